@@ -218,8 +218,8 @@ class Completion:
     ) -> Completion:
         """One completion of all of ``cameras``, of the rows and the completion of each part.
 
-        Parts are taken one after the other, so that only one need be in memory beside the whole.
-        Where some predict rays, the others have those of their cameras.
+        Only one part need be in memory beside the whole. Where some predict rays, the others have
+        those of their cameras.
         """
         images: list[Float32] = []
         rays: Float32 | None = None
@@ -344,10 +344,7 @@ def check_views(context: Sequence[ContextView], guidance: Guidance) -> None:
 def run_completer(
     completer: Completer, context: Sequence[ContextView], guidance: Guidance, *, seed: int = 0
 ) -> Completion:
-    """Call ``completer.complete`` and check what it returns.
-
-    That is its type, shapes, finite values, and that pixels which are valid in ``guidance`` kept
-    their colour, unless whole views were generated.
+    """``completer.complete``, and a check of its type, shapes, finite values and kept colours.
 
     Where memory does not suffice for all target views, they are completed in halves, and halves of
     these; context and seed stay the same.

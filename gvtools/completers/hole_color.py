@@ -48,18 +48,10 @@ def fill_color(
     evidence: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None,
     sweeps: int = 60,
 ) -> NDArray[np.float32]:
-    """Diffuse colour from the rim into the holes, along surfaces.
+    """(H, W, 3) colour diffused from the rim into the holes, along surfaces; 0 where no depth is.
 
-    Args:
-        rgb: (H, W, 3) in [0, 1].
-        known: (H, W) bool, where ``rgb`` is known; it is returned unchanged there.
-        surface: the filled depth of the same view.
-        evidence: colours (H, W, 3) that other photographs suggest for hole pixels, and their
-            weight (H, W), 0 = none; a weight of 1 counts as much as one neighbour.
-        sweeps: relaxation sweeps.
-
-    Returns:
-        (H, W, 3) float32; 0 where no depth was filled.
+    ``evidence``: colours (H, W, 3) that other photographs suggest for hole pixels, and their weight
+    (H, W), 0 = none; a weight of 1 counts as much as one neighbour.
     """
     filled = np.where(known[..., None], rgb, np.float32(0))
     holes = np.flatnonzero(~known & (surface.inverse > 0))
@@ -215,18 +207,10 @@ def look_up(
     context: Sequence[ContextView],
     views: int,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Colours that the photographs show where the hole pixels' points project.
+    """Colours (H, W, 3) that photographs show at holes' points, and their weight in [0, 1].
 
-    Args:
-        camera: the target, a batch of one.
-        depth: (H, W) filled z-depth, scene units.
-        error: (H, W) its relative error, ``depth_error``.
-        holes: (H, W) the pixels to look up.
-        context: the photographs.
-        views: how many of them to use: those that see the holes most reliably.
-
-    Returns:
-        Colours (H, W, 3) and their weight (H, W) in [0, 1], 0 = none.
+    ``depth`` (H, W) is filled, scene units, ``error`` its relative ``depth_error``. At most
+    ``views`` photographs are used: those that see the holes most reliably.
     """
     colors = np.zeros((*depth.shape, 3), np.float32)
     weights = np.zeros(depth.shape, np.float32)

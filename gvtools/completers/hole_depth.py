@@ -57,10 +57,7 @@ def rim_distance(known: NDArray[np.bool_]) -> NDArray[np.float64]:
 
 
 def hole_radius(valid: NDArray[np.bool_]) -> float:
-    """Largest distance of a hole's pixel to a valid one (H, W), as a share of the image diagonal.
-
-    0 without holes, infinity where nothing is known.
-    """
+    """Largest distance of a hole's pixel to a valid one, in image diagonals; may be infinite."""
     return float(rim_distance(valid).max()) / float(np.hypot(*valid.shape))
 
 
@@ -90,15 +87,11 @@ def fill_depth(
     smoothing: bool = True,
     generated: NDArray[np.bool_] | None = None,
 ) -> HoleDepth:
-    """Continue the surfaces around the holes of a depth map through them.
+    """Continue the surfaces around the holes of a z-depth map (H, W) through them.
 
-    Args:
-        depth: (H, W) z-depth, scene units.
-        valid: (H, W), where ``depth`` (> 0) is known.
-        focal: pixels.
-        steepest_deg: a surface seen at a more grazing angle counts as a step.
-        generated: (H, W) known pixels that a completer made; None where all were observed.
-        smoothing: whether medians, wider the farther from the rim, settle the fill.
+    A surface seen at a more grazing angle than ``steepest_deg`` counts as a step; ``generated``
+    (H, W) are known pixels that a completer made; ``smoothing``: medians, wider the farther from
+    the rim, settle the fill. ``focal`` is in pixels.
     """
     known = valid & (depth > 0) & np.isfinite(depth)
     inverse = np.zeros(depth.shape, np.float64)
@@ -308,10 +301,7 @@ def _unhidden(planes, flat, hits, h, x, y, width, slope):
 def _combine(
     first, last, inverse, known, hits, planes, flat, slope, limits, spread, row_values, row_weights
 ):  # fmt: skip
-    """Write the answer of the eight pairs into each hole pixel.
-
-    ``row_values`` and ``row_weights`` (H, 8) are scratch.
-    """
+    """Write the answer of the eight pairs into each hole pixel; the last two (H, 8) are scratch."""
     width = known.shape[1]
     for y in range(first, last):
         values, weights = row_values[y], row_weights[y]
@@ -350,10 +340,7 @@ def _combine(
 
 @compiled()
 def _weighted_quantile(values, weights, count, share):
-    """The smallest of ``count`` values at which ``share`` of the weight is reached, and the weight.
-
-    The arrays are sorted.
-    """
+    """The smallest of ``count`` values at which ``share`` of the weight is reached; sorts both."""
     for i in range(1, count):
         value, weight = values[i], weights[i]
         j = i - 1

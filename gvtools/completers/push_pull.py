@@ -40,12 +40,8 @@ class Filled:
 def push_pull(values: Tensor, valid: Tensor) -> Tensor:
     """Holes filled from averages over growing windows; known pixels stay as they are.
 
-    Args:
-        values: (B, C, H, W); what stands in the holes is ignored, NaN included.
-        valid: (B, 1, H, W), > 0 where known.
-
-    Returns:
-        (B, C, H, W); zeros for an image without a known pixel.
+    ``values`` (B, C, H, W) may hold anything in the holes, NaN too; ``valid`` (B, 1, H, W) is > 0
+    where known. Zeros for an image without a known pixel.
     """
     weight = (valid > 0).to(values.dtype)
     known = torch.where(weight > 0, values, values.new_zeros(()))
@@ -66,12 +62,7 @@ def push_pull(values: Tensor, valid: Tensor) -> Tensor:
 
 
 def push_pull_depth(depth: Tensor, valid: Tensor) -> Tensor:
-    """Depth filled in its logarithm; see ``push_pull``. Zeros for an image without known depth.
-
-    Args:
-        depth: (B, 1, H, W) > 0 where valid.
-        valid: (B, 1, H, W).
-    """
+    """Depth (B, 1, H, W) filled in its logarithm; see ``push_pull``."""
     known = (valid > 0) & (depth > 0)
     log = torch.where(known, depth, torch.ones_like(depth)).log()
     filled = push_pull(log, known).exp()

@@ -38,12 +38,8 @@ def surface_fill(
 ) -> Filled:
     """Colour, depth and confidence of all pixels, memory's pixels unchanged.
 
-    A view without a valid pixel keeps its zeros, unless something is carried there.
-
-    Args:
-        context: photographs to look hole points up in.
-        guidance: the projections.
-        shared: carry fills from view to view; their order does not matter.
+    A view without a valid pixel keeps its zeros, unless something is carried there: ``shared``
+    carries fills from view to view, whatever their order.
     """
     completion, looked_up = InpaintCompleter().filled(context, guidance)
     known = guidance.valid
@@ -74,7 +70,7 @@ def _shared(
     *,
     looked_up: NDArray[np.float32],
 ) -> NDArray[np.bool_]:  # (V, H, W) where memory or another view's fill knows
-    """Carry fills from view to view, the best known view first.
+    """(V, H, W) where memory or another view's fill knows, the best known view being filled first.
 
     ``completion`` and ``looked_up`` are written into.
     """

@@ -1,16 +1,12 @@
-"""The number type that networks compute in: one choice for completion, depth, training, benchmarks.
+"""Number types, fused attention and activation checkpointing of networks.
 
-bfloat16 on CUDA cards of compute capability 8.0 and later, float16 on older ones, whose bfloat16 is
-emulated and has no fused attention, float32 on CPUs. Half precision is torch's autocast: products
-and convolutions are rounded, while what has to be exact (statistics, norms and softmax sums, time
-frequencies, camera matrices, the geometry head) stays in float32.
+Networks compute in bfloat16 on CUDA cards of compute capability 8.0 and later, float16 on older
+ones, whose bfloat16 is emulated and has no fused attention, float32 on CPUs. Half precision is
+torch's autocast: products and convolutions are rounded, while what has to be exact (statistics,
+norms and softmax sums, time frequencies, camera matrices, the geometry head) stays in float32.
 
 Training does not use float16, whose gradients vanish without a loss scale: older cards train in
 float32. On a CPU it takes bfloat16 where the processor multiplies it faster, which is measured.
-
-Activation checkpointing: memory for time in training.
-
-Scaled dot-product attention without the matrix of scores.
 """
 
 from __future__ import annotations
@@ -47,12 +43,7 @@ def has_bfloat16(device: torch.device) -> bool:
 
 
 def inference_type(precision: str, device: torch.device) -> torch.dtype:
-    """What networks compute in when nothing is trained.
-
-    Args:
-        precision: see ``Precision``.
-        device: of the networks.
-    """
+    """The type that networks compute in when nothing is trained, see ``Precision``."""
     if precision != "auto":
         return named_type(precision)
     if device.type != "cuda":
@@ -61,12 +52,7 @@ def inference_type(precision: str, device: torch.device) -> torch.dtype:
 
 
 def training_type(precision: str, device: torch.device) -> torch.dtype:
-    """What networks are trained in; see the module.
-
-    Args:
-        precision: see ``TrainingPrecision``.
-        device: of the networks.
-    """
+    """The type that networks are trained in; see the module."""
     if precision != "auto":
         return named_type(precision)
     faster = has_bfloat16(device) if device.type == "cuda" else bfloat16_is_faster()
@@ -103,10 +89,7 @@ def hold_in(dtype: torch.dtype, *modules: nn.Module | None) -> None:
 
     The results under autocast are the same to the last bit, without a rounded copy beside every
     float32 weight. Everything else (norms, tokens, tables, frequencies, statistics) keeps its type.
-
-    Args:
-        dtype: that of autocast; float32 changes nothing.
-        modules: frozen, and run under autocast alone; entries that are None are skipped.
+    Of modules that are frozen, and run under autocast alone; float32 changes nothing.
     """
     if dtype == torch.float32:
         return
@@ -156,24 +139,14 @@ class Recomputing(nn.Module):
     recompute: bool = False
 
     def layer(self, run: Callable[..., Any], *inputs: Any) -> Any:
-        """``run(*inputs)``, whose activations are kept or not as ``recompute`` says.
-
-        Args:
-            run: a layer, without anything random in it.
-            inputs: tensors, and what else it takes.
-        """
+        """``run(*inputs)``, whose activations are kept or not as ``recompute`` says."""
         if not (self.recompute and torch.is_grad_enabled()):
             return run(*inputs)
         return recomputed(run, *inputs)
 
 
 def recomputed(run: Callable[..., Any], *inputs: Any) -> Any:
-    """``run(*inputs)``, of which the inputs alone are kept for the backward pass.
-
-    Args:
-        run: without anything random in it.
-        inputs: tensors, and what else it takes.
-    """
+    """``run(*inputs)``, nothing random; only the inputs are kept for the backward pass."""
     return checkpoint(run, *inputs, use_reentrant=False, preserve_rng_state=False)
 
 
@@ -191,23 +164,14 @@ MOST_SCORES = 2**26
 
 
 def attend(q: Tensor, k: Tensor, v: Tensor) -> Tensor:  # (B, heads, N, d)
-    """softmax(q kᵀ / sqrt(d)) v, in torch's fused kernels, whose memory is linear in N and M.
+    """softmax(q kᵀ / sqrt(d)) v of (B, heads, N or M, d), with memory linear in N and M.
 
     On CUDA, torch takes flash attention in half precision (compute capability 8.0 and later, heads
     of up to 256 channels) and its memory-efficient kernel otherwise (float32; float16 on older
-    cards), which asks for heads of a multiple of 8 channels, 4 in float32, adjacent in memory. The
-    heads here are of 48 and 128 (denoisers), 64 (encoder) and 72 (RGB head), without a mask. No
+    cards), which asks for heads of a multiple of 8 channels, 4 in float32, adjacent in memory. No
     fused kernel takes float64, or bfloat16 on older cards: these go by chunks of queries, each
-    computed again in the backward pass.
-
-    On a CPU the fused kernel is also the faster one: in float32 it takes a third to four fifths of
-    the time of the two products around a softmax from about 100 tokens on, and never longer by
-    more than a fraction of a millisecond; in bfloat16 the products may win, but round the scores.
-
-    Args:
-        q: (B, heads, N, d).
-        k: (B, heads, M, d).
-        v: (B, heads, M, d), the dtype of ``q`` and ``k``.
+    computed again in the backward pass. On a CPU the fused kernel is also the faster one from about
+    100 tokens on in float32; in bfloat16 the products may win, but round the scores.
     """
     if not _is_fused(q):
         return _in_chunks(q, k, v)

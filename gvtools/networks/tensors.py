@@ -1,12 +1,9 @@
-"""Tensors of a network: compared by name, shape and type, loaded into it, saved.
+"""Tensors of a network: found in weights files, read without running code, compared, loaded, saved.
 
 A missing, unexpected or wrongly shaped tensor is always an error, and so is one that holds no
-finite floating-point numbers.
-
-Tensors in weights files: found by name, read without running code.
-
-The safetensors library maps a whole file copy-on-write, which Linux refuses where the file is
-larger than the machine's memory, as a published video model is. Here a tensor's own bytes are read.
+finite floating-point numbers. The safetensors library maps a whole file copy-on-write, which Linux
+refuses where the file is larger than the machine's memory, as a published video model is. Here a
+tensor's own bytes are read.
 """
 
 from __future__ import annotations
@@ -104,13 +101,7 @@ def shapes(tensors: Mapping[str, Tensor]) -> dict[str, tuple[int, ...]]:
 
 
 def check_fit(stored: Mapping[str, Tensor], expected: Shapes, *, where: object) -> None:
-    """Refuse tensors that are not the expected ones, by name, shape and type.
-
-    Args:
-        stored: what is there; may be on the meta device.
-        expected: name to shape.
-        where: what the message names.
-    """
+    """Refuse tensors (also on the meta device) that are not the expected ones."""
     found = fit(stored, expected)
     if not found.ok:
         raise CheckpointError(f"{where}: {found}; the file is of another network or version")
@@ -151,13 +142,7 @@ def not_finite(tensors: Mapping[str, Tensor]) -> str | None:
 def share_tied(
     tensors: dict[str, Tensor], tied: tuple[tuple[str, ...], ...], *, where: object
 ) -> None:
-    """Give tied names their common tensor where a file has it under some of them, in place.
-
-    Args:
-        tensors: by name; may be on the meta device.
-        tied: groups of names that are one tensor in the publisher's network.
-        where: what the message names.
-    """
+    """Give tied names their common tensor where a file has it under some of them, in place."""
     for names in tied:
         present = [name for name in names if name in tensors]
         if not present or len(present) == len(names):
@@ -257,11 +242,8 @@ class _Entry(NamedTuple):
 class TensorFiles:
     """The tensors of one network, in one safetensors file or in several with an index.
 
-    Only headers are read until ``read`` is called, and a file in which no tensor is asked for is
-    not opened: it need not even be there.
-
-    Args:
-        places: file and stored name of each tensor, by the name it is asked for.
+    ``places``: file and stored name of each, by the name it is asked for. Only headers are read
+    until ``read`` is called, and a file in which no tensor is asked for need not even be there.
     """
 
     def __init__(self, places: Mapping[str, tuple[Path, str]]) -> None:
@@ -298,19 +280,11 @@ class TensorFiles:
         return sorted({path for path, _ in self.places.values()})
 
     def renamed(self, stored: Mapping[str, str]) -> TensorFiles:
-        """The same tensors by other names.
-
-        Args:
-            stored: today's name of each new one.
-        """
+        """The same tensors by other names: ``stored`` is today's name of each new one."""
         return TensorFiles({name: self.places[old] for name, old in stored.items()})
 
     def empty(self, names: Iterable[str] | None = None) -> dict[str, Tensor]:
-        """Shapes and types without numbers, on the meta device.
-
-        Args:
-            names: of the tensors that are looked for, whether they are there or not; None for all.
-        """
+        """Shapes and types, on the meta device; of ``names`` those that are there, None for all."""
         asked = self.places if names is None else names
         return {name: self._entry(name).empty for name in asked if name in self.places}
 
@@ -412,10 +386,7 @@ def plain_tensors(content: Mapping[Any, Any], path: Path) -> dict[str, Tensor]:
 def read_pickled(path: Path, *, legacy: bool = False) -> dict[str, Any]:
     """The dictionary of a .pt file, its tensors mapped from disk where they are in zip form.
 
-    Args:
-        path: the file.
-        legacy: also take the form that torch.save wrote before PyTorch 1.6. Like the zip form it is
-            read without running code.
+    ``legacy`` also takes the form that torch.save wrote before PyTorch 1.6, without running code.
     """
     start = _check_is_whole(path)
     zipped = start.startswith(_ZIP)

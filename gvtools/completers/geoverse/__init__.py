@@ -1,8 +1,7 @@
 """GeoVerse, the generative core: flow matching in the latents of a frozen geometry model.
 
-Needs torch and numpy alone; weights and the video prior bring in safetensors and diffusers.
-
-Start at ``model.py`` (the whole pass), ``config.py`` (its settings) and ``completer.py`` (its use).
+Needs torch and numpy alone; weights and the video prior bring in safetensors and diffusers. Start
+at ``model.py`` (the whole pass), ``config.py`` (its settings) and ``completer.py`` (its use).
 """
 
 from __future__ import annotations

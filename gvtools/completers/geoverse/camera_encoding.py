@@ -1,21 +1,17 @@
-"""Camera conditions of the denoisers: normalised poses, Plücker maps and the view mask.
+"""Camera conditions of the denoisers: normalised poses, Plücker maps and projective positions.
 
-Geometric Latent Diffusion's convention, for the weights' sake: poses are re-based to the last view
-of the list, translations are scaled by the largest component, and a pixel's ray passes through
+Poses and maps follow Geometric Latent Diffusion, for the weights' sake: poses are re-based to the
+last view, translations are scaled by the largest component, and a pixel's ray passes through
 (column - 0.5, row + 0.5).
 
-Projective positional encoding: attention that sees cameras only relative to each other.
-
-Source: PRoPE (Li et al., "Cameras as Relative Positional Encoding", 2025). A camera's matrix is
-P = lift(K) · cam_from_world, 4x4, with K in shares of the image about its centre. The first half of
-a head's channels is cut into groups of four, and each group of a token is multiplied by its view's
-matrix: queries by Pᵀ, keys and values by P⁻¹, the result by P. A score then holds P_i P_j⁻¹ alone,
-whatever the world frame. The second half carries rotary positions within the image: a quarter for
-x, a quarter for y, pairs formed by the two halves of a quarter.
-
-The recorded outputs of Geometric Latent Diffusion do not hold P⁻¹ but cam_from_world⁻¹ · lift(K),
-with K itself in the place of K⁻¹ (``invert_K=False``). That is relative to the world frame's choice
-as well, but a token no longer meets its own view's tokens through the identity.
+Positions are PRoPE (Li et al., "Cameras as Relative Positional Encoding", 2025). A camera's matrix
+is P = lift(K) · cam_from_world, 4x4, with K in shares of the image about its centre. The first half
+of a head's channels is cut into groups of four, and each group of a token is multiplied by its
+view's matrix: queries by Pᵀ, keys and values by P⁻¹, the result by P. A score then holds P_i P_j⁻¹
+alone, whatever the world frame. The second half carries rotary positions within the image: a
+quarter for x, a quarter for y, pairs formed by the two halves of a quarter. GLD's recorded outputs
+have K itself in the place of K⁻¹ (``invert_K=False``): still independent of the world frame, but a
+token no longer meets its own view's tokens through the identity.
 """
 
 from __future__ import annotations
@@ -46,15 +42,8 @@ class CameraCondition:
     def unconditional(self, mode: str = "new") -> CameraCondition:
         """The condition without cameras, for classifier-free guidance; the view mask stays.
 
-        The published models were trained and sampled with three versions of it:
-
-        ===========  ==============  =============  =======================================
-        mode         poses           K              model
-        ===========  ==============  =============  =======================================
-        "new"        identity        identity       level 1
-        "old"        identity        kept           cascade, as its evaluation runs it
-        "old_train"  kept            identity       cascade, as its training configuration
-        ===========  ==============  =============  =======================================
+        The published models know three: "new" drops poses and K (level 1), "old" the poses (the
+        cascade, as it is evaluated), "old_train" K (the cascade, as it is trained).
         """
         dropped = {"new": (True, True), "old": (True, False), "old_train": (False, True)}
         no_poses, no_K = dropped[mode]
@@ -90,18 +79,10 @@ def camera_condition(
 
 
 def normalised_poses(world_from_cam: Tensor, *, reference: int = -1) -> tuple[Tensor, Tensor]:
-    """Poses in the frame of one view, scaled so that the largest component of a centre is 1.
+    """(B, V, 4, 4) poses in the frame of one view, the largest component of a centre 1; scale (B,).
 
-    Differences of centres are taken before anything is rotated, so that views far from the
-    world's origin keep their digits. Where all centres coincide, nothing sets a scale: the
-    translations are 0 and the scale is 1.
-
-    Args:
-        world_from_cam: (B, V, 4, 4) rigid, OpenCV, scene units.
-        reference: the view that becomes the identity.
-
-    Returns:
-        world_from_cam (B, V, 4, 4), re-based and scaled, and the scale (B,).
+    Differences of centres are taken before anything is rotated, so that views far from the world's
+    origin keep their digits. Where all centres coincide, translations are 0 and the scale 1.
     """
     world_from_cam = world_from_cam.to(_precise(world_from_cam))
     rotation, centre = world_from_cam[..., :3, :3], world_from_cam[..., :3, 3:]
@@ -167,12 +148,9 @@ HEAD_MULTIPLE = 8
 class Projective:
     """The encoding of V cameras over one token grid, built once for all layers of a pass.
 
-    It holds tensors and no parameters. Matrices and angles are float32 (float64 for float64
-    cameras) whatever the tokens are; the tokens' dtype is that of the result.
-
-    Attributes:
-        matrix: (B, V, 4, 4), P.
-        key_matrix: (B, V, 4, 4), by which keys and values are multiplied.
+    Matrices and angles are float32 (float64 for float64 cameras) whatever the tokens are; the
+    tokens' dtype is that of the result. ``matrix`` and ``key_matrix`` (B, V, 4, 4) are P and its
+    inverse.
     """
 
     def __init__(
@@ -243,16 +221,10 @@ class Projective:
 def projection_matrices(
     cam_from_world: Tensor, K: Tensor, *, size: tuple[int, int], invert_K: bool = True
 ) -> tuple[Tensor, Tensor]:  # Two (..., 4, 4)
-    """P = lift(K) · cam_from_world and its inverse, with K in shares of the image.
+    """P = lift(K) · cam_from_world (..., 4, 4) and its inverse, with K in shares of the image.
 
     fx / W, fy / H, cx / W - 0.5, cy / H - 0.5. Written out row by row: no matrix product whose
-    precision a backend may lower, no general inversion.
-
-    Args:
-        cam_from_world: (..., 4, 4) rigid; its dtype is the results'.
-        K: (..., 3, 3) pixels of an image of ``size``.
-        size: (H, W), pixels.
-        invert_K: False leaves K as it is in the second matrix.
+    precision a backend may lower, no general inversion. ``invert_K`` False leaves K in the second.
     """
     K = K.to(cam_from_world.dtype)
     height, width = size

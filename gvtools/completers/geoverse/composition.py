@@ -1,16 +1,10 @@
-"""A completion as a correction of the filled projection.
+"""Decoded pictures and depth at the targets' own size, in the memory's scale and exposure.
 
-Decoded pictures are as sharp as a small network's decoder makes them; the filled projection is as
-sharp as the memory. What the model *changed* is the difference between the decoding of its
-features and that of the projection's own, and this difference is added to the projection: where
-the model changes nothing, nothing changes. What it would change of the memory's own pixels is
-continued through the holes and taken away, so that a hole's rim does not show. A departure from
-the paper, whose result is the decoding itself (``composition``).
-
-A pass's result at the targets' own size, in the memory's scale and exposure.
-
-Decoded pictures are resampled, and their depth scaled to what is known; or, where the model's form
-is a correction, what it changed is added to the filled projection at full resolution.
+A completion is the decoding itself (the paper), or a correction of the filled projection
+(``composition``): decoded pictures are as sharp as a small network's decoder makes them, the filled
+projection is as sharp as the memory. So the difference between the decoding of the model's features
+and that of the projection's own is added to the projection. What it would change of the memory's
+own pixels is continued through the holes and taken away, so that a hole's rim does not show.
 """
 
 from __future__ import annotations
@@ -45,14 +39,10 @@ FAR = 1e3
 
 
 def without_seams(values: Tensor, patch: int) -> Tensor:
-    """Decoded pictures (N, C, H, W) without the steps from patch to patch.
+    """Decoded pictures (N, C, H, W) of whole patches without the steps from patch to patch.
 
     A small decoder makes each patch by itself. Here the means of the patches are joined linearly,
     and what a patch shows around its mean stays. A pixel that is not finite stays so, alone.
-
-    Args:
-        values: H and W are multiples of ``patch``.
-        patch: side of a patch, pixels.
     """
     finite = values.isfinite()
     share = F.avg_pool2d(finite.to(values.dtype), patch)
@@ -75,15 +65,9 @@ def seamless(made: Generated, patch: int) -> Generated:
 
 
 def corrected_color(filled: Tensor, made: Tensor, hint: Tensor, *, valid: Tensor) -> Tensor:
-    """The filled projection plus what the model changed; not clipped to [0, 1].
+    """The filled projection plus what the model changed, (N, 3, H, W) each; not clipped to [0, 1].
 
-    A pixel that is not finite in either decoding stays so, alone.
-
-    Args:
-        filled: (N, 3, H, W) the filled projection.
-        made: likewise, decoded from generated features.
-        hint: likewise, decoded from the filled projection's features.
-        valid: (N, 1, H, W) bool, where the memory knows.
+    A pixel that is not finite in either decoding stays so, alone. ``valid`` is (N, 1, H, W).
     """
     change = made - hint
     known = valid & change.isfinite().all(1, keepdim=True)
@@ -114,12 +98,8 @@ def corrected_depth(
 def composed(batch: ViewBatch, made: Decoded, hint: Decoded | None) -> tuple[Tensor, Tensor]:
     """Pictures (B, T, 3, H, W) and depth (B, T, H, W) of the targets, as training judges them.
 
-    At the model's size, every correction of depth counting in full.
-
-    Args:
-        batch: filled as the model saw it (``conditioning.filled``).
-        made: decoded from generated features.
-        hint: decoded from the filled projections' features; None for the decoding itself.
+    At the model's size, every correction of depth counting in full; ``batch`` is filled as the
+    model saw it. Without a ``hint`` it is the decoding itself.
     """
     rgb, depth = made.rgb.float(), made.depth
     if hint is None:
@@ -210,14 +190,10 @@ def to_scene_scale(
 
 
 def aligned_color(rgb: Tensor, hint: Tensor, valid: Tensor) -> Tensor:
-    """Pictures with the push-pull of ``hint - rgb`` over valid pixels added, in [0, 1].
+    """Pictures (T, 3, H, W) plus the push-pull of ``hint - rgb`` over valid pixels, in [0, 1].
 
     What a small network decodes is off by a little all over, and a hole's fill then shows its rim.
-
-    Args:
-        rgb: (T, 3, H, W) of the model; a pixel that is not finite stays so.
-        hint: (T, 3, H, W) the memory's colour.
-        valid: (T, 1, H, W) where it is known.
+    A pixel that is not finite stays so.
     """
     known = valid & torch.isfinite(rgb).all(1, keepdim=True)
     offset = push_pull(torch.where(known, hint - rgb, 0.0), known)
@@ -229,11 +205,7 @@ def corrected(
 ) -> Completed:
     """The filled projection with what the model changed, in views that memory tells of.
 
-    Args:
-        generated: with the hints' decoding.
-        guidance: the targets' projections.
-        fill: the filled projections.
-        back: what stands where the fill has no depth; None where it has depth everywhere.
+    ``back`` stands where the fill has no depth; None where it has depth everywhere.
     """
     assert generated.hint is not None
     full = (guidance.depth.shape[1], guidance.depth.shape[2])
@@ -314,12 +286,7 @@ def refined(
 
 
 def depth_ratios(guidance: Guidance, generated: NDArray[np.float32]) -> NDArray[np.float64]:
-    """(T,) scene units per unit of the model; NaN where its depth is not the memory's by a factor.
-
-    Args:
-        guidance: the targets' projections.
-        generated: (T, H, W) depth in the model's unit.
-    """
+    """(T,) scene units per unit of a view's depth; NaN where no factor brings them together."""
     found = np.full(len(guidance), np.nan)
     for index, (view, known, valid) in enumerate(
         zip(generated, guidance.depth, guidance.valid, strict=True)

@@ -1,14 +1,11 @@
-"""Mean and variance of latent channels: features of a frozen encoder to a diffusion model's units.
+"""Pictures, projections and cameras as the denoisers are conditioned on them.
 
-The encoder's channels are heavy-tailed (Depth Anything 3 Base, level 1: deviations from 0.14 to
-10), so latents are normalised channel by channel, as in Geometric Latent Diffusion.
-
-From pictures, projections and cameras to what the denoisers are conditioned on.
-
-The hint features are Eq. 1 of the paper: context pictures and projections are encoded jointly and
-masked by the validity at feature resolution. The mask is applied to *normalised* features, so that
-a target without a valid token has exactly GLD's zero padding; such a view is also left out of the
-joint encoding, since it has nothing to tell and its black picture would disturb the others.
+Features of the frozen encoder become latents by mean and variance of each channel, as in Geometric
+Latent Diffusion: the channels are heavy-tailed (Depth Anything 3 Base, level 1: deviations from
+0.14 to 10). The hint features are Eq. 1 of the paper: context pictures and projections are encoded
+jointly and masked by the validity at feature resolution. The mask is applied to *normalised*
+features, so that a target without a valid token has exactly GLD's zero padding; such a view is also
+left out of the joint encoding, since its black picture would disturb the others.
 """
 
 from __future__ import annotations
@@ -29,12 +26,7 @@ from gvtools.networks.depth_anything.network import DepthAnything3, relative_cam
 
 
 class LatentStatistics(nn.Module):
-    """Per-channel statistics of one feature level.
-
-    Args:
-        channels: of the level.
-        eps: added to the variance.
-    """
+    """Mean and variance of the channels of one feature level; ``eps`` is added to the variance."""
 
     mean: Tensor
     var: Tensor
@@ -168,10 +160,7 @@ class Hints:
 
 
 def feature_mask(valid: Tensor, grid: tuple[int, int], share: float) -> Tensor:
-    """(B, V, 1, H, W) validity to (B, V, 1, h, w) in {0, 1}: enough of a token's pixels are valid.
-
-    A ``share`` of 0 counts every token.
-    """
+    """(B, V, 1, h, w) in {0, 1}: a ``share`` of a token's pixels is valid; 0 counts all."""
     patch = (valid.shape[-2] // grid[0], valid.shape[-1] // grid[1])
     covered = F.avg_pool2d(valid.float().flatten(0, 1), patch).unflatten(0, valid.shape[:2])
     # The mean of a patch is rounded; half of an even number of pixels must still count as half.
@@ -181,10 +170,7 @@ def feature_mask(valid: Tensor, grid: tuple[int, int], share: float) -> Tensor:
 def depth_condition(depth: Tensor, valid: Tensor, scale: Tensor) -> Tensor:
     """(B, V, 2, H, W): log of the depth in the cameras' unit where valid, and the validity.
 
-    Args:
-        depth: (B, V, 1, H, W) scene units.
-        valid: (B, V, 1, H, W).
-        scale: (B,) of the camera condition: normalised units a scene unit.
+    ``depth`` and ``valid`` are (B, V, 1, H, W), ``scale`` (B,) the camera condition's.
     """
     known = (valid > 0) & (depth > 0) & torch.isfinite(depth)
     unit = torch.where(known, depth, torch.ones_like(depth)) * scale[:, None, None, None, None]
@@ -288,14 +274,7 @@ def encode_latents(
 def encode_views(
     network: DepthAnything3, batch: ViewBatch, views: slice | Tensor, *, config: HintConfig
 ) -> list[Tensor]:
-    """Raw levels 0 and 1 of some views, token 0 included; gradients reach the encoder.
-
-    Args:
-        network: the encoder.
-        batch: all views.
-        views: which of them are encoded.
-        config: whether, and in which unit, it is told the cameras, relative to the first view.
-    """
+    """Raw levels 0 and 1 of some views, token 0 included; gradients reach the encoder."""
     images = batch.images[:, views]
     if not config.cameras:
         return network.encode(images, levels=2)

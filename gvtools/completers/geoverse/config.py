@@ -1,4 +1,4 @@
-"""The whole model's configuration.
+"""Configuration of the whole model.
 
 ``base`` is the paper's, ``gld`` that of the networks which it begins with and which are public,
 ``tiny`` can be trained on a CPU.

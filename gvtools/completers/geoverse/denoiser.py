@@ -1,12 +1,8 @@
-"""The layers of a denoiser: embedders, attention over all views, modulated transformer blocks.
-
-Parameter names are those of Geometric Latent Diffusion's checkpoints.
-
-The multi-view denoiser: a diffusion transformer with a wide head, over all tokens of all views.
+"""The multi-view denoiser: a diffusion transformer with a wide head, over all tokens of all views.
 
 A narrow, deep *encoder* reads the conditions and writes one conditioning vector a token; a wide,
 shallow *head* denoises under it (Zheng et al. 2025, RAE; Geometric Latent Diffusion). Every block
-attends over all views at once; position comes only from the cameras (``projective.py``).
+attends over all views at once; position comes only from the cameras (``camera_encoding.py``).
 
 The same class is level 1 (separate embedders for context and target views, both streams read
 [condition | noisy]) and the level-0 cascade (``source``: the encoder reads [condition | level 1]).
@@ -232,11 +228,7 @@ class Positions:
 
 
 class Denoiser(Recomputing):
-    """See the module.
-
-    ``forward`` returns the velocity of the linear path, or clean latents where the model's
-    configuration says so (``FlowConfig.prediction``).
-    """
+    """The velocity of the linear path, or clean latents, see ``FlowConfig.prediction``."""
 
     def __init__(self, config: DenoiserConfig) -> None:
         super().__init__()

@@ -81,12 +81,7 @@ def pass_scale(
 
 
 def centre_scale(geometry: Geometry, world_from_cam: NDArray[np.float64]) -> PassScale:
-    """s* between the predicted centres of all views and the requested ones, where they support it.
-
-    Args:
-        geometry: (1, V, ...) of a pass.
-        world_from_cam: (V, 4, 4), scene units.
-    """
+    """s* between predicted and requested camera centres (V), where they support it."""
     refused = PassScale(float("nan"), ScaleStatus.UNSUPPORTED)
     try:
         predicted = camera_centres(geometry.ray.float(), geometry.ray_confidence.float()).cpu()
@@ -192,10 +187,7 @@ def _fitted(
 def _deviation(
     depth: NDArray[np.floating[Any]], hint: NDArray[np.float32], valid: NDArray[np.bool_]
 ) -> tuple[float, int]:
-    """Median |log ratio| of scaled depth to the memory's, and the pixels where both are known.
-
-    The median is NaN below ``MIN_SUPPORT`` pixels.
-    """
+    """Median |log ratio| of scaled depth to the memory's (NaN of few), and common pixels."""
     both = both_known(depth, hint, valid)
     overlap = int(both.sum())
     if overlap < MIN_SUPPORT:

@@ -1,18 +1,13 @@
-"""Flow matching on a straight path: clean at t = 0, noise at t = 1, and Euler steps between them.
+"""Flow matching on a straight path: times, Euler steps, starting noise, and piecewise reflow.
 
 x_t = (1 - t) clean + t noise, velocity u = dx/dt = noise - clean. A time shift s spends more of the
 steps near the noise, t' = s t / (1 + (s - 1) t). Shapes: states (B, ...), usually latents
 (B, V, C, h, w); one t a sample, shared by its views.
 
-Starting noise that depends on the run's seed and the view alone.
-
-Not on which views go together, in which order, on the device, or on the dtype asked for.
-
-Piecewise reflow: a student learns the teacher's displacement over each interval as one step.
-
-The bounds 1 = tau_0 > ... > tau_K = 0 cut time into intervals a = 0 .. K-1 of upper end tau_a and
-lower end tau_{a+1}. Section "Few-Step Inference via Reflow Distillation" of the paper, after
-PeRFlow (Yan et al. 2024). The loss is ``losses.flow_matching_loss`` with this module's velocity.
+In reflow a student learns the teacher's displacement over each interval as one step (Section
+"Few-Step Inference via Reflow Distillation" of the paper, after PeRFlow, Yan et al. 2024). The
+bounds 1 = tau_0 > ... > tau_K = 0 cut time into intervals a = 0 .. K-1 of upper end tau_a and lower
+end tau_{a+1}. The loss is ``objective.flow_matching_loss`` with the velocity given here.
 """
 
 from __future__ import annotations
@@ -62,14 +57,7 @@ def latent_shift(values: int, *, base: int = 4096) -> float:
 def time_grid(
     steps: int, *, shift: float = 1.0, start: float = 1.0, end: float = 0.0
 ) -> tuple[float, ...]:
-    """``steps`` + 1 falling times, equally spaced before the shift.
-
-    Args:
-        steps: network evaluations of an Euler run over the grid.
-        shift: see ``shift_time``.
-        start: first and
-        end: last time, both after the shift.
-    """
+    """``steps`` + 1 falling times from ``start`` to ``end``, equally spaced before the shift."""
     check_range("steps", steps, ge=1)
     check_range("time grid's start", start, gt=0, le=1)
     check_range("time grid's end", end, ge=0, lt=start)
@@ -85,30 +73,19 @@ def time_grid(
 
 
 def gld_time_grid(points: int, *, shift: float) -> tuple[float, ...]:
-    """The grid of Geometric Latent Diffusion: ``points`` times, one network evaluation less.
-
-    It ends above 0, at shift_time(GLD_END): some noise stays in the result.
-    """
+    """Geometric Latent Diffusion's ``points`` times, which end above 0: some noise stays."""
     return time_grid(points - 1, shift=shift, end=shift_time(GLD_END, shift))
 
 
 def interval_bounds(intervals: int | Sequence[float], *, shift: float = 1.0) -> tuple[float, ...]:
-    """Bounds 1 = tau_0 > ... > tau_K = 0 of K intervals, or an explicit list, checked.
-
-    K intervals are equally long before the shift; an explicit list is not shifted.
-    """
+    """1 = tau_0 > ... > tau_K = 0, equally long before the shift; or an explicit list, checked."""
     if isinstance(intervals, int):
         return time_grid(intervals, shift=shift)
     return check_bounds(intervals)
 
 
 def check_bounds(bounds: Sequence[float], *, whole: bool = False) -> tuple[float, ...]:
-    """The bounds as floats.
-
-    Args:
-        bounds: K + 1 times.
-        whole: they have to end at 0, where no noise is left.
-    """
+    """K + 1 bounds as floats; a ``whole`` list has to end at 0, where no noise is left."""
     tau = tuple(float(bound) for bound in bounds)
     wanted = f"expected 1 = tau_0 > tau_1 > ... > tau_K {'=' if whole else '>='} 0"
     if len(tau) < 2:
@@ -129,8 +106,7 @@ def check_bounds(bounds: Sequence[float], *, whole: bool = False) -> tuple[float
 def training_times(uniform: Tensor, *, shift: float = 1.0, most: float = 1.0) -> Tensor:
     """Training times (B,) of uniform draws (B,) in [0, 1): scaled to [0, ``most``), then shifted.
 
-    The paper's t ~ U(0, 1) is ``most`` 1, ``shift`` 1; Geometric Latent Diffusion has 0.999 and
-    ``latent_shift``.
+    The paper's t ~ U(0, 1) is 1 and 1; Geometric Latent Diffusion has 0.999 and ``latent_shift``.
     """
     check_range("largest training time", most, gt=0, le=1)
     return shift_time(uniform * most, shift)
@@ -173,10 +149,7 @@ def velocity_from_clean(
 
 
 def guided(velocity: Velocity, unconditional: Velocity | None, scale: float) -> Velocity:
-    """Classifier-free guidance: u = unconditional + scale (conditional - unconditional).
-
-    ``scale`` 1 returns ``velocity`` itself: the unconditional branch is not evaluated.
-    """
+    """Classifier-free guidance u = unconditional + scale (conditional - unconditional)."""
     check_range("cfg_scale", scale, ge=0, lt=math.inf)
     if scale == 1:
         return velocity
@@ -199,14 +172,10 @@ def integrate(
     # Receives the number of steps made, their time (B,) and the state (B, ...).
     callback: Callable[[int, Tensor, Tensor], None] | None = None,
 ) -> Tensor:
-    """Euler steps of dx/dt = velocity(x, t) along ``times``.
+    """Euler steps of dx/dt = velocity(x, t) along ``times``; the state at the last one.
 
     The state is carried in float32 at least, so that small steps do not vanish in bfloat16; the
-    network receives it in its own dtype. Gradients flow unless the caller turns them off.
-
-    Returns:
-        The state at the last time, dtype of ``state``; infinite where that dtype ends (float16 at
-        65504).
+    network receives it in its own dtype, that of the result (infinite beyond float16's 65504).
     """
     wide = torch.promote_types(state.dtype, torch.float32)
     grid = torch.as_tensor(times, dtype=torch.float64, device="cpu")
@@ -282,10 +251,7 @@ def interval_ends(intervals: Tensor, bounds: Sequence[float]) -> tuple[Tensor, T
 def interval_times(which: Tensor, share: Tensor, bounds: Sequence[float]) -> tuple[Tensor, Tensor]:
     """An interval (B,) int64, each as likely, and t ~ U(tau_{a+1}, tau_a) (B,) float32; on the CPU.
 
-    Args:
-        which: (B,) uniform draws in [0, 1) of the interval.
-        share: (B,) uniform draws in [0, 1) of the place in it.
-        bounds: tau_0 .. tau_K.
+    ``which`` and ``share`` (B,) are uniform draws in [0, 1) of the interval and the place in it.
     """
     count = len(check_bounds(bounds)) - 1
     intervals = (which * count).long().clamp(max=count - 1)

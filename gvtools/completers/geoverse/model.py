@@ -1,18 +1,10 @@
-"""Names of a pass's stages, and a clock that a benchmark may put in.
-
-What a pass of the model hands from one stage to the next.
-
-The networks of GeoVerse, and what each computes in a pass; ``model.py`` has the passes.
-
-Equations are the paper's.
-
-GeoVerse: the whole model, from views and projections to target pictures, depth and rays.
+"""GeoVerse: the whole model, from views and projections to target pictures, depth and rays.
 
 Data flow of one pass (tensor shapes in the README.md beside this file; equations are the paper's)::
 
     pictures, projections --filled--> encode_hints (Eq. 1) --> hints
     hints, cameras, depth --> Conditions;  video prior --> control residuals | shared keys (once)
-    noise --level-1 denoiser, K Euler steps--> level 1 --cascade, 1 step--> level 0
+    noise --level-1 denoiser (Eq. 2), K Euler steps--> level 1 --cascade (Eq. 3)--> level 0
     level 1 --frozen blocks--> levels 2, 3;  all four --heads--> pictures, depth, rays
 """
 
@@ -121,11 +113,7 @@ class Generated:
 
 
 class GeoVerse(nn.Module):
-    """See the module. The encoder, its heads and the video prior are frozen.
-
-    Args:
-        config: see ``GeoVerseConfig``; ``config.named("tiny")`` for the small one.
-    """
+    """The whole model. The encoder, its heads and the video prior are frozen."""
 
     def __init__(self, config: GeoVerseConfig) -> None:
         super().__init__()
@@ -166,7 +154,7 @@ class GeoVerse(nn.Module):
         """Keep the weights in the type that autocast computes in, for inference alone.
 
         The same results, from half the memory: norms, tokens, tables, frequencies, statistics and
-        the geometry head stay float32 (``networks.precision``).
+        the geometry head stay float32 (``networks.compute``).
         """
         self.geometry.hold_in(dtype)
         hold_in(dtype, self.rgb_head, self.level1, self.cascade, self.control, self.shared)
@@ -287,7 +275,7 @@ class GeoVerse(nn.Module):
         return velocity_from_clean(clean, state, t, least=least or flow.least_time)
 
     def velocity_wanted(self, velocity: Tensor, t: Tensor) -> Tensor:
-        """What ``velocity1`` should give at ``t`` where ``velocity`` (B, V, C, h, w) is right.
+        """The target of ``velocity1`` at ``t`` where ``velocity`` (B, V, C, h, w) is right.
 
         A clean prediction's velocity is divided by no less than ``flow.least_time``; a target that
         is not would have the prediction wrong below it.
@@ -345,12 +333,7 @@ class GeoVerse(nn.Module):
         return [*raw, *self.geometry.encoder.propagate(raw[1], grid)]
 
     def without_cameras(self, prepared: Prepared, drop: Tensor | None = None) -> Prepared:
-        """Without cameras, as GLD's guidance has it: latents, hints and video are kept.
-
-        Args:
-            prepared: from ``prepare``.
-            drop: (B,) bool, samples that lose their cameras; None for all.
-        """
+        """Without cameras, as GLD's guidance has it, of the samples ``drop`` (B,) or of all."""
         known = prepared.level1.camera
         camera = known.unconditional()
         if drop is not None:

@@ -1,26 +1,17 @@
-"""Where a reference picture has edges and texture: weights in [0, 1] from its gradient.
-
-w(p) = clip((g(p) - q_0.50) / (q_0.98 - q_0.50 + delta)), g the Sobel magnitude of the grayscale
-picture, the quantiles taken over all valid pixels of a sample's views (appendix "RGB supervision").
-
-One scale a sample between predicted and reference cameras, by their centres.
-
-(s*, Q*, b*) minimises sum_j |s Q o^_j + b - o_j|^2 over s > 0, Q in SO(3), b (appendix
-"Scale-aligned depth supervision"). The scale, unlike the rotation, is determined by two centres or
-by centres on a line, so these are solved; where the scale stays open the status says so, and its
-numbers are NaN.
-
-The terms of the training objective, each (B,): one value a sample, to be averaged by the caller.
-
-Appendix "Loss Definitions and Computation". Latent terms see all views, context first; decoded
-terms see target views only. What lies outside a mask may hold anything, NaN too: neither a loss nor
-a gradient sees it. A sample without a valid pixel gives 0, still part of the graph. References
-never receive a gradient. Half-precision inputs are compared in float32.
-
-The whole training objective: five terms, their coefficients, and what each stood on.
+"""The training objective, its five terms, and the scale from camera centres.
 
 L = l_1 L_FM^1 + l_0 L_FM^0 + l_rgb L_rgb + l_hf L_hf + l_depth L_depth
-(Eq. "complete_training_loss" of the paper).
+(Eq. "complete_training_loss" of the paper, appendix "Loss Definitions and Computation").
+
+Each term is (B,): one value a sample, to be averaged by the caller. Latent terms see all views,
+context first; decoded terms see target views only. What lies outside a mask may hold anything, NaN
+too: neither a loss nor a gradient sees it. A sample without a valid pixel gives 0, still part of
+the graph. References never receive a gradient. Half-precision inputs are compared in float32.
+
+The scale: (s*, Q*, b*) minimises sum_j |s Q o^_j + b - o_j|^2 over s > 0, Q in SO(3), b (appendix
+"Scale-aligned depth supervision"). The scale, unlike the rotation, is determined by two centres or
+by centres on a line, so these are solved; where it stays open the status says so, and its numbers
+are NaN.
 """
 
 from __future__ import annotations
@@ -46,11 +37,11 @@ QUANTILES = (0.50, 0.98)
 
 @torch.no_grad()
 def gradient_weights(reference: Tensor, valid: Tensor) -> Tensor:
-    """Weights (B, T, H, W) of the reference pictures' gradients; no gradient flows through them.
+    """Weights (B, T, H, W) in [0, 1] of a picture's edges and texture, without a gradient.
 
-    Args:
-        reference: (B, T, 3, H, W), in the normalisation that the loss compares.
-        valid: (B, T, H, W) bool; other pixels have weight 0 and may hold anything.
+    w(p) = clip((g(p) - q_0.50) / (q_0.98 - q_0.50 + delta)), g the Sobel magnitude of the grayscale
+    picture, the quantiles taken over all valid pixels of a sample's views (appendix "RGB
+    supervision"). Pixels that are not ``valid`` (B, T, H, W) have weight 0.
     """
     magnitude = sobel_magnitude(grayscale(reference), valid)
     weights = torch.zeros_like(magnitude)
@@ -74,10 +65,6 @@ def sobel_magnitude(gray: Tensor, valid: Tensor) -> Tensor:
 
     The picture's border is repeated outwards. A neighbour that is not valid counts as equal to the
     pixel itself, so the edge of a mask is no edge of the picture.
-
-    Args:
-        gray: (B, T, H, W).
-        valid: (B, T, H, W) bool.
     """
     height, width = gray.shape[-2:]
     center = torch.where(valid, gray, 0.0)
@@ -129,13 +116,10 @@ class CenterSimilarity:
 
 @torch.no_grad()
 def center_similarity(predicted: Tensor, reference: Tensor) -> CenterSimilarity:
-    """Fit one similarity a sample, by centring and SVD of the cross-covariance.
+    """One similarity a sample of camera centres (B, V, 3), by SVD of their cross-covariance.
 
-    Solved in float64 on the CPU, a handful of numbers, so that every device gives the same scale.
-
-    Args:
-        predicted: (B, V, 3) camera centres o^; those that are not finite are left out.
-        reference: (B, V, 3) camera centres o, any other frame and unit; likewise.
+    Solved in float64 on the CPU, so that every device gives the same scale. Centres that are not
+    finite are left out.
     """
     x, y = (z.to("cpu").to(torch.float64) for z in (predicted, reference))
     use = (x.isfinite() & y.isfinite()).all(-1)
@@ -193,14 +177,9 @@ def flow_matching_loss(
 ) -> Tensor:
     """L_FM (B,): sum_j alpha_j |u^_j - u_j|^2, of either level; with a reflow target, L_PRF.
 
+    Velocities are (B, V, C, h, w), alpha is ``context_weight`` for context views and 1 for targets.
     The paper's sum is divided by V C h w here, a constant factor: the paper names no coefficient.
     With ``context_weight`` 1 it is Geometric Latent Diffusion's loss.
-
-    Args:
-        predicted: (B, V, C, h, w) velocity.
-        target: (B, V, C, h, w), see ``flow.velocity_target``.
-        context: number of context views, which come first.
-        context_weight: alpha of context views; target views have 1.
     """
     errors = view_errors(predicted, target)
     alpha = torch.ones_like(errors)
@@ -209,24 +188,13 @@ def flow_matching_loss(
 
 
 def rgb_mask(reference: Tensor, valid: Tensor | None) -> Tensor:
-    """Omega^rgb (B, T, H, W): finite reference pixels that are ``valid``.
-
-    Args:
-        reference: (B, T, 3, H, W).
-        valid: (B, T, H, W) bool; None for all.
-    """
+    """Omega^rgb (B, T, H, W): finite pixels of the reference (B, T, 3, H, W) that are ``valid``."""
     known = reference.isfinite().all(2)
     return known if valid is None else known & valid
 
 
 def rgb_loss(predicted: Tensor, reference: Tensor, *, valid: Tensor | None = None) -> Tensor:
-    """L_rgb (B,): the mean of e(p) = |I^(p) - I(p)|_1 / 3 over the valid pixels of all views.
-
-    Args:
-        predicted: (B, T, 3, H, W), target views.
-        reference: (B, T, 3, H, W), normalised like ``predicted``.
-        valid: see ``rgb_mask``.
-    """
+    """L_rgb (B,): the mean of e(p) = |I^(p) - I(p)|_1 / 3 over the ``rgb_mask`` of all views."""
     mask = rgb_mask(reference, valid)
     return _pixel_mean(_rgb_error(predicted, reference, mask), mask)
 
@@ -234,10 +202,7 @@ def rgb_loss(predicted: Tensor, reference: Tensor, *, valid: Tensor | None = Non
 def high_gradient_loss(
     predicted: Tensor, reference: Tensor, *, valid: Tensor | None = None
 ) -> Tensor:
-    """L_hf (B,): the mean of e(p) weighted by the reference's gradient; 0 where all weights are 0.
-
-    Arguments are those of ``rgb_loss``; the weights are those of ``gradient_weights``.
-    """
+    """L_hf (B,): the mean of e(p) weighted by ``gradient_weights``; 0 where all weights are 0."""
     mask = rgb_mask(reference, valid)
     weight = gradient_weights(reference, mask)
     error = _rgb_error(predicted, reference, mask)

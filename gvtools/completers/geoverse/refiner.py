@@ -76,24 +76,14 @@ class Refinement:
     depth_right: Tensor  # (N, 1, h, w) logit that the depth is within 10 % of the true one
 
     def colors(self, made: Tensor, valid: Tensor) -> Tensor:
-        """(N, 3, H, W) refined pictures of any size; what the memory knows stays.
-
-        Args:
-            made: (N, 3, H, W) the core's.
-            valid: (N, 1, H, W) bool.
-        """
+        """(N, 3, H, W) refined pictures of any size; what the memory knows stays."""
         size = (made.shape[-2], made.shape[-1])
         mixed = resampled(self.share, size) * made + resampled(self.rest, size)
         return torch.where(valid, made, mixed)
 
 
 def completed_views(batch: ViewBatch, made: Tensor) -> CompletedViews:
-    """The targets of all samples of a batch, one after the other.
-
-    Args:
-        batch: filled as the model saw it (``conditioning.filled``).
-        made: (B, T, 3, H, W) the core's pictures of the targets.
-    """
+    """The targets of all samples; ``batch`` as the model saw it, ``made`` (B, T, 3, H, W)."""
     context = batch.context
     images, depth, valid = (
         values[:, context:].flatten(0, 1) for values in (batch.images, batch.depth, batch.valid)
@@ -107,11 +97,7 @@ def completed_views(batch: ViewBatch, made: Tensor) -> CompletedViews:
 
 
 class Refiner(nn.Module):
-    """See the module.
-
-    Args:
-        config: its size.
-    """
+    """Shares, offset and trust of each pixel, see the module."""
 
     def __init__(self, config: RefinerConfig) -> None:
         super().__init__()
@@ -256,9 +242,6 @@ def distance_to(known: Tensor) -> Tensor:
     """(N, 1, h, w) distance of each pixel to the nearest known one, pixels; large without any.
 
     Exact, a side after the other; the work grows with the cube of the side, which is small here.
-
-    Args:
-        known: (N, 1, h, w) bool.
     """
     height, width = known.shape[-2:]
     rows, columns = (

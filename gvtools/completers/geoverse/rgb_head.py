@@ -53,12 +53,10 @@ class RGBHead(Recomputing):
     def forward(
         self, features: Tensor, grid: tuple[int, int], *, chunk: int | None = None
     ) -> Tensor:  # (B', 3, h * patch, w * patch) RGB, in [0, 1] but for overshoot
-        """Pictures, not clipped.
+        """(B', 3, h * patch, w * patch) RGB, in [0, 1] but for overshoot.
 
-        Args:
-            features: (B', N, in_channels), N = h * w tokens row-major, levels 0 to 3 concatenated.
-            grid: (h, w) in patches.
-            chunk: views at a time, which bounds the memory; None for all. The result is the same.
+        ``features`` (B', N, in_channels) are levels 0 to 3 concatenated, N = h * w tokens
+        row-major. ``chunk`` views at a time bound the memory; the result is the same.
         """
         return self.image(self.logits(features, grid, chunk=chunk), grid)
 

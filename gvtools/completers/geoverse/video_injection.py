@@ -1,6 +1,7 @@
-"""The ControlNet-style branch: video features become residuals of the denoiser's encoder.
+"""The two ways in which video features enter the denoiser: a control branch, or shared attention.
 
-For each video level l, with the denoiser's token stream h and the control stream c (Eqs. 5, 6)::
+The ControlNet-style branch makes them residuals of the denoiser's encoder. For each video level l,
+with the denoiser's token stream h and the control stream c (Eqs. 5, 6)::
 
     c[l+1] = B_ctrl[l](c[l] + A[l](F_W[l]); t, cameras),   c[0] = the tokens that enter the encoder
     h      = B(h; t, cameras) + Z[l](c[l+1])
@@ -8,12 +9,9 @@ For each video level l, with the denoiser's token stream h and the control strea
 B_ctrl starts as a copy of the denoiser's blocks, Z at zero: a fresh branch changes nothing, and on
 the first step only Z receives a gradient.
 
-The MoT variant: geometric queries attend jointly to geometric and video keys and values.
-
+In the MoT variant geometric queries attend jointly to geometric and video keys and values.
 Asymmetric, as the paper's appendix has it: video features do not see the geometric state, so their
 keys and values are computed once a pass and reused by every denoising step.
-
-Video features on their way to the denoiser, as keys of the shared attention.
 """
 
 from __future__ import annotations
@@ -66,13 +64,7 @@ class FeatureAdapter(nn.Module):
 
 
 class ControlBranch(Recomputing):
-    """See the module.
-
-    Args:
-        config: see ``ControlConfig``.
-        denoiser: its blocks at the control layers are copied.
-        video_channels: channels of the video features.
-    """
+    """The control branch; copies the denoiser's blocks at the control layers."""
 
     def __init__(self, config: ControlConfig, denoiser: Denoiser, *, video_channels: int) -> None:
         super().__init__()
@@ -124,14 +116,7 @@ class SharedAttentionConfig:
 
 
 class SharedAttention(nn.Module):
-    """Projects video features to keys and values of the coupled blocks.
-
-    Args:
-        config: see ``SharedAttentionConfig``.
-        width: channels of the denoiser's encoder.
-        heads: its attention heads.
-        video_channels: channels of the video features.
-    """
+    """Projects video features to keys and values of the denoiser's coupled blocks."""
 
     def __init__(
         self, config: SharedAttentionConfig, *, width: int, heads: int, video_channels: int
@@ -147,11 +132,9 @@ class SharedAttention(nn.Module):
     def forward(
         self, features: Sequence[Tensor], positions: Sequence[Projective]
     ) -> dict[int, VideoKeys]:
-        """Keys and values by block, to be computed once and handed to every step.
+        """Keys and values by block, of a (B, V, C, h', w') tensor for each coupled layer.
 
-        Args:
-            features: a (B, V, C, h', w') tensor a coupled layer.
-            positions: of the video grid, for each of them, in the units of the latents' grid.
+        ``positions`` are those of each one's grid, in the units of the latents' grid.
         """
         found = {}
         dtype = next(self.parameters()).dtype

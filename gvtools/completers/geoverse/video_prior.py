@@ -1,19 +1,12 @@
-"""How views become the frames of clips for a causal video VAE, and which latent holds which view.
-
-The VAE takes clips of 4k + 1 frames and gives 1 + k latents: the first frame alone, then four by
-four. It drops the rest of other lengths without a word, so clips have such a length here.
-
-How features are taken from the video model, as far as the paper leaves it open.
-
-What enters the video model: views at its resolution, where they are valid, and their seeds.
-
-Features of a frozen video model, computed once for all denoising steps.
+"""Features of a frozen video model, computed once for all denoising steps.
 
 Eq. 4 and the appendix on Wan VACE: projections are noised slightly and encoded by the video VAE
 (z_proxy); x_t = (1 - sigma) z_proxy + sigma eps enters the backbone and [z_proxy, V] its VACE
-branch; what four blocks give in that one forward is F^W. Nothing is sampled or decoded.
+branch; what four blocks give in that one forward is F^W. Nothing is sampled or decoded. Where the
+paper leaves a choice, ``VideoPriorConfig`` says which one is taken.
 
-Where the paper leaves a choice, ``VideoPriorConfig`` says which one is taken.
+The VAE takes clips of 4k + 1 frames and gives 1 + k latents: the first frame alone, then four by
+four. It drops the rest of other lengths without a word, so clips have such a length here.
 """
 
 from __future__ import annotations
@@ -81,14 +74,12 @@ LAYOUTS = tuple(_LAYOUTS)
 
 
 def view_layout(name: str, views: int) -> ViewLayout:
-    """One of the ways to show views to the VAE.
+    """One of the ways to show ``views`` views to the VAE.
 
-    Args:
-        name: "per_view": each view is a clip of one frame, as Wan encodes reference images.
-            "video9": one clip of all views, the last one repeated up to 4k + 1 frames (nine for
-            eight views); after the first, four views share a latent. "repeat4": one clip, the
-            first view once and every other one four times, so each has its latent.
-        views: how many.
+    "per_view": each view is a clip of one frame, as Wan encodes reference images. "video9": one
+    clip of all views, the last one repeated up to 4k + 1 frames (nine for eight views); after the
+    first, four views share a latent. "repeat4": one clip, the first view once and every other one
+    four times, so each has its latent.
     """
     if name not in _LAYOUTS:
         raise OptionError(f"video layout {name!r}; expected one of {', '.join(LAYOUTS)}")
@@ -96,18 +87,11 @@ def view_layout(name: str, views: int) -> ViewLayout:
 
 
 def packed_mask(generate: Tensor, layout: ViewLayout, *, stride: int = 8) -> Tensor:
-    """VACE's mask channels: the pixels of each latent's block side by side.
+    """VACE's mask channels (B, stride^2, F, H / stride, W / stride): each latent's block of pixels.
 
-    A latent of several views is to be generated where any of them is: resampling the mask in time,
-    as VACE does for true video, would give a latent the mask of a view that it does not hold.
-
-    Args:
-        generate: (B, V, 1, H, W), 1 = to be generated.
-        layout: of the views.
-        stride: pixels of a latent's edge.
-
-    Returns:
-        (B, stride^2, F, H / stride, W / stride); channel = row * stride + column.
+    Of ``generate`` (B, V, 1, H, W), 1 = to be generated; channel = row * stride + column. A latent
+    of several views is to be generated where any of them is: resampling the mask in time, as VACE
+    does for true video, would give a latent the mask of a view that it does not hold.
     """
     latents = [generate[:, list(views), 0].amax(dim=1) for views in layout.views_of_latent]
     packed = [F.pixel_unshuffle(mask[:, None], stride) for mask in latents]
@@ -164,16 +148,9 @@ class VideoPriorConfig:
 
 
 def resized(images: Tensor, valid: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """Views and their validity in another size; colours of invalid pixels do not bleed in.
+    """Views (B, V, 3, H, W), 0 where not valid, and validity (B, V, 1, H, W) in another size.
 
-    Args:
-        images: (B, V, 3, H, W).
-        valid: (B, V, 1, H, W), bool or 1 = valid.
-        size: rows and columns in px.
-
-    Returns:
-        Images (B, V, 3, *size) float32, 0 where not valid, and validity (B, V, 1, *size) float32,
-        of the nearest pixel, 0 or 1.
+    Both float32. Colours of invalid pixels do not bleed in; validity is the nearest pixel's.
     """
     usable = (valid if valid.dtype == torch.bool else valid > 0.5).flatten(0, 1)
     weight = usable.float()
@@ -190,13 +167,7 @@ def resized(images: Tensor, valid: Tensor, size: tuple[int, int]) -> tuple[Tenso
 
 
 def seed_rows(seed: int | Sequence[Sequence[int]], batch: int, views: int) -> list[list[int]]:
-    """A seed for each view, B rows of V.
-
-    Args:
-        seed: one number for all, or the rows themselves.
-        batch: B.
-        views: V.
-    """
+    """A seed for each view, B rows of V, of one number for all or the rows themselves."""
     if isinstance(seed, int):
         return [[view_seed(seed, item, view) for view in range(views)] for item in range(batch)]
     return [list(row) for row in seed]

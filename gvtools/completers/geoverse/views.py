@@ -1,8 +1,4 @@
-"""Picture sizes that a network with patches takes, and maps from one size to another.
-
-Which photographs a pass looks at: those that see what its targets show, or the nearest.
-
-Pictures and projections of any size to the model's grid, and its results back.
+"""Pictures and projections of any size to the model's grid, and its results back.
 
 Context pictures are cropped about their centre to the targets' aspect and resampled; the cameras
 follow. A projection's colour is the mean of the valid pixels under a cell; its depth is that of
@@ -98,11 +94,10 @@ def view_batch(
     *,
     fill: Filled | None = None,  # the targets with their holes filled; None leaves holes at 0
 ) -> tuple[ViewBatch, Cameras]:
-    """One sample of the model.
+    """One sample of the model, and all cameras (V) at ``size`` in the scene's own frame and unit.
 
-    Returns:
-        The batch, in the first context view's frame and a unit in which the farthest view stands
-        at a distance of 1, and all cameras (V) at ``size`` in the scene's own frame and unit.
+    The sample is in the first context view's frame and a unit in which the farthest view stands at
+    a distance of 1.
     """
     height, width = int(targets.cameras.height[0]), int(targets.cameras.width[0])
     pictures, depths, cameras = [], [], []

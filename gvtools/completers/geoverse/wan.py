@@ -1,6 +1,4 @@
-"""Wan's VAE and VACE transformer as two functions: clips to latents, latents to block outputs.
-
-The folder with the frozen video prior, and how it is read.
+"""Wan's VAE and VACE transformer, frozen, and the folder that they are read from.
 
 ::
 
@@ -32,15 +30,10 @@ PATCH = (1, 2, 2)  # latents of a token
 
 
 class WanNetworks:
-    """Both networks, frozen, in diffusers' form.
+    """Diffusers' WanVACETransformer3DModel and AutoencoderKLWan as two functions, with one prompt.
 
-    Args:
-        transformer: a WanVACETransformer3DModel.
-        vae: an AutoencoderKLWan.
-        prompt: (tokens, channels), the text embedding that the transformer always gets; None for
-            zeros.
-        prompt_rows: what it is padded to with zeros, which take part in attention, as in Wan's
-            training.
+    ``prompt`` (tokens, channels), or zeros, is what the transformer always gets as text, padded to
+    ``prompt_rows`` with zeros that take part in attention, as in Wan's training.
     """
 
     def __init__(
@@ -97,11 +90,7 @@ class WanNetworks:
 
     @contextmanager
     def lent(self, device: torch.device | None) -> Iterator[None]:
-        """On another device within the block, where only copies go: nothing is brought back.
-
-        Args:
-            device: None for where the weights are.
-        """
+        """On another device within the block, where only copies go: nothing is brought back."""
         if device is None or device == self.device:
             yield
             return
@@ -120,10 +109,9 @@ class WanNetworks:
                 tensor.data = data
 
     def encode(self, clips: Tensor) -> Tensor:  # (N, 16, 1 + k, H / 8, W / 8) float32
-        """The mode of the VAE's latents, normalised by its published mean and deviation.
+        """(N, 16, 1 + k, H / 8, W / 8) float32: the mode of the VAE's latents, normalised.
 
-        Args:
-            clips: (N, 3, T, H, W) in [-1, 1], T = 4k + 1.
+        Clips are (N, 3, 4k + 1, H, W) in [-1, 1].
         """
         latents = self.vae.encode(clips.to(self.vae.dtype)).latent_dist.mode().float()
         mean, deviation = (
@@ -136,13 +124,10 @@ class WanNetworks:
     def block_outputs(
         self, x: Tensor, condition: Tensor, *, timestep: float, blocks: Sequence[int]
     ) -> list[Tensor]:  # For each block (B, F, h / 2, w / 2, C)
-        """What some blocks give in one forward, their VACE hints included.
+        """(B, F, h / 2, w / 2, C) of each of some blocks in one forward, their VACE hints included.
 
-        Args:
-            x: (B, 16, F, h, w) noised latents.
-            condition: (B, 96, F, h, w) of the VACE branch.
-            timestep: 0 to 1000.
-            blocks: their numbers.
+        ``x`` (B, 16, F, h, w) are noised latents, ``condition`` (B, 96, F, h, w) is of the VACE
+        branch, ``timestep`` 0 to 1000.
         """
         after = [*self.transformer.blocks[1:], self.transformer.norm_out]
         taken: dict[int, Tensor] = {}
@@ -175,26 +160,17 @@ _FLOAT32 = frozenset({"time_embedder", "scale_shift_table", "norm1", "norm2", "n
 
 
 def expected_tensors(config: Mapping[str, Any], *, component: str = "transformer") -> Shapes:
-    """Name and shape of every tensor that a network's weights have to hold; nothing is allocated.
-
-    Args:
-        config: of the truncated folder's ``transformer/config.json`` or ``vae/config.json``.
-        component: "transformer" or "vae".
-    """
+    """Name and shape of every tensor that a network's weights have to hold."""
     return shapes(empty_network(component, config).state_dict())
 
 
 def load_network(
     folder: Path, component: str, *, dtype: torch.dtype | None = None, device: str = "cpu"
 ) -> nn.Module:
-    """A network of a truncated folder, strictly: every tensor is there and none is left over.
+    """A network of a truncated folder, strictly: every tensor is there, none is left over.
 
-    Args:
-        folder: see the module.
-        component: "transformer" or "vae".
-        dtype: None keeps what is stored. Otherwise what diffusers keeps in float32 is float32 and
-            the rest is this.
-        device: where to; "meta" checks names, shapes and types by headers alone.
+    ``dtype`` None keeps what is stored; otherwise what diffusers keeps in float32 is float32 and
+    the rest is this. On "meta", names, shapes and types are checked by headers alone.
     """
     place = Path(folder) / component
     network: Any = empty_network(component, read_config(place))
@@ -261,12 +237,7 @@ def network_class(component: str) -> Any:
 
 
 def empty_network(component: str, config: Mapping[str, Any]) -> nn.Module:
-    """A network of a diffusers config, on the meta device: shapes, no numbers, no memory.
-
-    Args:
-        component: "transformer" or "vae".
-        config: as in the component's config.json.
-    """
+    """A network of a diffusers config, on the meta device: shapes, no numbers, no memory."""
     kind = network_class(component)
     try:
         with torch.device("meta"):
@@ -298,10 +269,7 @@ def read_config(folder: Path) -> dict[str, Any]:
 
 @contextmanager
 def _broken_torchvision_hidden() -> Iterator[bool]:
-    """Where torchvision does not fit torch, diffusers would fail on it, and can do without.
-
-    Gives whether that is so.
-    """
+    """Hide a torchvision that does not fit torch: diffusers would fail on it."""
     try:
         import torchvision  # noqa: F401
     except Exception:

@@ -1,4 +1,4 @@
-"""The frozen video prior's folder of published weights, offline; ``wan_folder`` says what is in it.
+"""The video prior's folder (see ``wan.py``), made offline from published weights.
 
 Of Wan2.2-VACE-Fun-A14B it takes 14.8 GB in bfloat16 instead of 34.7: the VACE blocks come before
 the backbone and depend on its input alone, so the features of blocks 0 to 15 stay what they were,
@@ -42,10 +42,8 @@ _HEAD_WIDTH = 128
 def write_empty_prompt(text_encoder: Path | str, out: Path | str) -> None:
     """Run Wan's text encoder on the empty prompt, which is the end-of-text token alone, once.
 
-    Args:
-        text_encoder: folder of the UMT5 encoder in transformers' form (``text_encoder`` of a Wan
-            folder of diffusers); 11.4 GB in bfloat16 for the published one.
-        out: the truncated folder that it belongs into.
+    ``text_encoder`` is the folder of the UMT5 encoder in transformers' form (11.4 GB in bfloat16 as
+    published), ``out`` the truncated folder that the prompt belongs into.
     """
     from safetensors.torch import save_file
 
@@ -83,7 +81,7 @@ def truncate(
     # Called with bytes done and in all.
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> None:
-    """Write a ``wan_folder`` from published weights; only what is needed is read.
+    """Write a folder of the video prior from published weights; only what is needed is read.
 
     The folder appears under its name when it is whole. The empty prompt is made separately, by
     ``write_empty_prompt``. At most about 2 GB of tensors are in memory.
@@ -207,13 +205,10 @@ def by_diffusers_name(names: Iterable[str]) -> dict[str, str]:
 
 
 def _config_of_tensors(files: TensorFiles, *, stated: Mapping[str, Any]) -> dict[str, Any]:
-    """The transformer's diffusers config, of its tensors.
+    """The transformer's diffusers config, of its tensors by diffusers' names.
 
-    Args:
-        files: by diffusers' names.
-        stated: Wan's own config.json where there is one; of it ``num_heads``, ``eps`` and
-            ``vace_layers`` are taken, which no shape shows. Without it they are what all
-            published Wan VACE networks have: heads of 128, 1e-6, evenly spread.
+    Of Wan's own config.json, where ``stated``, num_heads, eps and vace_layers are taken, which no
+    shape shows; else they are what all published Wan VACE networks have.
     """
     sides = {
         "ffn_dim": ("blocks.0.ffn.net.0.proj.weight", 0),

@@ -1,14 +1,12 @@
-"""Which published files make ``gld`` and ``base``, and how their keys become ours.
-
-Facts about the files (names, sizes, licences, key prefixes) are those of their publishers' pages
-and code in November 2026; the shapes come from our own modules, not from the files.
-
-``GeoVerse`` from a folder and into one, and what precisely does not fit.
+"""``GeoVerse`` from a folder and into one, and what precisely does not fit.
 
 A weights folder is one of two: our own (``config.json`` and ``geoverse.safetensors`` with every
-tensor), or one of published files as they were downloaded (``published.py``). The video prior lies
-in ``video/`` of either. Loading and checking both go through ``examine``, so that what passes the
-check can be loaded.
+tensor), or one of published files as they were downloaded, which make ``gld`` and ``base``. The
+video prior lies in ``video/`` of either. Loading and checking both go through ``examine``, so that
+what passes the check can be loaded.
+
+Facts about published files (names, sizes, licences, key prefixes) are those of their publishers'
+pages and code in November 2026; the shapes come from our own modules, not from the files.
 """
 
 from __future__ import annotations
@@ -201,10 +199,7 @@ def read_part(
 ) -> tuple[dict[str, Tensor], tuple[str, ...]]:
     """A part's tensors by the names of our module, and the names of what else its file holds.
 
-    Args:
-        path: the file.
-        part: what it is.
-        numbers: False reads the headers of a safetensors file alone.
+    Without ``numbers`` the headers of a safetensors file are read alone.
     """
     content: dict[str, Any] = {}
     if path.suffix == ".safetensors":
@@ -280,10 +275,7 @@ def check_is_folder(folder: Path) -> None:
 
 
 def config_of(folder: Path) -> GeoVerseConfig:
-    """The folder's own configuration.
-
-    Published files without one are ``base`` where the video prior is beside them, else ``gld``.
-    """
+    """The folder's own, or that of published files: ``base`` with a video prior, else ``gld``."""
     check_is_folder(folder)
     if (folder / CONFIG_FILE).is_file():
         return configs.read(folder / CONFIG_FILE)
@@ -311,11 +303,7 @@ def examine(
 ) -> tuple[PartReport, dict[str, Tensor]]:
     """Read one file and compare; the tensors by their names in ``GeoVerse``, if all is well.
 
-    Args:
-        folder: of weights.
-        part: of the folder.
-        model: of its configuration; may be on the meta device.
-        numbers: False looks at names, shapes and types alone, which is quick.
+    Without ``numbers``, names, shapes and types are looked at alone, which is quick.
     """
     path = part.find(folder)
     if path is None:
@@ -364,14 +352,9 @@ def examine(
 
 
 def check_folder(folder: Path | str, config: GeoVerseConfig | None = None) -> list[PartReport]:
-    """Every part of a folder, looked at without building the model.
+    """Every part of a folder, looked at without building the model; it loads if all are ``ok``.
 
     All tensors but the video prior's are read, so that a NaN is found; of that, names and shapes.
-    The folder can be loaded if every report is ``ok``.
-
-    Args:
-        folder: of weights.
-        config: instead of the folder's own.
     """
     folder = Path(folder)
     check_is_folder(folder)
@@ -396,11 +379,7 @@ def check_folder(folder: Path | str, config: GeoVerseConfig | None = None) -> li
 
 
 def check_headers(folder: Path | str) -> GeoVerseConfig:  # Its configuration
-    """Refuse a folder that cannot be loaded, by what can be seen without reading weights.
-
-    Args:
-        folder: of weights.
-    """
+    """The configuration of a folder that can be loaded, as far as headers show; else refused."""
     folder = Path(folder)
     config = config_of(folder)
     _tensors(folder, empty_model(config, where=folder), numbers=False)
@@ -488,17 +467,11 @@ def _tensors(folder: Path, model: GeoVerse, *, numbers: bool = True) -> dict[str
 def save_pretrained(
     model: GeoVerse, folder: Path | str, *, dtype: str = "float32", about: str = ""
 ) -> Path:  # The weights' file
-    """Write ``config.json`` and ``geoverse.safetensors``; the video prior keeps its own folder.
+    """Write ``config.json`` and ``geoverse.safetensors``, the latter's path is the result.
 
     Each appears under its name when it is whole, and the weights of an earlier model are never
-    beside the configuration of a later one.
-
-    Args:
-        model: to be saved.
-        folder: made if absent.
-        dtype: of the stored weights, one of ``DTYPES``. Statistics, tables and Fourier frequencies,
-            whose rounding would change what the others mean, keep their float32.
-        about: further words for the weights' metadata.
+    beside the configuration of a later one. Of the stored ``dtype`` (one of ``DTYPES``) statistics,
+    tables and Fourier frequencies are exempt: rounding would change what the others mean.
     """
     folder = Path(folder)
     path, config_path = folder / WHOLE_FILE, folder / CONFIG_FILE
@@ -517,14 +490,9 @@ def save_pretrained(
 
 
 def fresh_extension(model: GeoVerse, loaded: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Untrained extensions, the same at every call.
+    """Untrained extensions, the same at every call; ``loaded`` are the published tensors.
 
     The output is bit for bit that of the published networks, but for the ungated MoT variant.
-
-    Args:
-        model: may be on the meta device.
-        loaded: the published tensors by their names in ``model``; the control branch starts as a
-            copy of some.
     """
     config = model.config
     fresh = {

@@ -1,18 +1,14 @@
-"""Layers of the vision transformer that Depth Anything 3 is built from.
-
-Parameter names are those of the published checkpoints (``norm1``, ``attn.qkv``, ``ls1.gamma`` ...).
-Source: DINOv2 (Oquab et al. 2023) with the query/key norm and 2-D rotary positions of Depth
-Anything 3 (Lin et al. 2025).
-
-Depth Anything 3's camera encoder and decoder: poses to camera tokens and back.
-
-The geometric encoder: Depth Anything 3's backbone, split at the synthesis boundary.
+"""Depth Anything 3's backbone, split at the synthesis boundary, and its camera tokens.
 
 ``encode`` runs the blocks up to a given one and keeps the taps; ``propagate`` runs the rest from
 features that a denoiser made. Blocks alternate from ``alternate_from`` on: even ones attend within
 a view, odd ones across all views. A tap is the concatenation of the last local state and the
 current state (2 x width channels), *raw*: the final LayerNorm is not applied, because it cannot be
 undone and the re-run needs the state before it. ``normed`` applies it to the half that has it.
+
+Parameter names are those of the published checkpoints (``norm1``, ``attn.qkv``, ``ls1.gamma`` ...).
+Source: DINOv2 (Oquab et al. 2023) with the query/key norm and 2-D rotary positions of Depth
+Anything 3 (Lin et al. 2025).
 """
 
 from __future__ import annotations
@@ -51,13 +47,7 @@ class RotaryTable:
 
 
 class Attention(nn.Module):
-    """Multi-head self-attention, optionally with normed queries and keys.
-
-    Args:
-        width: channels.
-        heads: divides ``width``.
-        qk_norm: LayerNorm over each head's queries and keys.
-    """
+    """Multi-head self-attention, optionally with a LayerNorm over each head's queries and keys."""
 
     def __init__(self, width: int, heads: int, *, qk_norm: bool = False) -> None:
         super().__init__()
@@ -135,14 +125,7 @@ POSE_CHANNELS = 9
 
 
 class CameraEncoder(nn.Module):
-    """Known cameras to the tokens that replace the learned camera token.
-
-    Args:
-        width: channels of a token.
-        heads: of the attention over views.
-        depth: number of blocks.
-        layer_scale: initial factor of the blocks' branches.
-    """
+    """Known cameras to the tokens that replace the learned camera token."""
 
     def __init__(
         self, width: int, heads: int = 16, depth: int = 4, *, layer_scale: float = 0.01
@@ -156,16 +139,9 @@ class CameraEncoder(nn.Module):
         self.trunk_norm = nn.LayerNorm(width)
 
     def forward(self, cam_from_world: Tensor, K: Tensor, size: tuple[int, int]) -> Tensor:
-        """Tokens of cameras.
+        """(B, V, width) tokens of cameras (B, V, 4, 4) with K (B, V, 3, 3) in px of the input.
 
-        Args:
-            cam_from_world: (B, V, 4, 4), OpenCV, relative to the reference view for a trained
-                model (``DepthAnything3.relative_cameras``).
-            K: (B, V, 3, 3), px of the network's input.
-            size: (H, W) of the network's input.
-
-        Returns:
-            (B, V, width).
+        A trained model takes ``relative_cameras``.
         """
         encoding = encode_cameras(cam_from_world, K, size)
         tokens = self.token_norm(self.pose_branch(encoding.to(self.token_norm.weight.dtype)))
@@ -204,10 +180,7 @@ def encode_cameras(cam_from_world: Tensor, K: Tensor, size: tuple[int, int]) -> 
 
 
 def quaternion_xyzw(rotation: Tensor) -> Tensor:
-    """(..., 3, 3) rotations to (..., 4) unit quaternions, scalar last and not negative.
-
-    Of the four algebraically equal forms, the one with the largest divisor is taken.
-    """
+    """(..., 3, 3) rotations to (..., 4) unit quaternions, scalar last and not negative."""
     m = rotation
     xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
     squared = torch.stack(
@@ -273,10 +246,7 @@ class PatchEmbed(nn.Module):
 
 
 class Backbone(Recomputing):
-    """The vision transformer. Images are (B, V, 3, H, W), normalised as ImageNet's.
-
-    The first view is the reference view: its frame is the frame of the predicted rays.
-    """
+    """The vision transformer. The first view's frame is the frame of the predicted rays."""
 
     def __init__(self, config: EncoderConfig) -> None:
         super().__init__()
@@ -335,13 +305,10 @@ class Backbone(Recomputing):
     def propagate(
         self, level: Tensor, grid: tuple[int, int], *, boundary: int | None = None
     ) -> list[Tensor]:  # A (B, V, 1 + N, 2 width) tensor for each level after the boundary
-        """The levels after ``boundary``, from the raw features of that level.
+        """(B, V, 1 + N, 2 width) of each level after ``boundary``, from that level's raw features.
 
-        Args:
-            level: (B, V, 1 + N, 2 width) raw, token 0 first. Only its second half (the current
-                state) is used: a local block follows and replaces the first.
-            grid: patches (rows, columns).
-            boundary: the level that ``level`` is; the configured one by default.
+        Only their second half (the current state) is used: a local block follows and replaces the
+        first.
         """
         boundary = self.config.boundary if boundary is None else boundary
         state = level[..., self.config.width :]
@@ -428,10 +395,7 @@ class Backbone(Recomputing):
 
 
 def _ray_embedder(width: int) -> nn.Linear:
-    """Rays as large as what pictures add to a token: the smaller, the later they are learned.
-
-    Origins and moments are fractions of a mean depth.
-    """
+    """Rays as large as what pictures add to a token: the smaller, the later they are learned."""
     embedder = nn.Linear(RAY, width)
     with torch.no_grad():
         nn.init.normal_(embedder.weight)
@@ -443,14 +407,7 @@ def _ray_embedder(width: int) -> nn.Linear:
 def patch_rays(
     cam_from_world: Tensor, K: Tensor, grid: tuple[int, int], *, size: tuple[int, int]
 ) -> Tensor:
-    """(B, V, N, 9): direction (z = 1 in the camera), origin and moment of the patches' middle rays.
-
-    Args:
-        cam_from_world: (B, V, 4, 4).
-        K: (B, V, 3, 3), pixels of the images.
-        grid: patches (rows, columns).
-        size: (H, W) of the images.
-    """
+    """(B, V, N, 9): direction (z = 1 in the camera), origin and moment of patches' middle rays."""
     y = (torch.arange(grid[0], device=K.device, dtype=K.dtype) + 0.5) * (size[0] / grid[0])
     x = (torch.arange(grid[1], device=K.device, dtype=K.dtype) + 0.5) * (size[1] / grid[1])
     rows, columns = torch.meshgrid(y, x, indexing="ij")

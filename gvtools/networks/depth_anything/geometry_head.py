@@ -147,13 +147,7 @@ class GeometryHead(Recomputing):
     def forward(
         self, levels: Sequence[Tensor], grid: tuple[int, int], *, views_at_once: int = 8
     ) -> Geometry:
-        """Depth and rays of all views.
-
-        Args:
-            levels: four (B, V, N, channels) tensors without token 0, as ``Backbone.normed`` gives.
-            grid: patches (rows, columns).
-            views_at_once: views that are decoded together; bounds the memory.
-        """
+        """Depth and rays of all views, of four (B, V, N, channels) levels that are ``normed``."""
         depth, ray = self._outputs(
             levels, grid, (self._depth, self._ray), views_at_once=views_at_once
         )
@@ -272,8 +266,7 @@ def _resized(x: Tensor, size: Sequence[int]) -> Tensor:
 def _with_positions(x: Tensor, image: tuple[int, int], *, ratio: float = 0.1) -> Tensor:
     """``x`` plus a tenth of the sine-cosine table of its pixels' directions in the image plane.
 
-    Coordinates span the image's aspect on a circle of diameter 2; frequencies 100^-k (VGGT, Wang et
-    al. 2025).
+    Coordinates span the image's aspect on a circle of diameter 2 (VGGT, Wang et al. 2025).
     """
     channels, height, width = x.shape[1:]
     aspect = image[1] / image[0]

@@ -1,9 +1,7 @@
-"""Depth Anything 3 (Small, Base and smaller): backbone, geometry head, camera encoder and decoder.
+"""Depth Anything 3: backbone, geometry head, camera encoder and decoder, and released weights.
 
 Parameter names are those of the published ``model.safetensors`` without their prefix ``model.``.
 Source: Depth Anything 3, Lin et al. 2025.
-
-Depth Anything 3 alone, from a folder: as published, or out of a GeoVerse folder.
 """
 
 from __future__ import annotations
@@ -114,16 +112,10 @@ class DepthAnything3(nn.Module):
 
 
 def relative_cameras(cam_from_world: Tensor) -> tuple[Tensor, Tensor]:
-    """Cameras as the camera encoder was trained on them.
+    """``cam_from_world`` (B, V, 4, 4) as the camera encoder was trained on them, and the unit (B,).
 
     The first view's frame becomes the world, and the unit the median distance of the centres from
     it (at least 0.1, so that a camera that only turns stays finite).
-
-    Args:
-        cam_from_world: (B, V, 4, 4).
-
-    Returns:
-        (B, V, 4, 4) relative ``cam_from_world``, and the (B,) unit in the input's units.
     """
     relative = cam_from_world.double() @ torch.linalg.inv(cam_from_world[:, :1].double())
     centres = -(relative[..., :3, :3].transpose(-1, -2) @ relative[..., :3, 3:])[..., 0]
@@ -177,11 +169,7 @@ GEOVERSE_PREFIX = "geometry."
 
 
 def tied_norms(start: str) -> tuple[tuple[str, ...], ...]:
-    """Names of the one LayerNorm that the four ray outputs share; files hold it under one name.
-
-    Args:
-        start: prefix of the head's keys.
-    """
+    """Names of the one LayerNorm that the four ray outputs share; files hold it under one name."""
     return tuple(
         tuple(f"{start}scratch.output_conv2_aux.{level}.2.{kind}" for level in range(4))
         for kind in ("weight", "bias")

@@ -1,19 +1,11 @@
-"""Robust homographies from ray directions, and their factors: rotation and intrinsics.
-
-Cameras from predicted ray maps.
+"""Cameras from predicted ray maps.
 
 A ray map holds, for every cell of a grid over the image, the direction of its ray (channels 0 to 2,
 not of unit length: R K⁻¹ p up to one scale a view) and its origin (channels 3 to 5: the camera
-centre), in the frame of the first view.
-
-=====================  ==========================================================================
-function               use it for
-=====================  ==========================================================================
-camera_centres         the scale of generated depth, losses: differentiable, no fit at all
-poses_least_squares    poses of generated views beside published GLD figures: exact on exact rays,
-                       one K for all views, no protection against outliers
-poses_ransac           poses of Depth Anything 3's rays: K of every view, outliers are left out
-=====================  ==========================================================================
+centre), in the frame of the first view. ``camera_centres`` needs no fit and is differentiable;
+``poses_least_squares`` is exact on exact rays, with one K for all views and no protection against
+outliers, as in published GLD figures; ``poses_ransac`` leaves outliers out and gives every view's
+K.
 
 ``poses_ransac`` repeats a flaw of the published method unless told otherwise: the direction matrix
 is R K⁻¹ with K⁻¹ *upper* triangular, and is factored into a rotation and a *lower* triangular
@@ -52,10 +44,7 @@ def candidates(count: int) -> int:
 
 
 def draw_samples(count: int, *, seed: int) -> Tensor:
-    """(ITERATIONS, SAMPLE) places among the candidates of ``count`` rays.
-
-    The same as Depth Anything 3 draws on a CPU after ``torch.manual_seed(seed)``.
-    """
+    """(ITERATIONS, SAMPLE) candidates of ``count`` rays, as Depth Anything 3 draws them."""
     if count < SAMPLE:
         raise DegenerateError(f"{count} rays; a homography is sampled from at least {SAMPLE}")
     generator = torch.Generator().manual_seed(seed)
@@ -65,19 +54,11 @@ def draw_samples(count: int, *, seed: int) -> Tensor:
 
 
 def fit(source: Tensor, target: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Homographies that minimise the weighted algebraic error.
+    """Homographies (..., 3, 3) of least weighted algebraic error, of points (..., N, 2) in float64.
 
     The null direction of the 9x9 normal matrix, which in float64 is as good as the singular vector
-    of the (2N, 9) system and needs no memory that grows with N.
-
-    Args:
-        source: (..., N, 2) float64.
-        target: (..., N, 2).
-        weight: (..., N) >= 0, of the squared errors.
-
-    Returns:
-        (..., 3, 3), up to scale, and (...), the share of the second smallest eigenvalue in the
-        largest: 0 where the points do not determine a homography.
+    of the (2N, 9) system and needs no memory that grows with N. With it (...), the share of the
+    second smallest eigenvalue in the largest: 0 where the points determine no homography.
     """
     point = torch.cat((source, torch.ones_like(source[..., :1])), dim=-1)
     weighted = point * weight[..., None]
@@ -102,16 +83,11 @@ def fit(source: Tensor, target: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]
 def ransac(
     source: Tensor, target: Tensor, weight: Tensor, *, samples: Tensor, threshold: float
 ) -> Tensor:  # (3, 3), up to scale, determinant above 0
-    """The homography of the sample whose inliers weigh most, fitted again to these.
+    """The homography (3, 3), determinant above 0, of the sample whose inliers weigh most.
 
-    Depth Anything 3 fits again to at most 8000 inliers drawn at random; here it is all of them.
-
-    Args:
-        source: (N, 2) float64.
-        target: (N, 2).
-        weight: (N,) >= 0.
-        samples: (iterations, S) places among the candidates, by falling weight.
-        threshold: an inlier's error is below it, in units of ``target``.
+    ``samples`` (iterations, S) are places among the candidates, by falling weight; the inliers'
+    error is below ``threshold``. The best is fitted again to all inliers (Depth Anything 3: at most
+    8000).
     """
     pool = min(candidates(len(source)), len(source))
     if samples.ndim != 2 or int(samples.min()) < 0 or int(samples.max()) >= pool:
@@ -138,11 +114,9 @@ def ransac(
 def factor(H: Tensor, *, upper: bool) -> tuple[Tensor, Tensor]:
     """A (3, 3) matrix R K⁻¹ of determinant above 0, to R and K, both (3, 3), K[2, 2] = 1.
 
-    Args:
-        H: up to scale.
-        upper: K⁻¹ is upper triangular, as intrinsics are. Else H is R times a *lower* triangular
-            L, as published, whose diagonal gives 1 / focal lengths and whose last row the
-            principal point, which holds for a principal point of 0 alone.
+    ``upper``: K⁻¹ is upper triangular, as intrinsics are. Else H is R times a *lower* triangular L,
+    as published, whose diagonal gives 1 / focal lengths and whose last row the principal point,
+    which holds for a principal point of 0 alone.
     """
     # A lower triangular factor is the upper one of the columns in reverse order.
     order = [0, 1, 2] if upper else [2, 1, 0]
@@ -173,15 +147,7 @@ class RayCameras:
 
 
 def camera_centres(ray: Tensor, confidence: Tensor | None = None) -> Tensor:
-    """Confidence-weighted mean of the origins of each view's rays; differentiable.
-
-    Args:
-        ray: (..., h, w, 6).
-        confidence: (..., h, w) >= 0; None for equal weights.
-
-    Returns:
-        (..., 3), the rays' units and dtype.
-    """
+    """(..., 3) mean of the origins of each view's rays (..., h, w, 6), weighted; differentiable."""
     _check(ray, confidence)
     origin = ray[..., 3:]
     if confidence is None:
