@@ -62,8 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace, console: Console) -> None:
     """Draw and write the film."""
     from gvtools.runs.memory_file import load_memory
-    from pipelines.film.path import film_cameras
-    from pipelines.film.writer import check_suffix, write_film
+    from pipelines.film import check_suffix, film_cameras, write_film
 
     check_suffix(args.out)
     if not 0 < args.fps <= 240:
@@ -91,7 +90,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
 
 
 def _panels(args: argparse.Namespace) -> tuple[str, ...]:
-    from pipelines.film.panels import PANELS
+    from pipelines.film import PANELS
 
     if args.complete:
         return ("completed",)
@@ -120,7 +119,7 @@ def _frames(
     """All frames in order; ``spent`` receives the seconds of projecting."""
     import numpy as np
 
-    from pipelines.film.panels import FilmRenderer, captioned
+    from pipelines.film import FilmRenderer, captioned
 
     for number in rounds:
         renderer = FilmRenderer(args.memory, cameras, up_to=number)

@@ -74,8 +74,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
     from gvtools.runs.layout import file_stems
     from gvtools.runs.memory_file import load_appearance, load_memory
     from gvtools.scenes.selection import select
-    from pipelines.rendering.figures import measure, render_view, summary
-    from pipelines.rendering.view_files import write_view
+    from pipelines.rendering import measure, render_view, summary, write_view
 
     if args.out is None and not args.against_images:
         raise OptionError("--out: nothing would be left; give a folder, or --against-images")

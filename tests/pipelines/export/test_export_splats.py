@@ -18,7 +18,7 @@ from gvtools.memory.splat.api import SplatOptions
 from gvtools.memory.store.local_frame import LocalFrame
 from gvtools.memory.thinning import thinned
 from gvtools.runs.memory_file import load_appearance
-from pipelines.rendering.figures import render_view
+from pipelines.rendering import render_view
 
 ORIGIN = (431_000.0, 5_650_000.0, 120.0)
 

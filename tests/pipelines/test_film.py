@@ -11,8 +11,7 @@ from PIL import Image, ImageSequence
 from tiny_scan import write_scan
 
 from pipelines.cli import main
-from pipelines.film.panels import FilmRenderer, captioned
-from pipelines.film.path import film_cameras
+from pipelines.film import FilmRenderer, captioned, film_cameras
 
 pytestmark = pytest.mark.usefixtures("unpainted")
 

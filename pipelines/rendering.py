@@ -1,16 +1,26 @@
-"""What a rendered view is worth: its time, its coverage, and its figures against a picture."""
+"""Rendered views: their figures against pictures, and their files.
+
+The files are NAME.rgb.png, NAME.depth.npz, NAME.valid.png and NAME.confidence.png. A confidence c
+is drawn as the grey level 255 c / (1 + c): 1 is mid grey, and every c has its own side of it.
+``depth.npz`` holds the key ``depth``, float32, scene units, 0 = none.
+"""
 
 from __future__ import annotations
 
 import statistics
 import time
 from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from gvtools.appearance.appearance import Appearance, applied
 from gvtools.cameras import Cameras
 from gvtools.evaluation.lpips_distance import Lpips
 from gvtools.evaluation.view_figures import FIGURES, view_figures
+from gvtools.files import replaced_when_written
 from gvtools.guidance import Guidance
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.splat.api import SplatOptions
@@ -44,13 +54,6 @@ def measure(
 
     A picture's mask limits every comparison and leaves the coverage as it is. On all pixels, holes
     count as black.
-
-    Args:
-        name: the view's.
-        guidance: a batch of one.
-        frame: the picture, and depth where there is some, of the same camera.
-        seconds: what the projection took.
-        lpips: the network; None leaves LPIPS out.
     """
     figures: dict[str, Any] = {"view": name, "coverage": guidance.coverage, "seconds": seconds}
     figures |= dict.fromkeys(FIGURES)
@@ -103,3 +106,24 @@ def _reason(key: str) -> str:
     if key.startswith("depth"):
         return "no reference depth where the memory is in view"
     return "no pixel to compare"
+
+
+def write_view(folder: Path, stem: PurePosixPath, guidance: Guidance) -> None:
+    """Write the four files of one view; sub-folders of ``stem`` are made, too."""
+    confidence = guidance.confidence[0].astype(np.float64)
+    grey = np.round(255 * confidence / (1 + confidence)).astype(np.uint8)
+    rgb = np.round(np.clip(guidance.rgb[0], 0, 1) * 255).astype(np.uint8)
+    base = folder / stem
+    _write_png(base.with_name(f"{base.name}.rgb.png"), rgb)
+    _write_png(base.with_name(f"{base.name}.valid.png"), guidance.valid[0].astype(np.uint8) * 255)
+    _write_png(base.with_name(f"{base.name}.confidence.png"), grey)
+    path = base.with_name(f"{base.name}.depth.npz")
+    with replaced_when_written(path) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, depth=guidance.depth[0].astype(np.float32))
+
+
+def _write_png(path: Path, pixels: NDArray[np.uint8]) -> None:
+    from PIL import Image
+
+    with replaced_when_written(path) as temporary:
+        Image.fromarray(pixels).save(temporary, format="PNG", compress_level=3)

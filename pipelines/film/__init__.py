@@ -1,1 +1,0 @@
-"""Films of a memory: a path of cameras, what each frame shows, and the file."""

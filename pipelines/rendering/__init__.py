@@ -1,1 +1,0 @@
-"""Pictures of a saved memory in given cameras, and their figures."""
