@@ -80,7 +80,7 @@ def test_every_setting_has_a_row_with_its_meaning(hooks: ModuleType) -> None:
 
 
 def test_every_data_set_has_a_row_and_its_facts(hooks: ModuleType) -> None:
-    from gvtools.scenes.data_sets.spec import load_spec, spec_names
+    from gvtools.scenes.data_sets.catalogue import load_spec, spec_names
 
     page = hooks.data_sets_page()
     for spec in map(load_spec, spec_names()):

@@ -22,7 +22,7 @@ from benchmarks.experiments.level_render import LevelScene
 from benchmarks.experiments.level_textures import Pictures
 from benchmarks.experiments.quake_levels import Archives, read_level
 from gvtools.errors import GvError
-from gvtools.scenes.sevenscenes import INTRINSICS
+from gvtools.scenes.calibration import INTRINSICS
 from gvtools.training.hints import Clip
 
 # Names of maps that begin with as many equal letters may be of one map's versions.

@@ -10,7 +10,7 @@ from PIL import Image
 from gvtools.capture.photographs import Photograph
 from gvtools.errors import ProjectError
 from gvtools.scenes.images import read_mask
-from gvtools.scenes.photographs import named
+from gvtools.scenes.matching import named
 from gvtools.scenes.scene import Finding
 
 

@@ -18,7 +18,7 @@ from PIL import Image, ImageOps
 
 from gvtools.errors import ProjectError
 from gvtools.scenes.images import UNREADABLE
-from gvtools.scenes.photographs import named
+from gvtools.scenes.matching import named
 from gvtools.scenes.project import PICTURES
 from gvtools.scenes.scene import Finding, natural_key
 from gvtools.untrusted import open_picture, read_bytes

@@ -30,7 +30,7 @@ from gvtools.errors import OptionError, ProjectError
 from gvtools.files import write_json
 from gvtools.runs.folder_lock import folder_lock
 from gvtools.scenes.faces import picture_of
-from gvtools.scenes.photographs import named
+from gvtools.scenes.matching import named
 from gvtools.scenes.scene import Finding
 
 if TYPE_CHECKING:

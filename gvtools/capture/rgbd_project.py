@@ -25,13 +25,20 @@ from gvtools.capture.rgbd_frames import RgbdFrames
 from gvtools.capture.rgbd_poses import Found, find_poses
 from gvtools.errors import ProjectError
 from gvtools.files import link_or_copy, write_json
+from gvtools.scenes.calibration import INTRINSICS
 from gvtools.scenes.images import UNREADABLE
-from gvtools.scenes.photographs import named
-from gvtools.scenes.rgbd import SIDECAR, resolve_options, rgbd_scene
-from gvtools.scenes.rgbd_recording import Recording, RgbdFrame, RgbdOptions
+from gvtools.scenes.matching import named
+from gvtools.scenes.photographs import PosedFrame
+from gvtools.scenes.rgbd import (
+    SIDECAR,
+    UNPOSED,
+    Recording,
+    RgbdOptions,
+    read_unposed,
+    resolve_options,
+    rgbd_scene,
+)
 from gvtools.scenes.scene import Finding, Scene
-from gvtools.scenes.sevenscenes import INTRINSICS
-from gvtools.scenes.unposed import LOOKS_LIKE, read_unposed
 from gvtools.untrusted import open_picture
 
 Float64 = NDArray[np.float64]
@@ -103,7 +110,7 @@ def capture_rgbd(
     """Find the poses of an RGB-D recording, and write a project.
 
     Args:
-        source: a folder of colour and depth, see ``gvtools.scenes.unposed``, or a ``.bag``.
+        source: a folder of colour and depth, see ``gvtools.scenes.rgbd``, or a ``.bag``.
         out: the project's folder; must not hold anything yet.
         options: what the folder does not tell by itself.
         say: told of each step.
@@ -139,9 +146,7 @@ def _read(source: Path, options: RgbdOptions | None) -> tuple[Recording, Scene, 
     resolved, met = resolve_options(source, options)
     recording = read_unposed(source, resolved)
     if recording is None:
-        raise ProjectError(
-            f"{source}: no RGB-D recording; expected one of: {'; '.join(LOOKS_LIKE)}"
-        )
+        raise ProjectError(f"{source}: no RGB-D recording; expected one of: {'; '.join(UNPOSED)}")
     if len(recording.frames) < 2:
         raise ProjectError(
             f"{source}: {len(recording.frames)} frames with picture and depth; expected at least "
@@ -164,10 +169,10 @@ def _read(source: Path, options: RgbdOptions | None) -> tuple[Recording, Scene, 
     return replace(recording, frames=[frames[name] for name in scene.names]), scene, resolved
 
 
-def _readable(frame: RgbdFrame) -> bool:
+def _readable(frame: PosedFrame) -> bool:
     """Whether both of a frame's files can be decoded."""
     try:
-        for path in (frame.color, frame.depth):
+        for path in (frame.image, frame.depth):
             if path is not None:
                 with open_picture(path) as picture:
                     picture.load()
@@ -180,9 +185,9 @@ def _names(recording: Recording) -> list[str]:
     """Names of the project's pictures: 7-Scenes' own stay, others are numbered in order."""
     names = []
     for number, frame in enumerate(recording.frames):
-        kept = ".color." in frame.color.name
-        suffix = frame.color.suffix.lower()
-        names.append(frame.color.name if kept else f"frame-{number:06d}.color{suffix}")
+        kept = ".color." in frame.image.name
+        suffix = frame.image.suffix.lower()
+        names.append(frame.image.name if kept else f"frame-{number:06d}.color{suffix}")
     return names
 
 
@@ -199,7 +204,7 @@ def _write(
         frame = recording.frames[number]
         assert frame.depth is not None
         stem = names[number][: names[number].rindex(".color.")]
-        link_or_copy(frame.color, work / names[number])
+        link_or_copy(frame.image, work / names[number])
         link_or_copy(frame.depth, work / f"{stem}.depth.png")
         _save(work / f"{stem}.pose.txt", pose)
     color_K = recording.color_K if options.color_K is None else np.asarray(options.color_K)
@@ -232,7 +237,7 @@ def _report(
     scene: Scene, found: Found, names: Sequence[str], *, source: Path, sources: Recording
 ) -> RgbdCaptureReport:
     kept = sorted(found.poses)
-    files = [os.path.relpath(frame.color, sources.root) for frame in sources.frames]
+    files = [os.path.relpath(frame.image, sources.root) for frame in sources.frames]
     left_out = {
         files[number]: f"agrees with {len(part) - 1} other frames, and none of the largest part"
         if len(part) > 1

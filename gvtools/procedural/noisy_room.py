@@ -23,7 +23,7 @@ from gvtools.procedural.render import developed, radiance
 from gvtools.procedural.room_sample import RoomSample, check_options, room_views
 from gvtools.procedural.sample_workspace import is_written, written_whole
 from gvtools.procedural.shading import Look
-from gvtools.scenes.sevenscenes import INTRINSICS
+from gvtools.scenes.calibration import INTRINSICS
 from gvtools.similarity import align_poses
 
 Float32 = NDArray[np.float32]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.errors import OptionError
-from gvtools.scenes.rgbd_recording import load_matrix
+from gvtools.scenes.calibration import load_matrix
 
 ESTIMATE, IDENTITY = "estimate", "identity"
 FORMS = (

@@ -30,8 +30,7 @@ def open_collection(address: str, root: Path | None = None) -> SceneCollection:
                 f"{address}: a root {root} is given; expected one for spec:NAME alone"
             )
         return _project_or_shards(Path(address))
-    from gvtools.scenes.data_sets.layouts import open_data_set, scenes_of
-    from gvtools.scenes.data_sets.spec import load_spec, name_key
+    from gvtools.scenes.data_sets.catalogue import load_spec, name_key, open_data_set, scenes_of
 
     name, colon, scene = address.removeprefix(SPEC).partition(":")
     spec = load_spec(name)
@@ -47,8 +46,7 @@ def open_collection(address: str, root: Path | None = None) -> SceneCollection:
 
 
 def _read(data_set: str, scene: str, *, root: Path) -> Scene:
-    from gvtools.scenes.data_sets.layouts import read_scene
-    from gvtools.scenes.data_sets.spec import load_spec
+    from gvtools.scenes.data_sets.catalogue import load_spec, read_scene
 
     return read_scene(load_spec(data_set), scene, root)
 

@@ -11,6 +11,7 @@ from gvtools.scenes.colmap_depth import depth_map_path, depth_map_size, read_dep
 from gvtools.scenes.colmap_files import find_model
 from gvtools.scenes.colmap_model import ColmapModel, load_model, sparse_points
 from gvtools.scenes.images import read_depth
+from gvtools.scenes.matching import named
 from gvtools.scenes.photographs import (
     Photograph,
     depth_findings,
@@ -18,7 +19,6 @@ from gvtools.scenes.photographs import (
     header_findings,
     lens_findings,
     mask_findings,
-    named,
 )
 from gvtools.scenes.scene import Finding, Scene, natural_key
 from gvtools.untrusted import is_file, named_file

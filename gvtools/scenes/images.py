@@ -129,6 +129,13 @@ def read_depth(
             f"{path}: depth of shape {raw.shape} and type {raw.dtype}; expected (height, width) "
             "numbers"
         )
+    return readings(raw, unit=unit, maximum=maximum)
+
+
+def readings(
+    raw: NDArray[Any], *, unit: float = 1.0, maximum: float | None = None
+) -> NDArray[np.float32]:
+    """Stored depths as float32, scene units, 0 for what is no reading as ``read_depth`` says."""
     with np.errstate(all="ignore"):  # what overflows is no reading
         depth = raw.astype(np.float32) * np.float32(unit)
     valid = np.isfinite(depth) & (depth > 0)

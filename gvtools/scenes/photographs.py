@@ -1,71 +1,272 @@
-"""A recorded photograph with what lies beside it, brought into its pinhole camera."""
+"""Posed photographs as a scene: the one builder of views, and its findings.
+
+A reader lists the frames that a scene should have, present on disk or not, as ``PosedFrame``. Here
+they are checked by file size and header alone, distorted cameras become pinholes, and depth of
+another camera is registered. What is missing or damaged of a data set is left out and counted, and
+intrinsics follow pictures of another size; a project of the user's own is read strictly: an
+impossible pose or camera is refused, a damaged picture an error.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.cameras import ROTATION_ROUNDING, Cameras
-from gvtools.errors import ProjectError
+from gvtools.cameras import ROTATION_ROUNDING, Cameras, invert_rigid, rigid_transform
+from gvtools.errors import GvError, ProjectError
+from gvtools.scenes.calibration import Float64, scaled_lens
 from gvtools.scenes.images import (
     ImageHeader,
     check_size,
     fit_depth,
+    read_depth,
     read_header,
     read_image,
     read_mask,
     same_aspect,
 )
-from gvtools.scenes.scene import Finding, Frame, View
-from gvtools.scenes.undistort import Undistortion
+from gvtools.scenes.matching import named
+from gvtools.scenes.scene import Finding, Frame, Scene, View, natural_key
+from gvtools.scenes.transforms_frame import LensParameters
+from gvtools.scenes.undistort import Undistortion, undistortion
+from gvtools.untrusted import named_file
 
 Depth = NDArray[np.float32]
-NAMED_AT_MOST = 3  # a finding names this many files and counts the rest
+
+# Reasons for which a frame is left out, as findings have them.
+NO_PICTURE = "have no picture"
+NO_POSE = "have no pose"
+LOST = "were lost by the tracker"
+NO_LENS = "have no intrinsics"
+UNREADABLE = "have a damaged picture"
+OTHER_ASPECT = "have a picture of another aspect than their camera"
+BAD_POSE = "have an impossible pose"
+BAD_CAMERA = "have an impossible camera"
 
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """Where the depth camera stands, when depth was not measured by the colour camera.
+    """The depth camera, when depth was not measured by the colour camera."""
 
-    Attributes:
-        depth_K: (3, 3) float64, pixels, first pixel centre (0.5, 0.5).
-        color_from_depth: (4, 4) float64, rigid, scene units.
+    depth_K: Float64  # (3, 3), pixels, first pixel centre (0.5, 0.5)
+    color_from_depth: Float64  # (4, 4), rigid, scene units
+
+
+@dataclass(frozen=True, eq=False)
+class PosedFrame:
+    """A frame that a layout names, whether or not its files are there."""
+
+    name: str  # the view's
+    image: Path  # the picture, or the file that holds it among others
+    # Of pictures of ``lens.size``; a picture of the same aspect and another size gets it scaled.
+    # None where the layout lacks it.
+    lens: LensParameters | None
+    pose: Float64 | None  # (4, 4) or (3, 4), OpenCV axes, scene units; None where there is none
+    depth: Path | None = None  # the depth map, or the file that holds it
+    # To (h, w) float32 z-depth in scene units, 0 = none.
+    read_depth: Callable[[Path], Depth] = read_depth
+    mask: Path | None = None  # black = ignore
+    registration: Registration | None = None
+    # None: ``image`` is a picture file. What has a reader of its own is of ``lens.size``.
+    read: Callable[[Path], Frame] | None = None
+    where: str = ""  # the file of the pose, for messages
+
+
+class _LeftOut(Exception):
+    """A frame is left out: the reason, and what it is in detail."""
+
+
+@dataclass(eq=False)
+class _Sieve:
+    """Which frames are left out, why, and what else is to report."""
+
+    total: int
+    strict: bool
+    dropped: dict[str, list[str]] = field(default_factory=dict)
+    details: dict[str, list[str]] = field(default_factory=dict)
+    headers: list[ImageHeader] = field(default_factory=list)
+    scaled: Counter[str] = field(default_factory=Counter)
+    defects: list[float] = field(default_factory=list)
+    sizes: dict[Path, int] = field(default_factory=dict)
+
+    def present(self, path: Path | None) -> Path | None:
+        """The file, if it is there with content; an interrupted download may leave it empty."""
+        if path is not None and path not in self.sizes:
+            try:
+                size = path.stat().st_size if path.is_file() else 0
+                self.sizes[path] = max(size, path.is_file() and self.strict)
+            except (OSError, ValueError):
+                self.sizes[path] = 0
+        return path if path is not None and self.sizes[path] > 0 else None
+
+    def findings(self) -> list[Finding]:
+        found = []
+        for reason, names in self.dropped.items():
+            listed = "; ".join([named(names), *self.details[reason]])
+            line = f"{len(names)} of {self.total} frames {reason}: dropped ({listed})"
+            found.append(Finding("warning", line))
+        found += [Finding("info", f"{count} {line}") for line, count in self.scaled.items()]
+        return found + rotation_findings(self.defects) + conversion_findings(self.headers)
+
+
+def posed_scene(
+    root: Path,
+    frames: Sequence[PosedFrame],
+    *,
+    poses: Literal["cam_from_world", "world_from_cam"],
+    metric: bool,
+    kind: str = "data set",
+    strict: bool = False,
+    findings: Sequence[Finding] = (),
+    home: Path | None = None,
+    unposed: str = NO_POSE,
+) -> Scene:
+    """The scene of the frames that can be used.
+
+    Args:
+        root: the scene's folder or file.
+        frames: that the layout names.
+        poses: which way ``PosedFrame.pose`` maps.
+        metric: whether the units of poses and depth are metres.
+        kind: of the scene.
+        strict: see the module's text.
+        findings: what the reader met.
+        home: the folder that no file of a frame may lie outside of; None: ``root``.
+        unposed: reason for which frames without a pose are left out.
     """
+    sieve = _Sieve(len(frames), strict)
+    lenses: dict[LensParameters, Undistortion] = {}
+    photographs = []
+    for frame in sorted(frames, key=lambda item: natural_key(item.name)):
+        for path in (frame.image, frame.depth, frame.mask):
+            # A download may be kept elsewhere and linked; a name out of a file may not lead there.
+            if path is not None:
+                where = f"{root}, frame {frame.name}"
+                named_file(home or root, path, where=where, follow_links=True)
+        try:
+            pose = _rigid(frame, sieve, unposed=unposed)
+            lens = _lens(frame, lenses, sieve)
+        except _LeftOut as left:
+            reason, *detail = left.args
+            sieve.dropped.setdefault(reason, []).append(frame.name)
+            sieve.details.setdefault(reason, detail)
+            continue
+        photographs.append(
+            Photograph(
+                frame.name,
+                frame.image,
+                lens,
+                pose if poses == "cam_from_world" else invert_rigid(pose),
+                sieve.present(frame.mask),
+                sieve.present(frame.depth),
+                frame.read_depth,
+                frame.registration,
+                frame.read or read_image,
+            )
+        )
+    missing = [item.name for item in photographs if item.depth is None]
+    report = [*findings, *sieve.findings()]
+    if not photographs:
+        reasons = "; ".join(item.message for item in report if item.level != "info")
+        raise ProjectError(
+            f"{root}: none of {len(frames)} frames can be read{reasons and f' ({reasons})'}; "
+            "expected at least one with picture and pose"
+            + ("" if strict else "; complete the download")
+        )
+    if missing and any(frame.depth is not None for frame in frames):
+        line = f"{len(missing)} of {len(photographs)} frames have no depth map ({named(missing)})"
+        report.append(Finding("warning", line))
+    report += lens_findings([item.lens for item in photographs])
+    if strict:
+        files = [item for item in photographs if item.read is read_image]
+        report += header_findings([(item.image, item.lens.source_size) for item in files])
+    views = tuple(item.view() for item in photographs)
+    return Scene(Path(root), kind, views, None, tuple(report), metric=metric)
 
-    depth_K: NDArray[np.float64]
-    color_from_depth: NDArray[np.float64]
+
+def _rigid(frame: PosedFrame, sieve: _Sieve, *, unposed: str) -> Float64:
+    """(4, 4), the frame's pose as it maps in its layout."""
+    if sieve.present(frame.image) is None:
+        raise _LeftOut(NO_PICTURE)
+    if frame.pose is None or (np.isnan(frame.pose).any() and not sieve.strict):
+        raise _LeftOut(unposed)
+    if np.isinf(frame.pose).any():
+        raise _LeftOut(LOST)
+    try:
+        rigid, defect = rigid_transform(frame.pose, what=frame.where or frame.name)
+    except GvError as error:
+        if sieve.strict:
+            raise
+        raise _LeftOut(BAD_POSE, str(error)) from None
+    sieve.defects.append(defect)
+    return rigid
+
+
+def _lens(
+    frame: PosedFrame, lenses: dict[LensParameters, Undistortion], sieve: _Sieve
+) -> Undistortion:
+    """The frame's way to a pinhole camera; ``lenses`` is added to."""
+    if frame.lens is None:
+        raise _LeftOut(NO_LENS)
+    size = frame.lens.size
+    if frame.read is None and not sieve.strict:
+        try:
+            header = read_header(frame.image)
+        except ProjectError as error:
+            raise _LeftOut(UNREADABLE, str(error)) from None
+        sieve.headers.append(header)
+        size = header.width, header.height
+    line = f"{size[0]}x{size[1]} for cameras of {frame.lens.size[0]}x{frame.lens.size[1]}"
+    if size != frame.lens.size and not same_aspect(size, frame.lens.size):
+        raise _LeftOut(OTHER_ASPECT, line)
+    if size != frame.lens.size:
+        sieve.scaled[f"pictures of {line}: intrinsics scaled"] += 1
+    try:
+        params = scaled_lens(frame.lens, size)
+        if params not in lenses:
+            what = str(frame.image) if sieve.strict else frame.name
+            lenses[params] = undistortion(params.model, params.values, size, what=what)
+        return lenses[params]
+    except ProjectError as error:
+        if sieve.strict:
+            raise
+        raise _LeftOut(BAD_CAMERA, str(error)) from None
+
+
+def first_size(pictures: Iterable[Path]) -> tuple[int, int] | None:
+    """Width and height of the first picture that can be read, pixels; None where none can.
+
+    For layouts that do not store the size which their intrinsics are of.
+    """
+    for path in pictures:
+        try:
+            header = read_header(path)
+        except ProjectError:
+            continue
+        return header.width, header.height
+    return None
 
 
 @dataclass(frozen=True, eq=False)
 class Photograph:
-    """One picture on disk, its mask and its depth, of one recorded camera (or a depth camera).
+    """One picture on disk, its mask and its depth, of one recorded camera (or a depth camera)."""
 
-    Attributes:
-        name: the view's name.
-        image: the picture.
-        lens: from the recorded camera to the view's.
-        cam_from_world: (4, 4) float64, rigid.
-        mask: black = ignore; None when there is none.
-        depth: the depth map; None when there is none.
-        read_depth: how ``depth`` is read, to (h, w) float32 z-depth in scene units, 0 = none.
-        registration: the depth camera, when it is another one than the picture's.
-        read: how ``image`` is read; it may be a file that holds many pictures.
-    """
-
-    name: str
+    name: str  # the view's
     image: Path
-    lens: Undistortion
-    cam_from_world: NDArray[np.float64]
-    mask: Path | None = None
+    lens: Undistortion  # from the recorded camera to the view's
+    cam_from_world: NDArray[np.float64]  # (4, 4), rigid
+    mask: Path | None = None  # black = ignore
     depth: Path | None = None
+    # To (h, w) float32 z-depth in scene units, 0 = none.
     read_depth: Callable[[Path], Depth] | None = None
     registration: Registration | None = None
-    read: Callable[[Path], Frame] = read_image
+    read: Callable[[Path], Frame] = read_image  # ``image`` may hold many pictures
 
     def view(self) -> View:
         """The photograph as a view that loads lazily."""
@@ -116,12 +317,7 @@ class Photograph:
 
 
 def given_folder(folder: Path, held: str) -> Path:
-    """The folder that the caller gave for what lies beside pictures.
-
-    Args:
-        folder: as it was given.
-        held: what it should hold, in the plural, for the message.
-    """
+    """The folder that the caller gave for what lies beside pictures, named in the plural."""
     folder = Path(folder)
     if not folder.is_dir():
         raise ProjectError(f"{folder}: no such folder ({held} were expected there)")
@@ -136,13 +332,9 @@ def mask_findings(unmasked: int, folder: Path | None) -> list[Finding]:
 
 
 def header_findings(pictures: Sequence[tuple[Path, tuple[int, int]]]) -> list[Finding]:
-    """What the headers of pictures tell before any is decoded.
+    """An error for each unreadable picture or wrong size, and a line a kind of conversion.
 
-    Args:
-        pictures: each file with the width and height that its camera expects.
-
-    Returns:
-        An error for each unreadable file or wrong size, and one line for each kind of conversion.
+    Each file comes with the width and height that its camera expects; none is decoded.
     """
     findings: list[Finding] = []
     headers: list[ImageHeader] = []
@@ -177,14 +369,10 @@ def conversion_findings(headers: Sequence[ImageHeader]) -> list[Finding]:
 def depth_findings(
     depths: Sequence[tuple[Path, tuple[int, int]]], size_of: Callable[[Path], tuple[int, int]]
 ) -> list[Finding]:
-    """What the headers of depth maps tell before any is decoded.
+    """An error for each unreadable depth map or other aspect, and a line a size that differs.
 
-    Args:
-        depths: each file with the width and height of its picture.
-        size_of: reads a file's width and height; raises ProjectError.
-
-    Returns:
-        An error for each unreadable file or other aspect, and one line for each size that differs.
+    Each file comes with the width and height of its picture; ``size_of`` reads a map's own and
+    raises ProjectError. None is decoded.
     """
     findings: list[Finding] = []
     resized: Counter[str] = Counter()
@@ -236,10 +424,3 @@ def rotation_findings(defects: Sequence[float]) -> list[Finding]:
             f"was {max(defects):.2g}",
         )
     ]
-
-
-def named(items: Sequence[object]) -> str:
-    """The first few of ``items`` and how many more, for a message."""
-    shown = ", ".join(str(item) for item in items[:NAMED_AT_MOST])
-    rest = len(items) - NAMED_AT_MOST
-    return shown + (f" and {rest} more" if rest > 0 else "")

@@ -9,33 +9,24 @@ from pathlib import Path
 from gvtools.errors import OptionError, ProjectError, UnposedError
 from gvtools.scenes.colmap_files import find_model
 from gvtools.scenes.data_sets.address import FORM, is_address
-from gvtools.scenes.phones.polycam import POLYCAM
-from gvtools.scenes.phones.record3d import RECORD3D
-from gvtools.scenes.phones.scanner_app import SCANNER_APP
-from gvtools.scenes.phones.stray_scanner import STRAY_SCANNER
-from gvtools.scenes.photographs import named
-from gvtools.scenes.redwood import REDWOOD
-from gvtools.scenes.rgbd_recording import RgbdOptions
-from gvtools.scenes.scannet import SCANNET
+from gvtools.scenes.matching import named
+from gvtools.scenes.phones import POLYCAM, SCANNER_APP, STRAY_SCANNER
+from gvtools.scenes.record3d import RECORD3D
+from gvtools.scenes.rgbd import LAYOUTS, RgbdOptions, count_unposed
 from gvtools.scenes.scene import Finding, Scene
-from gvtools.scenes.sevenscenes import SEVENSCENES
 from gvtools.scenes.transforms_json import FILE as TRANSFORMS
 from gvtools.scenes.transforms_json import read_transforms
-from gvtools.scenes.tum import TUM
-from gvtools.scenes.unposed import count_unposed
 
 PICTURES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg")
 # A recording of a RealSense camera.
 BAG = ".bag"
-# ScanNet before Redwood: both have colour and depth folders.
-LAYOUTS = (SEVENSCENES, TUM, SCANNET, REDWOOD)
 # What apps export; nothing has to be said about how they are read.
 PHONES = (RECORD3D, POLYCAM, SCANNER_APP, STRAY_SCANNER)
 LOOKED_FOR = (
     "a COLMAP model (cameras.bin or .txt in sparse/N, sparse, sparse_txt or the folder itself)",
     "transforms.json",
-    *(layout.looks_like for layout in (*LAYOUTS, *PHONES)),
+    *(layout.holds for layout in (*LAYOUTS, *PHONES)),
 )
 
 
@@ -71,7 +62,7 @@ def open_project(
                 f"{path}: the data set's spec says how it is read; expected neither images, masks, "
                 "a model's number nor RGB-D options"
             )
-        from gvtools.scenes.data_sets.layouts import open_address
+        from gvtools.scenes.data_sets.catalogue import open_address
 
         return open_address(path, root)
     if root is not None:

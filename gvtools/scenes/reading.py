@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gvtools.errors import OptionError, ProjectError
+from gvtools.scenes.calibration import load_matrix
 from gvtools.scenes.data_sets.address import is_address
 from gvtools.scenes.project import open_project
-from gvtools.scenes.rgbd_recording import RgbdOptions, load_matrix
+from gvtools.scenes.rgbd import RgbdOptions
 
 if TYPE_CHECKING:
     from gvtools.scenes.scene import Scene

@@ -1,73 +1,462 @@
-"""Posed RGB-D folders: what their layouts have in common.
+"""RGB-D folders in the layouts of 7-Scenes, TUM, ScanNet and Redwood, with poses and without.
 
-A layout is one file that defines an ``RgbdLayout``, and a line in ``project.LAYOUTS``. Its
-``record`` finds frames, poses and intrinsics and describes them as a ``Recording``; here they
-become a scene. Every supported layout publishes intrinsics whose first pixel centre is (0, 0), as
-Kinect drivers and Open3D count; they are moved by half a pixel to the project's (0.5, 0.5) in this
-file, once.
+- 7-Scenes: ``frame-XXXXXX.{color.png|jpg, depth.png, pose.txt}`` in one folder.
+- TUM RGB-D: ``rgb.txt``, ``depth.txt`` and ``groundtruth.txt`` with time stamps. Pictures and depth
+  maps are joined by the nearest stamp, each used once; each picture gets the pose nearest in time.
+- ScanNet as its exporter writes it: ``color``, ``depth``, ``pose`` and ``intrinsic``. Depth is of a
+  camera of its own; frames that the tracker lost hold infinity.
+- Redwood and Open3D: ``color``, ``depth`` and a ``.log`` trajectory, each block of which is the
+  number of a picture in natural order and a pose.
+
+Poses are camera-to-world, depth is 16-bit with 0 and 65535 for no reading. All layouts publish
+intrinsics whose first pixel centre is (0, 0), as Kinect drivers and Open3D count; they are moved by
+half a pixel to the project's (0.5, 0.5) here, once. ``gvtools capture`` takes the same layouts less
+their poses: every frame then stands at the identity.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
 import numpy as np
-from numpy.typing import ArrayLike
+from pydantic import BeforeValidator, Field
 
-from gvtools.cameras import invert_rigid, rigid_transform
+from gvtools.cameras import rigid_transform
 from gvtools.errors import OptionError, ProjectError
+from gvtools.scenes.calibration import (
+    INTRINSICS,
+    MILLIMETRES,
+    Float64,
+    corner_origin,
+    intrinsics_beside,
+    load_matrix,
+    pinhole,
+    sensor_default,
+)
 from gvtools.scenes.images import read_depth, read_header
+from gvtools.scenes.layout import Layout
+from gvtools.scenes.matching import (
+    associate,
+    listed_file,
+    named,
+    pair_by_name,
+    pictures_in,
+    pose_at,
+)
 from gvtools.scenes.photographs import (
-    Photograph,
+    NO_POSE,
+    PosedFrame,
     Registration,
     depth_findings,
-    header_findings,
-    lens_findings,
-    rotation_findings,
+    first_size,
+    posed_scene,
 )
-from gvtools.scenes.rgbd_recording import Float64, Recording, RgbdFrame, RgbdOptions
-from gvtools.scenes.scene import Finding, Scene, natural_key
-from gvtools.scenes.undistort import undistortion
-from gvtools.settings import changes, with_file
+from gvtools.scenes.scene import Finding, Scene
+from gvtools.scenes.transforms_frame import LensParameters
+from gvtools.settings import Settings, changes, with_file
+from gvtools.trajectory_files import read_poses
+from gvtools.untrusted import read_text
 
 SIDECAR = "rgbd.json"
+Matrix = Annotated[list[list[float]], BeforeValidator(lambda value: np.asarray(value).tolist())]
 
 
-@dataclass(frozen=True)
-class RgbdLayout:
-    """A way to lay out a posed RGB-D recording in a folder.
+class RgbdOptions(Settings):
+    """What a posed RGB-D folder does not tell by itself; None means the layout's own value.
 
-    Attributes:
-        looks_like: its name and what its folder holds, for messages.
-        matches: whether a folder is of this layout.
-        record: finds frames, poses and intrinsics in a folder, with the options that were given.
+    The same names may stand in a file ``rgbd.json`` in the folder; values given here win.
+    Intrinsics are as published with such recordings: the first pixel's centre is (0, 0).
     """
 
-    looks_like: str
-    matches: Callable[[Path], bool]
-    record: Callable[[Path, RgbdOptions], Recording]
+    section = "rgbd"
+
+    depth_unit: float | None = Field(None, gt=0)
+    """Metres per stored unit (TUM 1/5000, others 1/1000)."""
+    color_K: Matrix | None = None
+    """(3, 3) intrinsics of the colour camera, pixels."""
+    depth_K: Matrix | None = None
+    """(3, 3) intrinsics of the depth camera, pixels; None: depth is of the colour camera."""
+    color_from_depth: Matrix | None = None
+    """(4, 4) rigid, metres; None with ``depth_K`` given: the same place."""
+    distortion: list[float] | None = None
+    """k1, k2, p1, p2, k3 of the colour camera, as OpenCV has them."""
+    depth_max: float | None = Field(None, gt=0)
+    """Metres; greater readings are ignored."""
+    max_time_difference: float = Field(0.02, gt=0)
+    """Seconds between colour, depth and pose of one frame (TUM)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """RGB-D frames, poses world_from_cam, with the calibration as published."""
+
+    root: Path
+    color_K: Float64  # (3, 3)
+    distortion: tuple[float, ...] = ()  # k1, k2, p1, p2, k3 as OpenCV has them
+    depth_K: Float64 | None = None  # (3, 3); None where depth is of the colour camera
+    color_from_depth: Float64 | None = None  # (4, 4), metres; None: the same place
+    depth_unit: float = MILLIMETRES  # metres per stored unit
+    frames: Sequence[PosedFrame] = ()
+    unposed: str = NO_POSE  # why frames without a pose are left out
+    findings: Sequence[Finding] = ()
+
+
+class RgbdFolder(ABC):
+    """An RGB-D layout, with poses or without."""
+
+    name: str
+    holds: tuple[str, str]  # with poses and without, for messages
+
+    @abstractmethod
+    def matches(self, root: Path, *, posed: bool = True) -> bool:
+        """Whether a folder is of this layout, going by its files' names."""
+
+    @abstractmethod
+    def frames(self, root: Path, options: RgbdOptions) -> list[PosedFrame]:
+        """The pictures in order of time, with their depth maps, no poses yet."""
+
+    @abstractmethod
+    def calibration(self, root: Path, options: RgbdOptions) -> Recording:
+        """A recording that has no frames yet."""
+
+    @abstractmethod
+    def posed(self, recording: Recording, options: RgbdOptions, *, strict: bool) -> Recording:
+        """The recording with its frames and their poses; only a strict one minds damaged ones."""
+
+    def record(self, root: Path, options: RgbdOptions, *, strict: bool = True) -> Recording:
+        """The frames, poses and calibration of a folder."""
+        return self.posed(self.calibration(root, options), options, strict=strict)
 
     def read(self, root: Path, *, options: RgbdOptions | None = None) -> Scene:
-        """The folder ``root`` as a scene, metric, in the poses' own world frame.
-
-        Args:
-            root: the folder.
-            options: what the folder does not tell by itself.
-        """
-        root = Path(root)
+        """A folder with poses as a scene, metric, in the poses' own world frame."""
         resolved, findings = resolve_options(root, options)
         recording = self.record(root, resolved)
         return rgbd_scene(replace(recording, findings=[*findings, *recording.findings]), resolved)
+
+    def layout(self) -> Layout:
+        """For folders with poses."""
+        return Layout.of_folder(self.name, self.holds[0], matches=self.matches, read=self.read)
+
+
+def _with_pose(frame: PosedFrame, *shapes: tuple[int, int], strict: bool) -> PosedFrame:
+    """The frame with the pose in its own file."""
+    path = Path(frame.where)
+    try:
+        return replace(frame, pose=load_matrix(path, *shapes)) if path.is_file() else frame
+    except ProjectError:
+        if strict:
+            raise
+        return frame
+
+
+def _published(root: Path, options: RgbdOptions, *, above: bool = False) -> Recording | None:
+    """Calibrated by an option, or else by a file beside the frames."""
+    if options.color_K is not None:
+        return Recording(root, np.asarray(options.color_K))
+    found = intrinsics_beside(root, above=above)
+    if found is None:
+        return None
+    return Recording(root, found[0], findings=[Finding("info", f"intrinsics: {found[1]}")])
+
+
+class _SevenScenes(RgbdFolder):
+    name = "7-Scenes"
+    holds = "*.color.*, *.depth.png, *.pose.txt", "*.color.*, *.depth.png"
+
+    def matches(self, root: Path, *, posed: bool = True) -> bool:
+        beside = "*.pose.txt" if posed else "*.depth.png"
+        return any(root.glob(beside)) and any(root.glob("*.color.*"))
+
+    def frames(self, root: Path, options: RgbdOptions) -> list[PosedFrame]:
+        suffixes = (".color.png", ".color.jpg", ".color.jpeg")
+        return [
+            self._frame(root, path.name[: path.name.rindex(".color.")], path.name)
+            for path in sorted(root.iterdir())
+            if path.name.endswith(suffixes)
+        ]
+
+    def _frame(self, root: Path, stem: str, name: str) -> PosedFrame:
+        pose = str(root / f"{stem}.pose.txt")
+        depth = root / f"{stem}.depth.png"
+        return PosedFrame(name, root / name, None, None, depth, where=pose)
+
+    def calibration(self, root: Path, options: RgbdOptions) -> Recording:
+        found = _published(root, options, above=True)
+        if found is None:
+            raise ProjectError(
+                f"{root}: no {INTRINSICS} there or in the parent folder; expected three lines "
+                "'fx 0 cx', '0 fy cy', '0 0 1'; write it, or give color_K (--color-intrinsics)"
+            )
+        return found
+
+    def posed(self, recording: Recording, options: RgbdOptions, *, strict: bool) -> Recording:
+        root = recording.root
+        frames = self.frames(root, options)
+        known = {frame.where for frame in frames}
+        alone = (path.name for path in root.glob("*.pose.txt") if str(path) not in known)
+        stems = (name.removesuffix(".pose.txt") for name in alone)
+        frames += [self._frame(root, stem, f"{stem}.color.png") for stem in stems]
+        return replace(
+            recording,
+            frames=[_with_pose(frame, (4, 4), (3, 4), strict=strict) for frame in frames],
+        )
+
+
+# fx, fy, cx, cy and k1, k2, p1, p2, k3 as published with TUM RGB-D; freiburg3 is rectified.
+PUBLISHED = {
+    "freiburg1": (
+        (517.3, 516.5, 318.6, 255.3),
+        (0.2624, -0.9531, -0.0054, 0.0026, 1.1633),
+    ),
+    "freiburg2": (
+        (520.9, 521.0, 325.1, 249.7),
+        (0.2312, -0.7849, -0.0033, -0.0001, 0.9172),
+    ),
+    "freiburg3": ((535.4, 539.2, 320.1, 247.6), ()),
+}
+
+
+class _Tum(RgbdFolder):
+    name = "TUM"
+    holds = "rgb.txt, depth.txt, groundtruth.txt", "rgb.txt, depth.txt"
+
+    def matches(self, root: Path, *, posed: bool = True) -> bool:
+        return all((root / name).is_file() for name in self.holds[not posed].split(", "))
+
+    def frames(self, root: Path, options: RgbdOptions) -> list[PosedFrame]:
+        return [frame for _, frame in self._stamped(root, options)]
+
+    def _stamped(self, root: Path, options: RgbdOptions) -> list[tuple[float, PosedFrame]]:
+        lists = root / "rgb.txt", root / "depth.txt"
+        colors, depths = (_stamped_files(path) for path in lists)
+        times, depth_times = (np.array([time for time, _ in found]) for found in (colors, depths))
+        depth_of = associate(times, depth_times, options.max_time_difference)
+        frames = []
+        for i, (time, name) in enumerate(colors):
+            color = listed_file(root, name, where=str(lists[0]))
+            depth = None
+            if i in depth_of:
+                depth = listed_file(root, depths[depth_of[i]][1], where=str(lists[1]))
+            where = f"{root / 'groundtruth.txt'}, time {time:.6f}"
+            frames.append((time, PosedFrame(color.name, color, None, None, depth, where=where)))
+        return sorted(frames, key=lambda item: (item[0], item[1].image))
+
+    def calibration(self, root: Path, options: RgbdOptions) -> Recording:
+        found = _published(root, options)
+        if found is None:
+            K, finding = sensor_default()
+            found = Recording(root, K, findings=[finding])
+            for name, (values, distortion) in PUBLISHED.items():
+                if name in root.resolve().name:
+                    source = Finding("info", f"intrinsics: published for {name}")
+                    found = Recording(root, pinhole(values), distortion, findings=[source])
+        return replace(found, depth_unit=1 / 5000)
+
+    def posed(self, recording: Recording, options: RgbdOptions, *, strict: bool) -> Recording:
+        limit = options.max_time_difference
+        truth = read_poses(recording.root / "groundtruth.txt", layout="tum")
+        assert truth.stamps is not None
+        order = np.argsort(truth.stamps, kind="stable")
+        at = partial(pose_at, times=truth.stamps[order], poses=truth.poses[order], same=limit)
+        frames = [
+            replace(frame, pose=at(time)) for time, frame in self._stamped(recording.root, options)
+        ]
+        return replace(recording, frames=frames, unposed=f"{NO_POSE} within {limit:g} s")
+
+
+def _stamped_files(path: Path) -> list[tuple[float, str]]:
+    """Time stamps and names of a list of TUM RGB-D."""
+    try:
+        lines = read_text(path).splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise ProjectError(f"{path}: unreadable ({error})") from None
+    entries = []
+    for number, line in enumerate(lines, start=1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        try:
+            time, name = line.replace(",", " ").split(maxsplit=1)
+            entries.append((float(time), name.strip()))
+            if not math.isfinite(entries[-1][0]):
+                raise ValueError
+        except ValueError:
+            raise ProjectError(
+                f"{path}, line {number}: {line!r}; expected a time stamp in seconds and a file"
+            ) from None
+    return entries
+
+
+class _ScanNet(RgbdFolder):
+    name = "ScanNet"
+    holds = "color, depth, pose, intrinsic", "color, depth, intrinsic"
+
+    def matches(self, root: Path, *, posed: bool = True) -> bool:
+        return all((root / name).is_dir() for name in self.holds[not posed].split(", "))
+
+    def frames(self, root: Path, options: RgbdOptions) -> list[PosedFrame]:
+        return [self._frame(root, path) for path in pictures_in(root / "color")]
+
+    def _frame(self, root: Path, color: Path) -> PosedFrame:
+        depth, pose = root / "depth" / f"{color.stem}.png", root / "pose" / f"{color.stem}.txt"
+        return PosedFrame(color.name, color, None, None, depth, where=str(pose))
+
+    def calibration(self, root: Path, options: RgbdOptions) -> Recording:
+        folder = root / "intrinsic"
+        if options.color_K is not None:
+            K = np.asarray(options.color_K)
+        elif (folder / "intrinsic_color.txt").is_file():
+            K = load_matrix(folder / "intrinsic_color.txt", (4, 4), (3, 3))[:3, :3]
+        else:
+            raise ProjectError(
+                f"{folder}: no intrinsic_color.txt; export it, or give color_K (--color-intrinsics)"
+            )
+        if not (folder / "intrinsic_depth.txt").is_file():
+            return Recording(root, K)
+        depth_K = load_matrix(folder / "intrinsic_depth.txt", (4, 4), (3, 3))[:3, :3]
+        files = (folder / f"extrinsic_{camera}.txt" for camera in ("color", "depth"))
+        # Camera from rig each; an export without such files has one place for both.
+        color, depth = (
+            rigid_transform(load_matrix(path, (4, 4)), what=str(path))[0]
+            if path.is_file()
+            else np.eye(4)
+            for path in files
+        )
+        moved, findings = color @ np.linalg.inv(depth), []
+        if options.color_from_depth is None and not np.allclose(moved, np.eye(4)):
+            # Exports with other than identity are rare, and tools read them both ways.
+            message = "extrinsics are taken as camera-from-rig; if not, give color_from_depth"
+            findings.append(Finding("warning", message))
+        return Recording(root, K, depth_K=depth_K, color_from_depth=moved, findings=findings)
+
+    def posed(self, recording: Recording, options: RgbdOptions, *, strict: bool) -> Recording:
+        root = recording.root
+        frames = self.frames(root, options)
+        known = {frame.image.stem for frame in frames}
+        alone = (path.stem for path in (root / "pose").glob("*.txt") if path.stem not in known)
+        frames += [self._frame(root, root / "color" / f"{stem}.jpg") for stem in alone]
+        return replace(
+            recording, frames=[_with_pose(frame, (4, 4), strict=strict) for frame in frames]
+        )
+
+
+class _Redwood(RgbdFolder):
+    name = "Redwood"
+    holds = "color, depth, a .log trajectory", "color, depth"
+
+    def matches(self, root: Path, *, posed: bool = True) -> bool:
+        folders = (root / "depth").is_dir() and self._pictures(root) is not None
+        return folders and (not posed or any(root.glob("*.log")))
+
+    def _pictures(self, root: Path) -> Path | None:
+        folders = (root / name for name in ("color", "image", "rgb"))
+        return next((folder for folder in folders if folder.is_dir()), None)
+
+    def frames(self, root: Path, options: RgbdOptions) -> list[PosedFrame]:
+        folder = self._pictures(root)
+        colors = [] if folder is None else pictures_in(folder)
+        depth_of = pair_by_name(colors, pictures_in(root / "depth"))
+        return [PosedFrame(path.name, path, None, None, depth_of.get(path)) for path in colors]
+
+    def calibration(self, root: Path, options: RgbdOptions) -> Recording:
+        found = _published(root, options)
+        if found is not None:
+            return found
+        K, finding = sensor_default()
+        return Recording(root, K, findings=[finding])
+
+    def posed(self, recording: Recording, options: RgbdOptions, *, strict: bool) -> Recording:
+        root = recording.root
+        findings = list(recording.findings)
+        logs = sorted(root.glob("*.log"), key=lambda path: (path.name != "trajectory.log", path))
+        if len(logs) > 1:
+            others = named([path.name for path in logs[1:]])
+            findings.append(Finding("warning", f"poses are read from {logs[0].name}, not {others}"))
+        frames = self.frames(root, options)
+        unpaired = len(pictures_in(root / "depth")) - sum(item.depth is not None for item in frames)
+        if unpaired:
+            findings.append(Finding("warning", f"{unpaired} depth maps belong to no picture"))
+        numbers, poses = read_log(logs[0])
+        fits = len(set(numbers)) == len(numbers) and all(0 <= i < len(frames) for i in numbers)
+        if not fits and len(numbers) != len(frames):
+            raise ProjectError(
+                f"{logs[0]}: {len(numbers)} poses numbered {named(numbers)} for {len(frames)} "
+                "pictures; expected one pose a picture, or numbers of pictures counted from 0"
+            )
+        for row, number, pose in zip(
+            numbers if fits else range(len(frames)), numbers, poses, strict=True
+        ):
+            frames[row] = replace(frames[row], pose=pose, where=f"{logs[0]}, pose {number}")
+        return replace(recording, frames=frames, findings=findings)
+
+
+def read_log(path: Path) -> tuple[list[int], list[Float64]]:
+    """A ``.log`` trajectory: blocks of three integers and a 4x4 camera-to-world matrix.
+
+    Returns:
+        Each block's first integer and its (4, 4) matrix, as read.
+    """
+    try:
+        rows = [line.split() for line in read_text(path).splitlines()]
+        rows = [row for row in rows if row]
+        for at, row in enumerate(rows):
+            if len(row) != (3 if at % 5 == 0 else 4):
+                raise ValueError(f"line {at + 1} that is not empty has {len(row)} numbers")
+        if len(rows) % 5:
+            raise ValueError("the last block is not whole")
+        numbers = [int(row[0]) for row in rows[::5]]
+        matrices = np.array([row for at, row in enumerate(rows) if at % 5], np.float64)
+    except (OSError, ValueError) as error:
+        raise ProjectError(
+            f"{path}: {error}; expected blocks of three integers and four lines of four numbers"
+        ) from None
+    return numbers, list(matrices.reshape(-1, 4, 4))
+
+
+SCANNET_FOLDER = _ScanNet()
+# ScanNet before Redwood: both have colour and depth folders.
+_FOLDERS = (_SevenScenes(), _Tum(), SCANNET_FOLDER, _Redwood())
+SEVENSCENES, TUM, SCANNET, REDWOOD = LAYOUTS = tuple(folder.layout() for folder in _FOLDERS)
+UNPOSED = tuple(f"{folder.name} ({folder.holds[1]})" for folder in _FOLDERS)
+
+
+def _unposed(root: Path) -> RgbdFolder | None:
+    return next((folder for folder in _FOLDERS if folder.matches(root, posed=False)), None)
+
+
+def count_unposed(root: Path) -> int:
+    """How many RGB-D frames a folder holds that is no project; 0 where it holds none."""
+    folder = _unposed(root)
+    return 0 if folder is None else len(folder.frames(root, RgbdOptions()))
+
+
+def read_unposed(root: Path, options: RgbdOptions) -> Recording | None:
+    """The frames with depth of a folder, all at the identity; None where it is of no layout."""
+    folder = _unposed(root)
+    if folder is None:
+        return None
+    recording, found = folder.calibration(root, options), folder.frames(root, options)
+    frames = [
+        replace(frame, pose=np.eye(4), where=str(frame.image))
+        for frame in found
+        if frame.image.is_file() and frame.depth is not None and frame.depth.is_file()
+    ]
+    findings = list(recording.findings)
+    if len(frames) < len(found):
+        message = f"{len(found) - len(frames)} of {len(found)} pictures have no depth map: left out"
+        findings.append(Finding("warning", message))
+    return replace(recording, frames=frames, findings=findings)
 
 
 def resolve_options(root: Path, options: RgbdOptions | None) -> tuple[RgbdOptions, list[Finding]]:
     """``options`` over those of the folder's ``rgbd.json``, and a finding when that was read."""
     options = options or RgbdOptions()
-    path = root / SIDECAR
+    path = Path(root) / SIDECAR
     if not path.is_file():
         return options, []
     read = with_file(RgbdOptions(), path)
@@ -76,70 +465,52 @@ def resolve_options(root: Path, options: RgbdOptions | None) -> tuple[RgbdOption
     return merged, [Finding("info", f"options read from {SIDECAR}: {names}")]
 
 
-def rgbd_scene(recording: Recording, options: RgbdOptions) -> Scene:
+def rgbd_scene(
+    recording: Recording, options: RgbdOptions, *, kind: str = "rgbd", strict: bool = True
+) -> Scene:
     """The scene of a recording, in metres, in the poses' own world frame."""
-    root = recording.root
-    if not recording.frames:
-        reasons = "; ".join(
-            finding.message for finding in recording.findings if finding.level == "warning"
-        )
-        raise ProjectError(
-            f"{root}: no frame with picture and pose{f' ({reasons})' if reasons else ''}; "
-            "expected at least one"
-        )
-    frames = sorted(recording.frames, key=lambda frame: natural_key(frame.name))
+    root, frames = recording.root, recording.frames
     color_K = recording.color_K if options.color_K is None else options.color_K
-    K = _corner_origin(color_K, what=f"{root}, colour intrinsics")
-    registration = _registration(recording, options, K)
+    K = corner_origin(color_K, what=f"{root}, colour intrinsics")
+    registration = _registration(recording, options)
     unit = recording.depth_unit if options.depth_unit is None else float(options.depth_unit)
-    reader = partial(read_depth, unit=unit, maximum=options.depth_max)
-    size = _common_size(frames)
-    lens = _lens(K, recording, options, size=size)
-    photographs, defects = [], []
-    for frame in frames:
-        pose, defect = rigid_transform(frame.world_from_cam, what=frame.where)
-        defects.append(defect)
-        photographs.append(
-            Photograph(
-                frame.name,
-                frame.color,
-                lens,
-                invert_rigid(pose),
-                None,
-                frame.depth,
-                reader,
-                registration,
-            )
-        )
-    findings = [
-        *recording.findings,
-        *rotation_findings(defects),
-        *lens_findings([item.lens for item in photographs]),
-        *header_findings([(item.image, size) for item in photographs]),
-        *_intrinsics_findings(K, size),
-        *_depth_findings(photographs, size, registration, unit=unit),
-    ]
-    views = tuple(item.view() for item in photographs)
-    return Scene(root, "rgbd", views, None, tuple(findings), metric=True)
-
-
-def _corner_origin(K: ArrayLike, *, what: str) -> Float64:
-    """Published intrinsics, whose first pixel centre is (0, 0), moved to (0.5, 0.5)."""
-    matrix = np.array(K, np.float64)
-    if matrix.shape == (4, 4):
-        matrix = matrix[:3, :3]
-    if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
-        raise ProjectError(f"{what}: {np.asarray(K).tolist()}; expected a finite 3x3 matrix")
-    off = [matrix[0, 1], matrix[1, 0], matrix[2, 0], matrix[2, 1], matrix[2, 2] - 1]
-    if min(matrix[0, 0], matrix[1, 1]) <= 0 or np.abs(off).max() > 1e-6:
+    size = first_size(frame.image for frame in frames)
+    if size is None and frames and strict:
         raise ProjectError(
-            f"{what}: {matrix.tolist()}; expected [fx 0 cx; 0 fy cy; 0 0 1] with fx, fy > 0"
+            f"{frames[0].image}: unreadable, like all {len(frames)} pictures beside it"
         )
-    matrix[:2, 2] += 0.5
-    return matrix
+    lens = _lens(K, recording, options, size=size or (2, 2))
+    reader = partial(read_depth, unit=unit, maximum=options.depth_max)
+    frames = [
+        replace(frame, lens=lens, read_depth=reader, registration=registration) for frame in frames
+    ]
+    scene = posed_scene(
+        root,
+        frames,
+        poses="world_from_cam",
+        metric=True,
+        kind=kind,
+        strict=strict,
+        findings=recording.findings,
+        unposed=recording.unposed,
+    )
+    findings = [*scene.findings, *_principal_point_findings(K, lens.size)]
+    measured = {view.name for view in scene if view.has_depth}
+    if not measured:
+        findings.append(Finding("warning", f"none of {len(scene)} frames has a depth map"))
+    else:
+        findings.append(Finding("info", f"depth unit: {unit:.6g} m"))
+        if registration is not None:
+            findings.append(Finding("info", "depth is registered into the colour camera"))
+        elif strict:
+            maps = [item.depth for item in frames if item.name in measured and item.depth]
+            findings += depth_findings([(path, lens.size) for path in maps], _depth_size)
+            line = "depth is taken as seen by the colour camera (no depth_K)"
+            findings.append(Finding("info", line))
+    return replace(scene, findings=tuple(findings))
 
 
-def _registration(recording: Recording, options: RgbdOptions, K: Float64) -> Registration | None:
+def _registration(recording: Recording, options: RgbdOptions) -> Registration | None:
     depth_K = recording.depth_K if options.depth_K is None else options.depth_K
     moved = (
         recording.color_from_depth if options.color_from_depth is None else options.color_from_depth
@@ -155,40 +526,30 @@ def _registration(recording: Recording, options: RgbdOptions, K: Float64) -> Reg
     if moved is not None:
         transform, _ = rigid_transform(moved, what=f"{recording.root}, color_from_depth")
     return Registration(
-        _corner_origin(depth_K, what=f"{recording.root}, depth intrinsics"), transform
+        corner_origin(depth_K, what=f"{recording.root}, depth intrinsics"), transform
     )
 
 
-def _common_size(frames: Sequence[RgbdFrame]) -> tuple[int, int]:
-    """Width and height of the first readable picture; the others are checked against it."""
-    for frame in frames:
-        try:
-            header = read_header(frame.color)
-        except ProjectError:
-            continue
-        return header.width, header.height
-    raise ProjectError(f"{frames[0].color}: unreadable, like all {len(frames)} pictures beside it")
-
-
-def _lens(K: Float64, recording: Recording, options: RgbdOptions, *, size: tuple[int, int]) -> Any:
-    params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
-    what = f"{recording.root}, colour camera"
+def _lens(
+    K: Float64, recording: Recording, options: RgbdOptions, *, size: tuple[int, int]
+) -> LensParameters:
+    shared = (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
     if options.distortion is not None:
         distortion: Sequence[float] = options.distortion
         if len(distortion) != 5 or not np.isfinite(distortion).all():
             raise OptionError(
-                f"{what}: distortion {distortion}; expected five numbers k1, k2, p1, p2, k3"
+                f"{recording.root}, colour camera: distortion {distortion}; expected five numbers "
+                "k1, k2, p1, p2, k3"
             )
     else:
         # What a layout publishes belongs to the intrinsics that it publishes.
         distortion = recording.distortion if options.color_K is None else ()
     if any(distortion):
-        params += [*distortion, 0.0, 0.0, 0.0]
-        return undistortion("FULL_OPENCV", params, size, what=what)
-    return undistortion("PINHOLE", params, size, what=what)
+        return LensParameters("FULL_OPENCV", (*shared, *distortion, 0.0, 0.0, 0.0), size)
+    return LensParameters("PINHOLE", shared, size)
 
 
-def _intrinsics_findings(K: Float64, size: tuple[int, int]) -> list[Finding]:
+def _principal_point_findings(K: Float64, size: tuple[int, int]) -> list[Finding]:
     x, y = K[0, 2] / size[0], K[1, 2] / size[1]
     if 0.25 < x < 0.75 and 0.25 < y < 0.75:
         return []
@@ -199,30 +560,6 @@ def _intrinsics_findings(K: Float64, size: tuple[int, int]) -> list[Finding]:
             f"{size[0]}x{size[1]} pixels: are the intrinsics of another size?",
         )
     ]
-
-
-def _depth_findings(
-    photographs: Sequence[Photograph],
-    size: tuple[int, int],
-    registration: Registration | None,
-    *,
-    unit: float,
-) -> list[Finding]:
-    with_depth = [item.depth for item in photographs if item.depth is not None]
-    findings = []
-    if len(with_depth) < len(photographs):
-        findings.append(
-            Finding("warning", f"{len(photographs) - len(with_depth)} frames have no depth map")
-        )
-    if not with_depth:
-        return findings
-    findings.append(Finding("info", f"depth unit: {unit:.6g} m"))
-    if registration is not None:
-        findings.append(Finding("info", "depth is registered into the colour camera"))
-        return findings
-    findings += depth_findings([(path, size) for path in with_depth], _depth_size)
-    findings.append(Finding("info", "depth is taken as seen by the colour camera (no depth_K)"))
-    return findings
 
 
 def _depth_size(path: Path) -> tuple[int, int]:

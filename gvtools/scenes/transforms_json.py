@@ -20,13 +20,13 @@ from gvtools.errors import ProjectError
 from gvtools.files import write_text
 from gvtools.scenes.faces import perspective_views
 from gvtools.scenes.images import read_depth
+from gvtools.scenes.matching import named
 from gvtools.scenes.photographs import (
     Photograph,
     given_folder,
     header_findings,
     lens_findings,
     mask_findings,
-    named,
     rotation_findings,
 )
 from gvtools.scenes.scene import Finding, Scene, natural_key

@@ -62,7 +62,7 @@ def _opened(entry: SceneSource) -> _Opened:
     collection = open_collection(entry.project, root)
     weight, own_share = 0.0, 1.0
     if collection.data_set:
-        from gvtools.scenes.data_sets.spec import load_spec
+        from gvtools.scenes.data_sets.catalogue import load_spec
 
         spec = load_spec(collection.data_set)
         # One scene of a data set has no claim to the weight of all.

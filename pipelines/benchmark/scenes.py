@@ -20,7 +20,7 @@ def scene_names(benchmark: Benchmark, root: Path) -> tuple[str, ...]:
             raise ProjectError(f"{root}: no such folder; expected the scenes of {benchmark.name}")
         return benchmark.scenes
     if benchmark.data_set.spec:
-        from gvtools.scenes.data_sets.layouts import scenes_of
+        from gvtools.scenes.data_sets.catalogue import scenes_of
 
         return scenes_of(benchmark.data_set.spec, root)
     return _projects(root)
@@ -49,7 +49,7 @@ def open_benchmark_scene(benchmark: Benchmark, name: str, root: Path) -> Scene:
         name: of the scene.
         root: the folder of the data set, or of the projects.
     """
-    from gvtools.scenes.data_sets.layouts import open_data_set
+    from gvtools.scenes.data_sets.catalogue import open_data_set
     from gvtools.scenes.project import open_project
 
     released = benchmark.split_of(benchmark.context).kind == "files"
@@ -60,8 +60,7 @@ def open_benchmark_scene(benchmark: Benchmark, name: str, root: Path) -> Scene:
 
 def _name_there(benchmark: Benchmark, name: str, root: Path) -> str:
     """A scene's name in the download: in whichever folder it lies, and of the reduced pictures."""
-    from gvtools.scenes.data_sets.layouts import layout_of, scenes_of
-    from gvtools.scenes.data_sets.spec import load_spec
+    from gvtools.scenes.data_sets.catalogue import layout_of, load_spec, scenes_of
 
     rule = benchmark.split_of(benchmark.context)
     known = scenes_of(benchmark.data_set.spec, root)

@@ -77,7 +77,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
     """Find the cameras and write the project."""
     from gvtools.capture.project import capture_photographs
     from gvtools.scenes.project import BAG, VIDEOS, is_recording
-    from gvtools.scenes.unposed import count_unposed
+    from gvtools.scenes.rgbd import count_unposed
 
     if not args.input.exists():
         raise ProjectError(

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from gvtools.errors import GvError, OptionError, ProjectError
 from gvtools.files import json_list_written
-from gvtools.scenes.data_sets.layouts import chosen_scenes, read_scene
-from gvtools.scenes.data_sets.spec import DataSetSpec, load_spec
+from gvtools.scenes.data_sets.catalogue import DataSetSpec, chosen_scenes, load_spec, read_scene
 
 if TYPE_CHECKING:
     from gvtools.scenes.inspection import SceneReport

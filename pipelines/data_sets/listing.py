@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from gvtools.scenes.data_sets.spec import DataSetSpec, load_spec, spec_names
+from gvtools.scenes.data_sets.catalogue import DataSetSpec, load_spec, spec_names
 
 if TYPE_CHECKING:
     from pipelines.console import Console

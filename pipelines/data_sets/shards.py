@@ -46,7 +46,7 @@ def verify_options(option: Callable[..., object]) -> None:
 def shards(args: argparse.Namespace, console: Console) -> None:
     """Convert scenes to shards, or go on where a conversion stopped."""
     from gvtools.scenes.addresses import SPEC, open_collection
-    from gvtools.scenes.data_sets.spec import name_key, spec_names
+    from gvtools.scenes.data_sets.catalogue import name_key, spec_names
     from gvtools.scenes.shards.writer import MEGABYTE, ShardOptions, write_shards
 
     address = args.scenes_of

@@ -11,8 +11,7 @@ import numpy as np
 
 from gvtools.errors import GvError, OptionError, ProjectError
 from gvtools.files import write_json
-from gvtools.scenes.data_sets.layouts import chosen_scenes, read_scene
-from gvtools.scenes.data_sets.spec import load_spec
+from gvtools.scenes.data_sets.catalogue import chosen_scenes, load_spec, read_scene
 from gvtools.scenes.inspection import spread
 from pipelines.data_sets.checking import PROBES
 from pipelines.data_sets.log_histogram import LogHistogram

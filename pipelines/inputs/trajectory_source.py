@@ -30,7 +30,7 @@ def open_trajectory(path: Path, *, layout: str = "auto", root: Path | None = Non
     """
     from gvtools.scenes.colmap_files import find_model
     from gvtools.scenes.data_sets.address import is_address
-    from gvtools.scenes.data_sets.layouts import open_address
+    from gvtools.scenes.data_sets.catalogue import open_address
     from gvtools.trajectory_files import Trajectory, read_poses
 
     if is_address(path):

@@ -21,9 +21,7 @@ from gvtools.capture.rgbd_frames import RgbdFrames
 from gvtools.capture.rgbd_project import capture_rgbd
 from gvtools.errors import ProjectError
 from gvtools.scenes.project import open_project
-from gvtools.scenes.rgbd import rgbd_scene
-from gvtools.scenes.rgbd_recording import RgbdOptions
-from gvtools.scenes.unposed import count_unposed, read_unposed
+from gvtools.scenes.rgbd import RgbdOptions, count_unposed, read_unposed, rgbd_scene
 from pipelines.cli import main
 
 COUNT = 12

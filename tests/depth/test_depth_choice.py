@@ -20,8 +20,8 @@ from gvtools.depth.stereo.plane_sweep import PlaneSweepStereo
 from gvtools.errors import CheckpointError, DegenerateError, OptionError, ProjectError
 from gvtools.scenes.colmap import read_colmap
 from gvtools.scenes.colmap_depth import write_depth_map
+from gvtools.scenes.rgbd import SEVENSCENES
 from gvtools.scenes.scene import Frame, Scene, SparsePoints, View
-from gvtools.scenes.sevenscenes import read_sevenscenes
 from pipelines.cli import main
 
 pytestmark = pytest.mark.usefixtures("unpainted")
@@ -42,7 +42,7 @@ class Computed:
 
 @pytest.fixture
 def scan(tmp_path) -> Scene:
-    return read_sevenscenes(write_scan(tmp_path / "scan"))
+    return SEVENSCENES.read(write_scan(tmp_path / "scan"))
 
 
 def without_depth(scene: Scene, *rows: int) -> Scene:

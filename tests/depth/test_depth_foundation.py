@@ -26,8 +26,8 @@ from gvtools.networks.depth_anything.network import (
     load_depth_anything,
 )
 from gvtools.scenes.colmap import read_colmap
+from gvtools.scenes.rgbd import SEVENSCENES
 from gvtools.scenes.scene import Scene
-from gvtools.scenes.sevenscenes import read_sevenscenes
 from pipelines.cli import main
 
 pytestmark = pytest.mark.usefixtures("unpainted")
@@ -132,7 +132,7 @@ def test_depth_gets_the_scale_of_the_sparse_points(tmp_path, monkeypatch, weight
 
 @pytest.mark.parametrize("cameras", [True, False])
 def test_without_points_the_camera_centres_give_the_scale(tmp_path, monkeypatch, weights, cameras):
-    scene = read_sevenscenes(write_scan(tmp_path / "scan"))
+    scene = SEVENSCENES.read(write_scan(tmp_path / "scan"))
     stand_in(monkeypatch, scene)
     source = da3(scene, weights, cameras=cameras)
     assert max(relative_errors(scene, source)) < 0.02
@@ -141,7 +141,7 @@ def test_without_points_the_camera_centres_give_the_scale(tmp_path, monkeypatch,
 
 
 def test_passes_share_one_scale_and_are_as_equal_as_can_be(tmp_path, monkeypatch, weights):
-    scene = read_sevenscenes(write_scan(tmp_path / "scan", views=7))
+    scene = SEVENSCENES.read(write_scan(tmp_path / "scan", views=7))
     oracle = stand_in(monkeypatch, scene)
     source = da3(scene, weights, views=3)
     assert max(relative_errors(scene, source)) < 0.02
@@ -153,7 +153,7 @@ def test_passes_share_one_scale_and_are_as_equal_as_can_be(tmp_path, monkeypatch
 def test_a_scale_without_support_is_refused(tmp_path, monkeypatch, weights, wrong):
     """Points that fit no scale refuse it, whatever the centres say."""
     if wrong == "centres":
-        scene = read_sevenscenes(write_scan(tmp_path / "scan"))
+        scene = SEVENSCENES.read(write_scan(tmp_path / "scan"))
     else:
         scene = read_colmap(write_colmap_scan(tmp_path / "colmap", points=200))
     stand_in(monkeypatch, scene, wrong=wrong)
@@ -197,7 +197,7 @@ def in_another_unit(scene: Scene, factor: float) -> Scene:
 def test_the_scenes_unit_changes_the_depths_unit_alone(tmp_path, monkeypatch, weights, factor):
     network = Recorder()
     monkeypatch.setattr(module, "load_depth_anything", lambda path, **_: network)
-    scene = read_sevenscenes(write_scan(tmp_path / "scan"))
+    scene = SEVENSCENES.read(write_scan(tmp_path / "scan"))
     depths = []
     for other in (scene, in_another_unit(scene, factor)):
         source = da3(other, weights)
@@ -211,7 +211,7 @@ def test_the_scenes_unit_changes_the_depths_unit_alone(tmp_path, monkeypatch, we
 
 
 def test_no_depth_lies_between_two_surfaces(tmp_path, monkeypatch, weights):
-    scene = read_sevenscenes(write_scan(tmp_path / "scan"))
+    scene = SEVENSCENES.read(write_scan(tmp_path / "scan"))
     oracle = stand_in(monkeypatch, scene)
     original = Oracle.__call__
 
@@ -234,7 +234,7 @@ def test_no_depth_lies_between_two_surfaces(tmp_path, monkeypatch, weights):
 
 
 def test_unsure_pixels_and_masked_ones_stay_empty(tmp_path, monkeypatch, weights):
-    scene = read_sevenscenes(write_scan(tmp_path / "scan"))
+    scene = SEVENSCENES.read(write_scan(tmp_path / "scan"))
     stand_in(monkeypatch, scene)
     source = da3(scene, weights)
     view = scene.views[0]
@@ -248,7 +248,7 @@ def test_unsure_pixels_and_masked_ones_stay_empty(tmp_path, monkeypatch, weights
 
 
 def test_choice_takes_it_when_weights_are_given(tmp_path, weights):
-    scene = read_sevenscenes(write_scan(tmp_path / "scan"))
+    scene = SEVENSCENES.read(write_scan(tmp_path / "scan"))
 
     def bare(view):
         return replace(view, load=lambda: replace(view.load(), depth=None), has_depth=False)
@@ -307,7 +307,7 @@ def test_the_released_small_model_is_known_by_its_width(tmp_path):
 
 
 def test_two_centres_alone_are_no_support(tmp_path, monkeypatch, weights):
-    scene = read_sevenscenes(write_scan(tmp_path / "scan", views=2))
+    scene = SEVENSCENES.read(write_scan(tmp_path / "scan", views=2))
     stand_in(monkeypatch, scene)
     source = da3(scene, weights)
     with pytest.raises(DegenerateError, match="at least 4"):

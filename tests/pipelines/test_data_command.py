@@ -16,8 +16,7 @@ from command_line import refused
 from data_sets.miniature import Miniature, miniatures
 from tiny_scan import FOCAL, WIDTH, render, world_from_cam, write_scan
 
-from gvtools.scenes.data_sets.layouts import read_scene
-from gvtools.scenes.data_sets.spec import DataSetSpec, load_spec, spec_names
+from gvtools.scenes.data_sets.catalogue import DataSetSpec, load_spec, read_scene, spec_names
 from gvtools.scenes.scene import Scene
 from pipelines.cli import main
 from pipelines.data_sets import checking

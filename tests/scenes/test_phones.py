@@ -21,12 +21,12 @@ from phone_exports import (
 from PIL import Image
 
 from gvtools.errors import OptionError, ProjectError
-from gvtools.scenes.data_sets.sky import sky_findings
-from gvtools.scenes.data_sets.video import frame_seconds, read_frame
+from gvtools.scenes.calibration import sky_findings
 from gvtools.scenes.inspection import inspect
 from gvtools.scenes.project import is_project, open_project
-from gvtools.scenes.rgbd_recording import RgbdOptions
+from gvtools.scenes.rgbd import RgbdOptions
 from gvtools.scenes.scene import Scene
+from gvtools.scenes.video import frame_seconds, read_frame
 
 Write = Callable[[Path], Expected]
 EXPORTS: dict[str, tuple[str, Write, str]] = {

@@ -12,8 +12,8 @@ from gvtools.depth.choice import choose_source
 from gvtools.errors import ProjectError
 from gvtools.scenes.colmap import read_colmap
 from gvtools.scenes.inspection import inspect, reprojection_errors
+from gvtools.scenes.rgbd import SEVENSCENES
 from gvtools.scenes.scene import Scene
-from gvtools.scenes.sevenscenes import read_sevenscenes
 
 
 def test_report_of_a_model(tmp_path):
@@ -39,7 +39,7 @@ def test_report_of_a_model(tmp_path):
 def test_report_of_a_scan(tmp_path):
     root = sevenscenes(tmp_path, frames=5)
     save(root / "frame-000004.depth.png", depth_picture(4.0))
-    report = inspect(read_sevenscenes(root))
+    report = inspect(SEVENSCENES.read(root))
     assert report.metric
     assert report.path_length == pytest.approx(0.4)
     assert report.extent == pytest.approx(0.4)
@@ -57,7 +57,7 @@ def test_truncated_picture_is_found_by_opening(tmp_path):
     path = root / "frame-000001.color.png"
     save(path, np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3), dtype=np.uint8))
     path.write_bytes(path.read_bytes()[:-3000])
-    scene = read_sevenscenes(root)
+    scene = SEVENSCENES.read(root)
     report = inspect(scene)
     assert not report.ok
     assert report.views_opened == 2
@@ -75,7 +75,7 @@ def depth_findings(scene):
 
 
 def test_depth_that_a_run_computes_is_told(tmp_path):
-    scene = read_sevenscenes(sevenscenes(tmp_path))
+    scene = SEVENSCENES.read(sevenscenes(tmp_path))
     assert not depth_findings(scene)
     bare = tuple(replace(view, has_depth=False) for view in scene)
     ((level, message),) = depth_findings(replace(scene, views=bare))

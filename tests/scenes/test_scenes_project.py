@@ -11,7 +11,7 @@ from scenes_workspace import PINHOLE, frame, ramp, save, sevenscenes, transforms
 
 from gvtools.errors import OptionError, ProjectError
 from gvtools.scenes.project import open_project
-from gvtools.scenes.rgbd_recording import RgbdOptions
+from gvtools.scenes.rgbd import RgbdOptions
 
 
 def make_transforms(root):

@@ -9,7 +9,7 @@ import pytest
 from gvtools.scenes.colmap import read_colmap
 from gvtools.scenes.inspection import inspect, reprojection_errors
 from gvtools.scenes.project import open_project
-from gvtools.scenes.rgbd_recording import RgbdOptions
+from gvtools.scenes.rgbd import RgbdOptions
 
 pytestmark = pytest.mark.data
 

@@ -12,7 +12,7 @@ import torch
 from scipy.stats import chi2_contingency
 
 from gvtools.errors import DegenerateError, OptionError, ProjectError
-from gvtools.scenes.data_sets.spec import load_spec, spec_names
+from gvtools.scenes.data_sets.catalogue import load_spec, spec_names
 from gvtools.training.distributed import Processes
 from gvtools.training.drawn import drawn_lines
 from gvtools.training.invalid_sample import DEPTH, OVERLAP, UNREADABLE, InvalidSampleError

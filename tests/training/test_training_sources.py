@@ -17,7 +17,7 @@ from tiny_scan import write_scan
 
 from gvtools.errors import OptionError, ProjectError
 from gvtools.scenes.addresses import open_collection
-from gvtools.scenes.data_sets.spec import load_spec
+from gvtools.scenes.data_sets.catalogue import load_spec
 from gvtools.scenes.shards.writer import ShardOptions, write_shards
 from gvtools.settings import with_texts
 from gvtools.training.batch import TrainingBatch
@@ -135,7 +135,9 @@ def test_the_papers_rule_is_taken_from_the_spec(home, monkeypatch):
     mixed = load_spec("Hypersim").geometry
     assert mixed is not None and mixed.own_share == pytest.approx(2 / 3)
     texts = {"7scenes": spec.model_copy(update={"geometry": mixed})}
-    monkeypatch.setattr("gvtools.scenes.data_sets.spec.load_spec", lambda name: texts["7scenes"])
+    monkeypatch.setattr(
+        "gvtools.scenes.data_sets.catalogue.load_spec", lambda name: texts["7scenes"]
+    )
     alone = samples(str(home / "shards"), share=1.0).batch(range(24, 32))
     own, fallen = (
         alone.notes.get(f"geometry/7-Scenes/{kind}", 0) for kind in ("own", "own (no estimate)")

@@ -19,39 +19,33 @@ degrees is taken, and a finding says so.
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.errors import ProjectError
-from gvtools.optional import require
-from gvtools.scenes.data_sets.array_files import read_dataset
-from gvtools.scenes.data_sets.layouts import Layout
-from gvtools.scenes.data_sets.posed_pictures import (
-    OPENCV_FROM_OPENGL,
+from gvtools.scenes.calibration import (
     Float64,
-    PosedPicture,
-    natural,
+    csv_rows,
+    opencv_pose,
     pinhole_lens,
-    posed_scene,
+    rigid_poses,
 )
-from gvtools.scenes.data_sets.spec import DataSetSpec
-from gvtools.scenes.images import read_image
-from gvtools.scenes.photographs import Depth
+from gvtools.scenes.depth_files import hdf5_array
+from gvtools.scenes.images import read_image, readings
+from gvtools.scenes.layout import Layout
+from gvtools.scenes.matching import natural
+from gvtools.scenes.photographs import Depth, PosedFrame, posed_scene
 from gvtools.scenes.scene import Finding, Frame, Scene
 from gvtools.scenes.transforms_frame import LensParameters
-from gvtools.untrusted import regular
-
-if TYPE_CHECKING:
-    pass
+from gvtools.untrusted import read_text
 
 PARAMETERS = "metadata_camera_parameters.csv"
 SIZE = (1024, 768)  # width, height of the pictures where the file of parameters is absent
@@ -65,15 +59,11 @@ NO_ENTITY = -1  # in render_entity_id: the pixel shows no object
 
 
 def _scenes(root: Path) -> tuple[str, ...]:
-    found = [
-        f"{path.parent.parent.name}/{path.name}"
-        for path in root.glob("*/_detail/cam_*/")
-        if (path / "camera_keyframe_positions.hdf5").is_file()
-    ]
-    return natural(found)
+    found = root.glob("*/_detail/cam_*/camera_keyframe_positions.hdf5")
+    return natural(f"{path.parents[2].name}/{path.parent.name}" for path in found)
 
 
-def _read(root: Path, scene: str, spec: DataSetSpec) -> Scene:
+def _read(root: Path, scene: str) -> Scene:
     name, _, camera = scene.partition("/")
     detail, images = root / name / "_detail", root / name / "images"
     parameters = _parameters(root, name)
@@ -83,18 +73,17 @@ def _read(root: Path, scene: str, spec: DataSetSpec) -> Scene:
     findings += _turn_findings(turned)
     orientations = _hdf5(detail / camera / "camera_keyframe_orientations.hdf5")
     positions = _hdf5(detail / camera / "camera_keyframe_positions.hdf5") * unit
-    indices = _frame_indices(detail / camera, len(positions))
+    numbers = detail / camera / "camera_keyframe_frame_indices.hdf5"
+    indices = [int(i) for i in _hdf5(numbers)] if numbers.is_file() else range(len(positions))
     geometry = images / f"scene_{camera}_geometry_hdf5"
     frames = []
     for index, rotation, position in zip(indices, orientations, positions, strict=True):
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = rotation, position
-        pose = pose @ OPENCV_FROM_OPENGL
+        pose = opencv_pose(rigid_poses(rotation, position))
         pose[:3, :3] = pose[:3, :3] @ turned.stored_from_turned
         stem = f"frame.{index:04d}"
         color, read = _color(images, camera, stem, turned=turned)
         frames.append(
-            PosedPicture(
+            PosedFrame(
                 stem,
                 color,
                 turned.lens,
@@ -104,30 +93,21 @@ def _read(root: Path, scene: str, spec: DataSetSpec) -> Scene:
                 read=read,
             )
         )
+    place = root / scene
     return posed_scene(
-        root / scene,
-        frames,
-        poses="world_from_cam",
-        metric=True,
-        findings=findings,
-        home=root,
+        place, frames, poses="world_from_cam", metric=True, findings=findings, home=root
     )
 
 
 @dataclass(frozen=True)
 class TurnedPinhole:
-    """The pinhole that equals a camera with a tilted lens.
+    """The pinhole that equals a camera with a tilted lens."""
 
-    Attributes:
-        lens: intrinsics of the pinhole, pixels.
-        stored_from_turned: (3, 3) rotation from the pinhole's axes to those of the stored pose,
-            both OpenCV.
-        slope: pixels by which each row of the stored picture is shifted right against the row
-            above (skew / fy); 0 for none.
-    """
-
-    lens: LensParameters
+    lens: LensParameters  # intrinsics of the pinhole, pixels
+    # (3, 3) rotation from the pinhole's axes to those of the stored pose, both OpenCV.
     stored_from_turned: Float64
+    # Pixels by which each row of the stored picture is shifted right against the row above (skew /
+    # fy); 0 for none.
     slope: float
 
     def straight(self, values: NDArray[Any], *, nearest: bool) -> NDArray[Any]:
@@ -178,8 +158,7 @@ def read_distance(path: Path, *, camera: TurnedPinhole) -> Depth:
     scale = camera.lens.size[0] / width, camera.lens.size[1] / height
     x = ((np.arange(width) + 0.5) * scale[0] - cx) / fx
     y = ((np.arange(height) + 0.5) * scale[1] - cy) / fy
-    z = distance / np.sqrt(1 + x[None, :] ** 2 + y[:, None] ** 2)
-    return np.where(np.isfinite(z) & (z > 0), z, 0).astype(np.float32)
+    return readings(distance / np.sqrt(1 + x[None, :] ** 2 + y[:, None] ** 2))
 
 
 def read_color(path: Path) -> Frame:
@@ -234,24 +213,14 @@ def _turn_findings(turned: TurnedPinhole) -> list[Finding]:
     return findings
 
 
-def _frame_indices(folder: Path, count: int) -> list[int]:
-    """Numbers in the names of a camera's frames."""
-    path = folder / "camera_keyframe_frame_indices.hdf5"
-    return [int(i) for i in _hdf5(path)] if path.is_file() else list(range(count))
-
-
 def _parameters(root: Path, scene: str) -> dict[str, str]:
     """The scene's line in the file of camera parameters; empty where that is absent."""
-    for folder in (root, root.resolve().parent):
-        path = folder / PARAMETERS
-        if path.is_file():
-            try:
-                with regular(path).open(newline="", encoding="utf-8") as file:
-                    found = (row for row in csv.DictReader(file) if row["scene_name"] == scene)
-                    return next(found, {})
-            except (OSError, KeyError, ValueError, csv.Error) as error:
-                raise ProjectError(f"{path}: unreadable ({error}); copy it again") from None
-    return {}
+    paths = (folder / PARAMETERS for folder in (root, root.resolve().parent))
+    path = next((path for path in paths if path.is_file()), None)
+    rows = [] if path is None else csv_rows(path)
+    if rows and "scene_name" not in rows[0]:
+        raise ProjectError(f"{path}: no column scene_name; copy it again")
+    return next((row for row in rows if row["scene_name"] == scene), {})
 
 
 def _projection(parameters: dict[str, str]) -> tuple[Float64, tuple[int, int], list[Finding]]:
@@ -275,9 +244,8 @@ def _projection(parameters: dict[str, str]) -> tuple[Float64, tuple[int, int], l
 def _metres_per_unit(path: Path, parameters: dict[str, str]) -> float:
     texts = [parameters.get("settings_units_info_meters_scale") or ""]
     if path.is_file():
-        with regular(path).open(newline="", encoding="utf-8", errors="replace") as file:
-            rows = [row for row in csv.reader(file) if row[:1] == ["meters_per_asset_unit"]]
-        texts = [row[1] for row in rows if len(row) > 1] + texts
+        words = (line.split(",") for line in read_text(path, errors="replace").splitlines())
+        texts = [row[1] for row in words if row[0] == "meters_per_asset_unit" and row[1:]] + texts
     for text in texts:
         # An interrupted download may end before the number.
         with suppress(ValueError):
@@ -288,15 +256,9 @@ def _metres_per_unit(path: Path, parameters: dict[str, str]) -> float:
     )
 
 
-def _hdf5(path: Path) -> Float64:
-    """The array ``dataset`` of an HDF5 file, with its stored shape and type."""
-    try:
-        with require("h5py", extra="data", purpose="reading Hypersim").File(
-            regular(path), "r"
-        ) as file:
-            return read_dataset(path, file["dataset"])
-    except (OSError, KeyError, RuntimeError, TypeError, ValueError) as error:
-        raise ProjectError(f"{path}: unreadable ({error}); copy it again") from None
+def _hdf5(path: Path) -> Any:
+    """The array of an HDF5 file, which all of Hypersim's call "dataset"."""
+    return hdf5_array(path, "dataset")
 
 
-LAYOUT = Layout("ai_VVV_NNN/_detail/cam_XX with ai_VVV_NNN/images", _scenes, _read)
+LAYOUTS = (Layout("hypersim", "ai_VVV_NNN/_detail/cam_XX with ai_VVV_NNN/images", _scenes, _read),)

@@ -13,27 +13,20 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from gvtools.errors import ProjectError
 from gvtools.optional import require
-from gvtools.scenes.data_sets.layouts import Layout
-from gvtools.scenes.data_sets.posed_pictures import (
-    Float64,
-    PosedPicture,
-    natural,
-    posed_scene,
-)
-from gvtools.scenes.data_sets.spec import DataSetSpec
+from gvtools.scenes.calibration import Float64
 from gvtools.scenes.images import UNREADABLE
+from gvtools.scenes.layout import Layout
+from gvtools.scenes.matching import natural
+from gvtools.scenes.photographs import PosedFrame, posed_scene
 from gvtools.scenes.scene import Finding, Frame, Scene
 from gvtools.scenes.transforms_frame import LensParameters
 from gvtools.untrusted import open_picture, regular
-
-if TYPE_CHECKING:
-    pass
 
 CAMERAS = {1: "front", 2: "front_left", 3: "front_right", 4: "side_left", 5: "side_right"}
 TIME, CAMERA = "key.frame_timestamp_micros", "key.camera_name"
@@ -56,7 +49,7 @@ def _scenes(root: Path) -> tuple[str, ...]:
     return natural(found)
 
 
-def _read(root: Path, scene: str, spec: DataSetSpec) -> Scene:
+def _read(root: Path, scene: str) -> Scene:
     split, _, segment = scene.rpartition("/")
     home = root / split
     images = home / "camera_image" / f"{segment}.parquet"
@@ -73,7 +66,7 @@ def _read(root: Path, scene: str, spec: DataSetSpec) -> Scene:
         if pose is not None and vehicle_from_cam is not None:
             pose = pose @ vehicle_from_cam @ WAYMO_FROM_OPENCV
         pictures.append(
-            PosedPicture(
+            PosedFrame(
                 f"{CAMERAS.get(camera, str(camera))}/{time}",
                 images,
                 lens,
@@ -89,13 +82,7 @@ def _read(root: Path, scene: str, spec: DataSetSpec) -> Scene:
 
 
 def read_picture(path: Path, *, group: int, row: int) -> Frame:
-    """One picture of a ``camera_image`` file.
-
-    Args:
-        path: the file.
-        group: its row group.
-        row: within the group.
-    """
+    """The picture in a row of a row group of a ``camera_image`` file."""
     try:
         with _parquet().ParquetFile(regular(path)) as file:
             seen = 0
@@ -171,6 +158,11 @@ def _parquet() -> Any:
     return require("pyarrow.parquet", extra="data", purpose="reading Waymo's files")
 
 
-LAYOUT = Layout(
-    "SPLIT/camera_image/SEGMENT.parquet with camera_calibration and vehicle_pose", _scenes, _read
+LAYOUTS = (
+    Layout(
+        "waymo",
+        "SPLIT/camera_image/SEGMENT.parquet with camera_calibration and vehicle_pose",
+        _scenes,
+        _read,
+    ),
 )

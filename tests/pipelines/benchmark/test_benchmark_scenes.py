@@ -14,7 +14,7 @@ from gvtools.errors import ProjectError
 from gvtools.evaluation.published import load_benchmark
 from gvtools.runs.run import Run
 from gvtools.scenes.colmap_writer import write_colmap
-from gvtools.scenes.data_sets import layouts
+from gvtools.scenes.data_sets import catalogue
 from pipelines.benchmark import scenes
 from pipelines.benchmark.scenes import (
     open_benchmark_scene,
@@ -115,11 +115,11 @@ def test_llff_has_one_size_and_its_runs_are_opened_again_with_it(tmp_path, copie
 
 def test_scenes_are_found_in_whichever_folder_of_the_download_they_lie(monkeypatch, tmp_path):
     names = ("Rectified/scan8", "Rectified/scan80", "scan9")
-    monkeypatch.setattr(layouts, "scenes_of", lambda name, root: names)
+    monkeypatch.setattr(catalogue, "scenes_of", lambda name, root: names)
     monkeypatch.setattr(
-        layouts,
+        catalogue,
         "layout_of",
-        lambda spec: layouts.Layout("", lambda _: names, None),  # type: ignore[arg-type]
+        lambda spec: catalogue.Layout("", "", lambda _: names, None),  # type: ignore[arg-type]
     )
     benchmark = load_benchmark("dtu").at(3)
     found = [scenes._name_there(benchmark, name, tmp_path) for name in ("scan8", "scan9", "scan1")]

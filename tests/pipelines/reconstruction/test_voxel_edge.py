@@ -13,8 +13,8 @@ from gvtools.depth.source import DepthMap, MixedDepth, RecordedDepth
 from gvtools.depth.stereo.plane_sweep import PlaneSweepStereo
 from gvtools.errors import DegenerateError, ProjectError
 from gvtools.scenes.colmap import read_colmap
+from gvtools.scenes.rgbd import SEVENSCENES
 from gvtools.scenes.scene import Frame, Scene, View
-from gvtools.scenes.sevenscenes import read_sevenscenes
 from pipelines.cli import main
 from pipelines.reconstruction.voxel import automatic_voxel
 
@@ -60,7 +60,7 @@ def swept(monkeypatch) -> list[PlaneSweepStereo]:
 
 
 def test_recorded_depth_tells(tmp_path):
-    scene = read_sevenscenes(write_scan(tmp_path / "scan"))
+    scene = SEVENSCENES.read(write_scan(tmp_path / "scan"))
     said: list[str] = []
     for percentile, distance in ((50, WALL), (1, SQUARE)):
         edge = automatic_voxel(
@@ -71,7 +71,7 @@ def test_recorded_depth_tells(tmp_path):
 
 
 def test_where_some_views_tell_the_others_are_not_computed(tmp_path, photographs):
-    scene = read_sevenscenes(write_scan(tmp_path / "scan"))
+    scene = SEVENSCENES.read(write_scan(tmp_path / "scan"))
     bare = tuple(replace(view, has_depth=False) for view in scene.views[1:])
     mixed = replace(scene, views=(scene.views[0], *bare))
     source = MixedDepth(RecordedDepth(), Never())
@@ -143,7 +143,7 @@ def test_no_depth_at_all_is_an_error_that_names_the_way_out(photographs, tmp_pat
     scene = replace(read_colmap(photographs), points=None)
     with pytest.raises(ProjectError, match=r"none shows what it does\); give --voxel"):
         automatic_voxel(scene, scene.names, Lacking(), percentile=50)
-    blank = read_sevenscenes(write_scan(tmp_path / "scan"))
+    blank = SEVENSCENES.read(write_scan(tmp_path / "scan"))
     views = tuple(
         replace(view, load=lambda: Frame(np.zeros((72, 96, 3), np.uint8), np.zeros((72, 96), "f4")))
         for view in blank.views

@@ -9,10 +9,11 @@ import pytest
 import yaml
 
 from gvtools.errors import OptionError
-from gvtools.scenes.data_sets import spec as spec_module
-from gvtools.scenes.data_sets.layouts import LAYOUTS, layout_of
-from gvtools.scenes.data_sets.spec import (
+from gvtools.scenes.data_sets import catalogue as spec_module
+from gvtools.scenes.data_sets.catalogue import (
+    LAYOUTS,
     DataSetSpec,
+    layout_of,
     load_spec,
     name_key,
     parse_spec,
@@ -99,7 +100,7 @@ def test_every_layout_is_known() -> None:
     assert {spec.layout for spec in specs} == set(LAYOUTS)
     for spec in specs:
         found = layout_of(spec)
-        assert found.looks_like and callable(found.scenes) and callable(found.read)
+        assert found.holds and callable(found.scenes) and callable(found.reader)
 
 
 def test_a_wrong_spec_is_named() -> None:

@@ -19,9 +19,9 @@ from data_sets.room_frames import room_frames
 from PIL import Image
 
 from gvtools.errors import ProjectError
-from gvtools.scenes.data_sets.dtu import decomposed
-from gvtools.scenes.data_sets.video import read_frame
+from gvtools.scenes.data_sets.mvs import decomposed
 from gvtools.scenes.scene import Scene
+from gvtools.scenes.video import read_frame
 
 
 def messages(scene: Scene) -> str:

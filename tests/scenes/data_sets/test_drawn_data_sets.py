@@ -26,13 +26,19 @@ from data_sets.drawn_frames import drawn_frames
 from data_sets.miniature import Expected, layout_named, read_miniature
 from PIL import Image
 
-from gvtools.errors import ProjectError
-from gvtools.scenes.data_sets import array_files
-from gvtools.scenes.data_sets.drawn import number_table, numbers_in, picture_size
-from gvtools.scenes.data_sets.omniworld import buffer_depth
-from gvtools.scenes.data_sets.spring import halved
-from gvtools.scenes.data_sets.tartanair import SKY_FROM, ned_poses
-from gvtools.scenes.data_sets.tartanair_v2 import CAMERAS, packed_depth
+from gvtools.errors import OptionError, ProjectError
+from gvtools.scenes import depth_files
+from gvtools.scenes.calibration import number_table
+from gvtools.scenes.data_sets.synthetic import (
+    CAMERAS,
+    SKY_FROM,
+    buffer_depth,
+    halved,
+    ned_poses,
+    packed_depth,
+)
+from gvtools.scenes.matching import numbers_in
+from gvtools.scenes.photographs import first_size
 from gvtools.scenes.scene import Scene
 
 WRITERS = {
@@ -312,10 +318,10 @@ def test_hdf5_and_exr_name_the_extra_that_reads_them(
 ) -> None:
     monkeypatch.setitem(sys.modules, "h5py", None)
     monkeypatch.setitem(sys.modules, "OpenEXR", None)
-    with pytest.raises(ProjectError, match=r"gvtools\[data\]"):
-        array_files.hdf5_array(tmp_path / "a.h5", "x")
-    with pytest.raises(ProjectError, match=r"gvtools\[data\]"):
-        array_files.exr_channel(tmp_path / "a.exr", ("Y",))
+    with pytest.raises(OptionError, match=r"gvtools\[data\]"):
+        depth_files.hdf5_array(tmp_path / "a.h5", "x")
+    with pytest.raises(OptionError, match=r"gvtools\[data\]"):
+        depth_files.exr_channel(tmp_path / "a.exr", ("Y",))
 
 
 def test_errors_of_array_files_say_what_is_there(tmp_path: Path) -> None:
@@ -325,23 +331,23 @@ def test_errors_of_array_files_say_what_is_there(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["image_0"] = np.zeros(3)
     with pytest.raises(ProjectError, match="holds image_0; expected 'depth'"):
-        array_files.hdf5_array(tmp_path / "a.h5", "depth")
+        depth_files.hdf5_array(tmp_path / "a.h5", "depth")
     with pytest.raises(ProjectError, match=r"no such file|unreadable"):
-        array_files.hdf5_array(tmp_path / "b.h5", "depth")
+        depth_files.hdf5_array(tmp_path / "b.h5", "depth")
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     for name, kind in (("half", np.float16), ("float", np.float32)):
         image = np.array([[1.5, np.inf], [2.0, 3.0]], kind)
         OpenEXR.File(header, {"R": image}).write(str(tmp_path / f"{name}.exr"))
-        read = array_files.exr_channel(tmp_path / f"{name}.exr", ("Y", "R"))
+        read = depth_files.exr_channel(tmp_path / f"{name}.exr", ("Y", "R"))
         np.testing.assert_array_equal(read, image)
         assert read.dtype == np.float32
     with pytest.raises(ProjectError, match="channels R; expected Y or Z"):
-        array_files.exr_channel(tmp_path / "half.exr", ("Y", "Z"))
+        depth_files.exr_channel(tmp_path / "half.exr", ("Y", "Z"))
     (tmp_path / "half.exr").write_bytes(b"none")
     with pytest.raises(ProjectError, match="unreadable"):
-        array_files.exr_channel(tmp_path / "half.exr", ("Y",))
+        depth_files.exr_channel(tmp_path / "half.exr", ("Y",))
     with pytest.raises(ProjectError, match="no such file"):
-        array_files.exr_channel(tmp_path / "none.exr", ("Y",))
+        depth_files.exr_channel(tmp_path / "none.exr", ("Y",))
 
 
 def test_numbers_and_tables(tmp_path: Path) -> None:
@@ -355,11 +361,11 @@ def test_numbers_and_tables(tmp_path: Path) -> None:
         (tmp_path / name).touch()
     assert numbers_in(tmp_path, "rgb_{:05d}.jpg") == {3, 10}
     assert numbers_in(tmp_path / "none", "rgb_{:05d}.jpg") == set()
-    assert picture_size(tmp_path.iterdir()) == (1, 1)
+    assert first_size(tmp_path.iterdir()) is None
     assert number_table(tmp_path / "none.txt", 3).shape == (0, 3)
     path = tmp_path / "rows.txt"
     path.write_text("a b\n1 2\n\n3 4\n")
-    np.testing.assert_array_equal(number_table(path, 2, header=True), [[1, 2], [3, 4]])
+    np.testing.assert_array_equal(number_table(path, 2, skip=1), [[1, 2], [3, 4]])
     with pytest.raises(ProjectError, match="could not convert"):
         number_table(path, 2)
     with pytest.raises(ProjectError, match="row 1 of 3 has 2 numbers; expected 7"):

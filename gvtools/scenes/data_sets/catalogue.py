@@ -1,19 +1,28 @@
-"""What is known of a public data set, as ``data_specs/data_sets`` records it, one YAML each.
+"""Public data sets by name: what is known of each, and the scenes of its download.
 
-Every fact names its source; what could not be verified stands under ``not_verified``.
+A spec records what is known of a data set, one YAML each in ``data_specs/data_sets``; every fact
+names its source, and what could not be verified stands under ``not_verified``. Its layout, the
+reader of a download as the authors publish it, is one of LAYOUTS: several data sets may share one.
 """
 
 from __future__ import annotations
 
 import difflib
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 from importlib import resources
+from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from gvtools.errors import OptionError
+from gvtools.errors import OptionError, ProjectError
+from gvtools.scenes.data_sets import aria, captures, hypersim, mvs, reconstructed, synthetic, waymo
+from gvtools.scenes.data_sets.address import FORM, SPEC
+from gvtools.scenes.layout import Layout
+from gvtools.scenes.scene import Origin, Scene
 from gvtools.untrusted import parse_yaml
 
 Texts = Annotated[tuple[str, ...], Field(strict=False)]
@@ -76,7 +85,7 @@ class Depth(_Record):
     invalid: Texts = ()
     """Stored values that mean "no depth", in words or numbers."""
     complete: bool
-    """Whether every pixel has depth (drawn scenes), so that nothing has to be estimated."""
+    """Whether every pixel has depth (rendered scenes), so that nothing has to be estimated."""
 
 
 class Licence(_Record):
@@ -129,7 +138,7 @@ class DataSetSpec(_Record):
     counts: Counts
     """Of the paper's table where that lists the data set."""
     layout: str
-    """The native layout: a name in ``gvtools.scenes.data_sets.layouts.LAYOUTS``."""
+    """The native layout: a name in ``LAYOUTS``."""
     files: dict[str, str]
     """What each kind of file is called, relative to the root; {scene} stands for a scene's name."""
     camera: Camera
@@ -208,3 +217,87 @@ def _texts() -> dict[str, str]:
     entries = resources.files("data_specs").joinpath("data_sets").iterdir()
     found = {x.name[:-5]: x.read_text(encoding="utf-8") for x in entries if x.name[-5:] == ".yaml"}
     return dict(sorted(found.items()))
+
+
+# The ``layout`` of a data set's spec, by name.
+LAYOUTS: dict[str, Layout] = {
+    layout.name: layout
+    for module in (captures, reconstructed, mvs, synthetic, hypersim, aria, waymo)
+    for layout in module.LAYOUTS
+}
+
+
+def layout_of(spec: DataSetSpec) -> Layout:
+    """The layout that a spec names."""
+    return LAYOUTS[spec.layout]
+
+
+def scenes_of(name: str, root: Path) -> tuple[str, ...]:
+    """The scenes of a data set that a folder holds."""
+    spec = load_spec(name)
+    layout = layout_of(spec)
+    if not Path(root).is_dir():
+        raise ProjectError(f"{root}: no such folder; expected {layout.holds}")
+    found = layout.scenes(Path(root))
+    if not found:
+        raise ProjectError(f"{root}: no scene of {spec.name}; expected {layout.holds}")
+    return found
+
+
+def open_data_set(name: str, scene: str, root: Path) -> Scene:
+    """One scene of the data set ``name`` as it was downloaded to ``root``.
+
+    ``scene`` is as ``scenes_of`` names it, or a variant; "" for the only one of the folder.
+    """
+    spec = load_spec(name)
+    known = scenes_of(name, root)
+    if not scene and len(known) == 1:
+        scene = known[0]
+    if not scene:
+        raise ProjectError(
+            f"{root}: holds {len(known)} scenes of {spec.name}, first {known[0]!r}; say which, as "
+            f"{FORM}"
+        )
+    _check_is_there(spec, scene, Path(root), known=known)
+    return read_scene(spec, scene, Path(root))
+
+
+def open_address(address: Path | str, root: Path | None) -> Scene:
+    """The scene that ``spec:NAME:SCENE`` names in the folder of the data set's download.
+
+    ":SCENE" may be left out where the folder holds only one.
+    """
+    name, _, scene = str(address).removeprefix(SPEC).partition(":")
+    if not name:
+        raise OptionError(f"{address}: names no data set; expected {FORM}")
+    spec = load_spec(name)
+    if root is None:
+        raise OptionError(
+            f"{address}: where {spec.name} lies is not said; give the folder of its download by "
+            "--root DIR (root= in Python)"
+        )
+    return open_data_set(name, scene, Path(root))
+
+
+def chosen_scenes(name: str, root: Path, scenes: Sequence[str] = ()) -> tuple[str, ...]:
+    """The scenes of a download that a user names, without repeats; all of them if none is named."""
+    spec = load_spec(name)
+    known = scenes_of(name, root)
+    for scene in scenes:
+        _check_is_there(spec, scene, Path(root), known=known)
+    return tuple(dict.fromkeys(scenes)) or known
+
+
+def _check_is_there(spec: DataSetSpec, scene: str, root: Path, *, known: Sequence[str]) -> None:
+    if scene in known or scene in layout_of(spec).variants(root):
+        return
+    near = difflib.get_close_matches(scene, known, n=1)
+    hint = f"did you mean {near[0]!r}?" if near else f"first of {len(known)}: {known[0]!r}"
+    raise ProjectError(f"{root}: {spec.name} has no scene {scene!r} there; {hint}")
+
+
+def read_scene(spec: DataSetSpec, scene: str, root: Path) -> Scene:
+    """A scene by its name, without listing the others first, as ``open_data_set`` does."""
+    opened = layout_of(spec).read(root, scene)
+    origin = Origin(f"{SPEC}{name_key(spec.name)}:{scene}", root.resolve())
+    return replace(opened, origin=origin)

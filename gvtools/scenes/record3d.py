@@ -24,22 +24,23 @@ from pydantic import BaseModel, Field, ValidationError
 
 from gvtools.errors import ProjectError
 from gvtools.optional import require
-from gvtools.scenes.data_sets.array_files import exr_channel
-from gvtools.scenes.data_sets.posed_pictures import (
+from gvtools.scenes.calibration import (
     Float64,
-    PosedPicture,
+    finite_array,
+    opencv_pose,
     pinhole_lens,
     quaternion_pose,
     scaled_lens,
 )
-from gvtools.scenes.images import UNREADABLE
-from gvtools.scenes.phones.arkit import PhoneLayout, numbers, opencv_pose, phone_scene, readings
-from gvtools.scenes.photographs import Depth
+from gvtools.scenes.depth_files import exr_depth
+from gvtools.scenes.images import UNREADABLE, readings
+from gvtools.scenes.layout import Layout
+from gvtools.scenes.phones import confident, phone_scene
+from gvtools.scenes.photographs import Depth, PosedFrame
 from gvtools.scenes.scene import Finding, Frame, Scene
 from gvtools.scenes.transforms_frame import LensParameters
 from gvtools.untrusted import archive, open_picture, parse_json, read_bytes
 
-NAME = "Record3D"
 ARCHIVE, EXPORT = ".r3d", "EXR_RGBD"
 PICTURES = (".jpg", ".png")
 CHANNELS = ("R", "Y", "Z")
@@ -63,17 +64,16 @@ class Metadata(BaseModel):
     def lens(self, number: int) -> LensParameters | None:
         """Of a frame, for pictures of ``w`` x ``h``; None where it is impossible."""
         given = self.perFrameIntrinsicCoeffs
-        own = numbers(given[number], (4,)) if number < len(given) else None
-        K = numbers([self.K[place] for place in (0, 4, 6, 7)], (4,)) if own is None else own
+        own = finite_array(given[number], 4) if number < len(given) else None
+        K = finite_array([self.K[place] for place in (0, 4, 6, 7)], 4) if own is None else own
         return None if K is None else pinhole_lens(K, (self.w, self.h))
 
     def pose(self, number: int) -> Float64 | None:
         """(4, 4) world_from_cam of a frame, OpenCV axes, metres; None where there is none."""
-        values = numbers(self.poses[number], (7,)) if number < len(self.poses) else None
-        if values is None or not values[:4].any():
+        values = finite_array(self.poses[number], 7) if number < len(self.poses) else None
+        if values is None:
             return None
-        x, y, z, w = values[:4]
-        return opencv_pose(quaternion_pose([w, x, y, z], values[4:]))
+        return opencv_pose(quaternion_pose(values[[3, 0, 1, 2]], values[4:]))
 
     def frames(self, stems: set[str]) -> list[int]:
         """Numbers of frames that have a pose or a picture of that name."""
@@ -107,7 +107,7 @@ def _read(path: Path) -> Scene:
     if bare:
         line = f"{bare} depth maps have no confidence map: all of their depth is used"
         findings.append(Finding("info", line))
-    return phone_scene(path, NAME, pictures, upright=False, findings=findings)
+    return phone_scene(path, "Record3D", pictures, upright=False, findings=findings)
 
 
 def _metadata(home: Path, name: str) -> Metadata:
@@ -132,7 +132,7 @@ def _metadata(home: Path, name: str) -> Metadata:
     return metadata
 
 
-def _from_export(home: Path, metadata: Metadata) -> tuple[list[PosedPicture], int]:
+def _from_export(home: Path, metadata: Metadata) -> tuple[list[PosedFrame], int]:
     """The frames, and how many depth maps lack confidence."""
     images = {path.stem: path for path in (home / "rgb").iterdir() if path.suffix in PICTURES}
     pictures, bare = [], 0
@@ -140,19 +140,19 @@ def _from_export(home: Path, metadata: Metadata) -> tuple[list[PosedPicture], in
         depth = home / "depth" / f"{number}.exr"
         bare += depth.is_file()
         pictures.append(
-            PosedPicture(
+            PosedFrame(
                 f"{number}.jpg",
                 images.get(str(number), home / "rgb" / f"{number}.jpg"),
                 metadata.lens(number),
                 metadata.pose(number),
                 depth,
-                _exr,
+                partial(exr_depth, channels=CHANNELS),
             )
         )
     return pictures, bare
 
 
-def _from_archive(path: Path, metadata: Metadata) -> tuple[list[PosedPicture], int]:
+def _from_archive(path: Path, metadata: Metadata) -> tuple[list[PosedFrame], int]:
     """The frames, and how many depth maps lack confidence."""
     held, packed = _members(path), path.is_file()
     stems = {Path(name).stem for name in held if name.endswith(".jpg")}
@@ -164,7 +164,7 @@ def _from_archive(path: Path, metadata: Metadata) -> tuple[list[PosedPicture], i
         bare += depth in held and conf not in held
         maps = [name for name in (depth, conf) if name in held]
         pictures.append(
-            PosedPicture(
+            PosedFrame(
                 f"{number}.jpg",
                 # What an archive lacks is given as a path that does not exist.
                 path if packed and image in held else path / image,
@@ -223,29 +223,21 @@ def _picture(path: Path, *, member: str) -> Frame:
         raise _damaged(path / member, error) from None
 
 
-def _exr(path: Path) -> Depth:
-    return readings(exr_channel(path, CHANNELS), None)
-
-
 def _lzfse_depth(home: Path, maps: list[str], _: Path, *, shape: tuple[int, int]) -> Depth:
-    """Depth, and its confidence where there is any.
-
-    Args:
-        home: the archive, or the folder that it was unpacked into.
-        maps: names of depth and confidence in it.
-        shape: height and width.
-    """
-    depth = _unpacked(home, maps[0], "<f4", shape=shape)
+    """(h, w) depth; ``maps`` are names of it and, if there is any, its confidence in ``home``."""
+    depth = readings(_unpacked(home, maps[0], "<f4", shape=shape))
     if len(maps) == 1:
-        return readings(depth, None)
-    return readings(depth, _unpacked(home, maps[1], "u1", shape=shape) > 0)
+        return depth
+    return confident(depth, _unpacked(home, maps[1], "u1", shape=shape) > 0)
 
 
 def _unpacked(home: Path, name: str, dtype: str, *, shape: tuple[int, int]) -> NDArray[Any]:
     lzfse = require(
-        "lzfse", extra="phones", purpose=f"{home}: depth compressed by LZFSE",
-        instead="or export EXR and JPG", error=ProjectError,
-    )  # fmt: skip
+        "lzfse",
+        extra="phones",
+        purpose=f"{home}: depth compressed by LZFSE",
+        instead="or export EXR and JPG",
+    )
     try:
         data = _decompressed(_stored(home, name), np.dtype(dtype).itemsize * shape[0] * shape[1])
         return np.frombuffer(data, dtype).reshape(shape)
@@ -281,6 +273,9 @@ def _decompressed(data: bytes, size: int) -> bytes:
     return buffer.raw[:size]
 
 
-RECORD3D = PhoneLayout(
-    NAME, f"{NAME} (an .r3d file, metadata with rgbd/, or {EXPORT}/metadata.json)", _matches, _read
+RECORD3D = Layout.of_folder(
+    "Record3D",
+    f"an .r3d file, metadata with rgbd/, or {EXPORT}/metadata.json",
+    matches=_matches,
+    read=_read,
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +13,6 @@ from gvtools.errors import ProjectError
 from gvtools.optional import require
 from gvtools.scenes.scene import Frame
 from gvtools.untrusted import regular
-
-if TYPE_CHECKING:
-    pass
 
 
 @dataclass(frozen=True)

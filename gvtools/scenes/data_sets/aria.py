@@ -1,9 +1,18 @@
-"""Cameras and pictures in Aria's VRS files, through the official ``projectaria_tools``."""
+"""Aria Digital Twin: ``[SEQUENCE/]RECORDING/{video.vrs, depth_images.vrs, aria_trajectory.csv}``.
+
+The recording is a VRS file, read through the official ``projectaria_tools``; its colour camera (a
+fisheye of 1408x1408) becomes a pinhole. The trajectory is world_from_device in metres by the
+device's clock (microseconds); frames between two poses get their interpolation. Quaternions are
+stored w x y z in version 1.0 of the data set (``metadata.json`` or ``gt-metadata.json``; 1.0 where
+it names none) and x y z w since. Depth is of the same fisheye pixels, millimetres along z. The
+glasses' colour sensor lies on its side: pictures are read as stored, not turned upright.
+"""
 
 from __future__ import annotations
 
+import csv
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,17 +20,86 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gvtools.cameras import invert_rigid
 from gvtools.errors import ProjectError
 from gvtools.optional import require
-from gvtools.scenes.photographs import Depth
-from gvtools.scenes.rgbd_recording import MILLIMETRES
-from gvtools.scenes.scene import Frame
+from gvtools.scenes.calibration import MILLIMETRES, Float64, json_file, quaternion_pose
+from gvtools.scenes.layout import Layout
+from gvtools.scenes.matching import pose_at, scenes_holding
+from gvtools.scenes.photographs import Depth, PosedFrame, posed_scene
+from gvtools.scenes.scene import Finding, Frame, Scene
 from gvtools.scenes.transforms_frame import LensParameters
+from gvtools.untrusted import read_text
 
 if TYPE_CHECKING:
     import pycolmap
 
-Float64 = NDArray[np.float64]
+VIDEO, TRAJECTORY, DEPTH = "video.vrs", "aria_trajectory.csv", "depth_images.vrs"
+METADATA = ("metadata.json", "gt-metadata.json")
+FIRST_VERSION = "1.0"
+SAME, LONGEST_GAP = 1_000, 100_000_000  # nanoseconds
+
+
+def _scenes(root: Path) -> tuple[str, ...]:
+    found = scenes_holding(root, f"*/{VIDEO}", f"*/*/{VIDEO}")
+    return tuple(name for name in found if (root / name / TRAJECTORY).is_file())
+
+
+def _read(root: Path, scene: str) -> Scene:
+    folder = root / scene
+    version = _version(folder)
+    times, world_from_device = read_trajectory(folder / TRAJECTORY, version=version)
+    camera = rgb_camera(folder / VIDEO)
+    cam_from_world = invert_rigid(world_from_device @ camera.device_from_cam)
+    depth = folder / DEPTH
+    pictures = [
+        PosedFrame(
+            str(time),
+            folder / VIDEO,
+            camera.pinhole,
+            pose_at(time, times, cam_from_world, same=SAME, longest_gap=LONGEST_GAP),
+            depth if depth.is_file() else None,
+            partial(read_rgb_depth, time=time, camera=camera),
+            read=partial(read_rgb, index=i, camera=camera),
+        )
+        for i, time in enumerate(rgb_times(folder / VIDEO))
+    ]
+    (width, height), focal = camera.lens.size, camera.lens.values[0]
+    line = f"Aria's fisheye {width}x{height} to PINHOLE with focal length {focal:.1f} px"
+    findings = [Finding("info", f"{line}; quaternions of version {version}")]
+    return posed_scene(folder, pictures, poses="cam_from_world", metric=True, findings=findings)
+
+
+def _version(folder: Path) -> str:
+    """The data set's version, which tells the order of quaternions."""
+    for path in (home / name for home in (folder, folder.parent) for name in METADATA):
+        if path.is_file():
+            data = json_file(path)
+            if not isinstance(data, dict):
+                raise ProjectError(f"{path}: no JSON object; copy it again")
+            return str(data.get("dataset_version", FIRST_VERSION))
+    raise ProjectError(
+        f"{folder}: neither {' nor '.join(METADATA)}, which tell the order of quaternions; "
+        "complete the download"
+    )
+
+
+def read_trajectory(path: Path, *, version: str) -> tuple[Float64, Float64]:
+    """The glasses' trajectory: (N,) nanoseconds, increasing, and (N, 4, 4) world_from_device."""
+    try:
+        rows = list(csv.reader(read_text(path).splitlines()))[1:]
+        values = np.array([[row[1], *row[3:10]] for row in rows if row], np.float64)
+    except (OSError, ValueError, IndexError, csv.Error) as error:
+        raise ProjectError(f"{path}: {error}; expected a head and 20 columns") from None
+    if not len(values):
+        raise ProjectError(f"{path}: no pose; complete the download")
+    values = values[np.argsort(values[:, 0], kind="stable")]
+    quaternions = values[:, 4:]
+    if version != FIRST_VERSION:
+        quaternions = quaternions[:, [3, 0, 1, 2]]
+    poses = [quaternion_pose(q, t) for q, t in zip(quaternions, values[:, 1:4], strict=True)]
+    return values[:, 0] * 1000, np.stack(poses)
+
 
 RGB_STREAM, RGB_LABEL = "214-1", "camera-rgb"
 FISHEYE = "RAD_TAN_THIN_PRISM_FISHEYE"  # COLMAP's name of Aria's FISHEYE624
@@ -34,16 +112,11 @@ class AriaCamera:
 
     The pinhole has the fisheye's size and focal length, its principal point in the middle, and the
     same axes: its picture lies wholly inside the fisheye's round one.
-
-    Attributes:
-        lens: of the fisheye, pixels, first pixel's centre (0.5, 0.5).
-        radius: within which the sensor sees anything, pixels from the principal point.
-        device_from_cam: (4, 4) float64, metres.
     """
 
-    lens: LensParameters
-    radius: float
-    device_from_cam: Float64
+    lens: LensParameters  # of the fisheye, pixels, first pixel's centre (0.5, 0.5)
+    radius: float  # within which the sensor sees anything, pixels from the principal point
+    device_from_cam: Float64  # (4, 4), metres
 
     @property
     def pinhole(self) -> LensParameters:
@@ -132,12 +205,9 @@ def read_rgb(path: Path, *, index: int, camera: AriaCamera) -> Frame:
 
 
 def read_rgb_depth(path: Path, *, time: int, camera: AriaCamera) -> Depth:
-    """The depth map that belongs to a picture of the colour camera; the nearest in time.
+    """The depth map of a picture of the colour camera: the nearest in time, nanoseconds.
 
-    Args:
-        path: ``depth_images.vrs``, whose streams name the recorded streams that they belong to.
-        time: nanoseconds of the device's clock.
-        camera: of the recording.
+    Streams of ``depth_images.vrs`` name the recorded streams that they belong to.
     """
     tools, provider = _tools(), _provider(path)
     for stream in provider.get_all_streams():
@@ -174,3 +244,8 @@ def _tools() -> Any:
     for part in ("data_provider", "sensor_data", "stream_id"):
         require(f"projectaria_tools.core.{part}", extra="aria", purpose="reading Aria's recordings")
     return import_module("projectaria_tools.core")
+
+
+LAYOUTS = (
+    Layout("aria_digital_twin", f"SEQUENCE/{VIDEO} with {TRAJECTORY} and {DEPTH}", _scenes, _read),
+)

@@ -1,0 +1,264 @@
+"""Cameras and poses as files hold them: tables of numbers, matrices, lenses, pixel centres."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gvtools.errors import ProjectError
+from gvtools.scenes.scene import Finding
+from gvtools.scenes.transforms_frame import LensParameters
+from gvtools.scenes.undistort import camera_of
+from gvtools.untrusted import read_bytes, read_json, read_text
+
+Float64 = NDArray[np.float64]
+
+MILLIMETRES = 1e-3
+OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+INTRINSICS = "camera-intrinsics.txt"
+# fx, fy, cx, cy of a Kinect-like sensor as PrimeSense's driver and Open3D have them, 640x480.
+SENSOR_DEFAULT = (525.0, 525.0, 319.5, 239.5)
+# Where the sky is in a picture, as x and y.
+DIRECTIONS = {"up": (0, -1), "left": (-1, 0), "down": (0, 1), "right": (1, 0)}
+
+
+# --- files ------------------------------------------------------------------------------------
+
+
+def number_table(path: Path, columns: int, *, skip: int = 0, required: bool = False) -> Float64:
+    """(N, columns) float64 of a text file with one row a line.
+
+    Args:
+        path: the file.
+        columns: that each row has.
+        skip: lines above the rows.
+        required: whether an absent file or one without rows is refused; else it has no rows.
+    """
+    try:
+        lines = read_text(path).splitlines()[skip:]
+    except (OSError, UnicodeDecodeError) as error:
+        if isinstance(error, FileNotFoundError) and not required:
+            return np.zeros((0, columns))
+        raise ProjectError(f"{path}: unreadable ({error}); download it again") from None
+    rows = [line.split() for line in lines if line.strip()]
+    for number, row in enumerate(rows, start=1):
+        if len(row) != columns:
+            raise ProjectError(
+                f"{path}: row {number} of {len(rows)} has {len(row)} numbers; expected {columns}; "
+                "download it again"
+            )
+    if required and not rows:
+        raise ProjectError(f"{path}: no rows; expected {columns} numbers in each")
+    try:
+        return np.array(rows, np.float64).reshape(-1, columns)
+    except ValueError as error:
+        raise ProjectError(f"{path}: {error}; expected {columns} numbers in each row") from None
+
+
+def load_matrix(path: Path, *shapes: tuple[int, int]) -> Float64:
+    """A matrix of one of the shapes in a text file."""
+    expected = " or ".join(f"{rows}x{columns}" for rows, columns in shapes)
+    try:
+        text = read_text(path).replace(",", " ")
+        matrix = np.loadtxt(text.splitlines(), np.float64, ndmin=2)
+    except (OSError, ValueError) as error:
+        reason = str(error).splitlines()[0]
+        raise ProjectError(f"{path}: unreadable ({reason}); expected {expected} numbers") from None
+    if matrix.shape not in shapes:
+        shape = "x".join(str(length) for length in matrix.shape)
+        raise ProjectError(f"{path}: {shape} numbers; expected {expected}")
+    return matrix
+
+
+def csv_rows(path: Path, *, again: str = "copy it again") -> list[dict[str, str]]:
+    """The rows of a CSV file by the names of its header."""
+    try:
+        return list(csv.DictReader(read_text(path).splitlines(), skipinitialspace=True))
+    except (OSError, ValueError, csv.Error) as error:
+        raise ProjectError(f"{path}: unreadable ({error}); {again}") from None
+
+
+def json_file(path: Path) -> Any:
+    """The value in a JSON file that has to be there."""
+    try:
+        return read_json(path)
+    except (OSError, ValueError) as error:
+        raise ProjectError(f"{path}: unreadable ({error}); download it again") from None
+
+
+def json_object(path: Path) -> Mapping[str, Any]:
+    """The JSON object in a file; empty where it is absent or damaged, as if it had no key."""
+    try:
+        found = read_json(path)
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def finite_array(values: object, *shape: int) -> Float64 | None:
+    """Finite numbers of that shape, flat or nested; None where the values are others."""
+    try:
+        array = np.asarray(values, np.float64)
+    except (OverflowError, TypeError, ValueError):
+        return None
+    if array.size != int(np.prod(shape)) or not np.isfinite(array).all():
+        return None
+    return array.reshape(shape)
+
+
+# --- intrinsics -------------------------------------------------------------------------------
+
+
+def pinhole(values: Sequence[float]) -> Float64:
+    """(3, 3) intrinsics of fx, fy, cx, cy, pixels."""
+    fx, fy, cx, cy = values
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+
+
+def intrinsics_beside(root: Path, *, above: bool = False) -> tuple[Float64, str] | None:
+    """(3, 3) as published and the file's name: ``camera-intrinsics.txt`` or Open3D's JSON.
+
+    With ``above``, the text file may also stand in the parent folder.
+    """
+    for folder in (root, root.resolve().parent) if above else (root,):
+        if (folder / INTRINSICS).is_file():
+            return load_matrix(folder / INTRINSICS, (3, 3)), INTRINSICS
+    for path in sorted(root.glob("*.json")):
+        if path.is_file() and b"intrinsic_matrix" in read_bytes(path):
+            return open3d_intrinsics(path), path.name
+    return None
+
+
+def open3d_intrinsics(path: Path) -> Float64:
+    """(3, 3) intrinsics of Open3D's JSON form, which lists them column by column."""
+    try:
+        values = read_json(path)["intrinsic_matrix"]
+        return np.array(values, np.float64).reshape(3, 3).T
+    except (OSError, ValueError, KeyError, TypeError, OverflowError) as error:
+        raise ProjectError(
+            f"{path}: {type(error).__name__} ({error}); expected Open3D's form with "
+            "'intrinsic_matrix' as nine numbers, column by column"
+        ) from None
+
+
+def sensor_default() -> tuple[Float64, Finding]:
+    """(3, 3) that stands in where no file has intrinsics, and the warning that it does."""
+    values = ", ".join(f"{value:g}" for value in SENSOR_DEFAULT)
+    line = f"no intrinsics file: the PrimeSense driver's default {values} is taken"
+    return pinhole(SENSOR_DEFAULT), Finding("warning", line)
+
+
+def corner_origin(K: ArrayLike, *, what: str) -> Float64:
+    """(3, 3) of published intrinsics, whose first pixel centre is (0, 0), moved to (0.5, 0.5)."""
+    matrix = np.array(K, np.float64)
+    if matrix.shape == (4, 4):
+        matrix = matrix[:3, :3]
+    if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
+        raise ProjectError(f"{what}: {np.asarray(K).tolist()}; expected a finite 3x3 matrix")
+    off = [matrix[0, 1], matrix[1, 0], matrix[2, 0], matrix[2, 1], matrix[2, 2] - 1]
+    if min(matrix[0, 0], matrix[1, 1]) <= 0 or np.abs(off).max() > 1e-6:
+        raise ProjectError(
+            f"{what}: {matrix.tolist()}; expected [fx 0 cx; 0 fy cy; 0 0 1] with fx, fy > 0"
+        )
+    matrix[:2, 2] += 0.5
+    return matrix
+
+
+def pinhole_lens(K: ArrayLike, size: tuple[int, int]) -> LensParameters:
+    """A pinhole camera without distortion.
+
+    Args:
+        K: fx, fy, cx, cy, or a (3, 3) matrix without skew; pixels, first pixel centre (0.5, 0.5).
+        size: width and height of the picture, pixels.
+
+    >>> pinhole_lens([500, 500, 320, 240], (640, 480)).values
+    (500.0, 500.0, 320.0, 240.0)
+    """
+    matrix = np.asarray(K, np.float64)
+    if matrix.ndim == 2:
+        matrix = matrix[[0, 1, 0, 1], [0, 1, 2, 2]]
+    fx, fy, cx, cy = (float(value) for value in matrix)
+    return LensParameters("PINHOLE", (fx, fy, cx, cy), (int(size[0]), int(size[1])))
+
+
+def renderer_lens(values: Iterable[float], size: tuple[int, int]) -> LensParameters:
+    """A renderer's camera of fx, fy, cx, cy, whichever way its data set counts pixels.
+
+    It looks through the middle of its picture. So a principal point at ((W - 1) / 2, (H - 1) / 2)
+    says that the first pixel's centre is meant to be (0, 0), and is moved by half a pixel; one at
+    (W / 2, H / 2), or anywhere else, stays.
+
+    >>> renderer_lens([725.0, 725.0, 620.5, 187.0], (1242, 375)).values
+    (725.0, 725.0, 621.0, 187.5)
+    """
+    fx, fy, cx, cy = values
+    if max(abs(cx - (size[0] - 1) / 2), abs(cy - (size[1] - 1) / 2)) < 0.01:
+        cx, cy = cx + 0.5, cy + 0.5
+    return pinhole_lens([fx, fy, cx, cy], size)
+
+
+def scaled_lens(lens: LensParameters, size: tuple[int, int]) -> LensParameters:
+    """The camera of the same picture resampled to ``size`` (width and height, pixels).
+
+    >>> scaled_lens(pinhole_lens([500, 500, 320, 240], (640, 480)), (320, 240)).values
+    (250.0, 250.0, 160.0, 120.0)
+    """
+    if tuple(size) == lens.size:
+        return lens
+    width, height = size
+    camera = camera_of(lens.model, lens.values, lens.size, what="a picture's camera")
+    camera.rescale(int(width), int(height))
+    values = tuple(float(value) for value in camera.params)
+    return LensParameters(lens.model, values, (int(width), int(height)))
+
+
+# --- poses ------------------------------------------------------------------------------------
+
+
+def quaternion_pose(wxyz: ArrayLike, translation: ArrayLike) -> Float64:
+    """(4, 4) float64 of a quaternion, scalar first, and a translation; NaN where that is no pose.
+
+    >>> quaternion_pose([1, 0, 0, 0], [1, 2, 3])[:3, 3]
+    array([1., 2., 3.])
+    """
+    from scipy.spatial.transform import Rotation
+
+    w, x, y, z = np.asarray(wxyz, np.float64)
+    if not np.isfinite([w, x, y, z]).all() or w == x == y == z == 0:
+        return np.full((4, 4), np.nan)
+    return rigid_poses(Rotation.from_quat([x, y, z, w]).as_matrix(), translation)
+
+
+def rigid_poses(rotation: ArrayLike, translation: ArrayLike) -> Float64:
+    """(..., 4, 4) float64 transforms of (..., 3, 3) rotations and (..., 3) translations."""
+    turn = np.asarray(rotation, np.float64)
+    poses = np.zeros((*turn.shape[:-2], 4, 4))
+    poses[..., :3, :3], poses[..., :3, 3], poses[..., 3, 3] = turn, translation, 1
+    return poses
+
+
+def opencv_pose(world_from_cam: ArrayLike) -> Float64:
+    """(4, 4) world_from_cam for OpenCV's camera axes, from (4, 4) or (3, 4) for OpenGL's."""
+    pose = np.eye(4)
+    pose[:3] = np.asarray(world_from_cam, np.float64)[:3]
+    return pose @ OPENCV_FROM_OPENGL
+
+
+def sky_findings(cam_from_world: Float64, axis: int) -> list[Finding]:
+    """A line when the sky is not to the top of most pictures.
+
+    Args:
+        cam_from_world: (N, 4, 4), OpenCV axes.
+        axis: the number of the world's axis that points up.
+    """
+    up = cam_from_world[:, :2, axis].mean(axis=0)
+    sky = max(DIRECTIONS, key=lambda name: float(up @ np.array(DIRECTIONS[name])))
+    if sky == "up":
+        return []
+    line = f"the sky is to the {sky} of pictures: they are read as stored, not turned"
+    return [Finding("info", line)]

@@ -1,0 +1,533 @@
+"""Data sets whose cameras a reconstruction found: Mip-NeRF 360, LLFF, DL3DV, ETH3D, ScanNet++ v2.
+
+Their models are COLMAP's or nerfstudio's; pictures may lie elsewhere, or at another size, than
+these say. A scene is read from its largest pictures; ``SCENE/images_4`` asks for reduced copies.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from gvtools.errors import ProjectError
+from gvtools.scenes.calibration import (
+    MILLIMETRES,
+    OPENCV_FROM_OPENGL,
+    Float64,
+    finite_array,
+    json_file,
+    pinhole_lens,
+)
+from gvtools.scenes.colmap_files import find_model, has_model
+from gvtools.scenes.colmap_model import ColmapModel, RegisteredImage, load_model, sparse_points
+from gvtools.scenes.images import read_depth, readings
+from gvtools.scenes.layout import Layout
+from gvtools.scenes.matching import (
+    PICTURES,
+    natural,
+    pictures_by_stem,
+    scenes_holding,
+)
+from gvtools.scenes.photographs import Depth, PosedFrame, first_size, posed_scene
+from gvtools.scenes.scene import Finding, Scene, SparsePoints
+from gvtools.scenes.transforms_frame import LensParameters, frame_keys
+from gvtools.scenes.transforms_json import FILE as TRANSFORMS
+from gvtools.scenes.transforms_json import load_frames
+from gvtools.scenes.undistort import Undistortion
+from gvtools.untrusted import is_file, load_array, regular
+
+FULL = "images"
+
+
+# --- COLMAP models ----------------------------------------------------------------------------
+
+
+def colmap_frames(
+    model: ColmapModel, picture_of: Callable[[RegisteredImage], Path]
+) -> list[PosedFrame]:
+    """The model's images as frames, named as the model names them."""
+    cameras = {key: model.reconstruction.cameras[key] for key in model.lenses}
+    lenses = {
+        key: LensParameters(
+            camera.model_name,
+            tuple(float(value) for value in camera.params),
+            (int(camera.width), int(camera.height)),
+        )
+        for key, camera in cameras.items()
+    }
+    return [
+        PosedFrame(image.name, picture_of(image), lenses[image.camera_id], image.cam_from_world)
+        for image in model.images
+    ]
+
+
+def colmap_scene(
+    root: Path, model: ColmapModel, frames: list[PosedFrame], *, metric: bool = False
+) -> Scene:
+    """The scene of a model's frames with its sparse points, detections in the views' pixels.
+
+    Frames are named as the model names its images; not every one has to be there.
+    """
+    scene = posed_scene(
+        root,
+        frames,
+        poses="cam_from_world",
+        metric=metric,
+        kind="colmap",
+        findings=model.findings,
+    )
+    index = {name: i for i, name in enumerate(scene.names)}
+    views_of_image = {
+        image.image_id: [index[image.name]] for image in model.images if image.name in index
+    }
+    points, findings = sparse_points(model, views_of_image)
+    if points is not None:
+        points = _moved_detections(points, model, scene)
+    return replace(scene, points=points, findings=(*scene.findings, *findings))
+
+
+def _moved_detections(points: SparsePoints, model: ColmapModel, scene: Scene) -> SparsePoints:
+    """Detections moved from the pinholes of the model's cameras to those of the views.
+
+    Both look along the same axes from the same place, so that the ray stays the same.
+    """
+    camera_of = {image.name: image.camera_id for image in model.images}
+    change = np.stack(
+        [
+            view.camera.K[0] @ np.linalg.inv(model.lenses[camera_of[view.name]].K)
+            for view in scene.views
+        ]
+    )[points.view_index]
+    flat = np.concatenate([points.xy, np.ones((len(points.xy), 1))], axis=1)
+    xy = np.einsum("nij,nj->ni", change, flat)
+    if not np.isfinite(xy).all():
+        raise ProjectError(
+            f"{model.files.folder}: detections and cameras that do not belong together; download "
+            "the model again"
+        )
+    return replace(points, xy=xy[:, :2])
+
+
+def model_in(folder: Path) -> ColmapModel:
+    """The COLMAP model of a folder."""
+    found = find_model(folder)
+    if found is None:
+        raise ProjectError(
+            f"{folder}: no COLMAP model; expected cameras.bin or cameras.txt in sparse/0, sparse "
+            "or the folder itself; complete the download"
+        )
+    return load_model(found)
+
+
+# --- files of nerfstudio ----------------------------------------------------------------------
+
+
+def nerfstudio_frames(
+    file: Path, home: Path, *, keys: tuple[str, ...] = ("frames",)
+) -> list[PosedFrame]:
+    """Frames of a ``transforms.json`` whose pictures lie in ``home``, poses world_from_cam.
+
+    ``keys`` name the lists of frames that are read.
+    """
+    data = load_frames(file)
+    frames = []
+    for key in keys:
+        listed = data.get(key) or []
+        if not isinstance(listed, list) or not all(isinstance(frame, dict) for frame in listed):
+            raise ProjectError(f"{file}: {key} is no list of frames; download it again")
+        for i, frame in enumerate(listed):
+            what = f"{file}, {key} {i}"
+            name = frame.get("file_path")
+            if not isinstance(name, str) or not name:
+                raise ProjectError(f"{what}: no file_path; expected the picture's path")
+            path = home / name.replace("\\", "/").rpartition("/")[2]
+            values = frame_keys(frame, data, what=what)
+            try:
+                pose: Float64 | None = np.array(values.transform_matrix, np.float64)
+            except (OverflowError, TypeError, ValueError):
+                pose = None
+            if pose is not None:
+                pose = pose @ OPENCV_FROM_OPENGL if pose.shape == (4, 4) else None
+            frames.append(PosedFrame(path.name, path, values.lens(path, what=what), pose))
+    return frames
+
+
+# --- folders of reduced copies: ``images``, ``images_2``, ``images_4`` ------------------------
+
+
+def picture_folders(scene: Path) -> list[Path]:
+    """The folders of pictures that a scene has, the largest pictures first."""
+    found = [path for path in scene.glob(f"{FULL}*") if path.is_dir() and _factor(path.name)]
+    held = [p for p in found if any(item.suffix.lower() in PICTURES for item in p.iterdir())]
+    return sorted(held, key=lambda path: _factor(path.name))
+
+
+def variants_of(root: Path, scenes: Iterable[str], *, inside: str = "") -> tuple[str, ...]:
+    """Every scene's folders of pictures, which lie ``inside`` it, such as ``garden/images_4``."""
+    return tuple(
+        f"{scene}/{folder.name}"
+        for scene in scenes
+        for folder in picture_folders(root / scene / inside)
+    )
+
+
+def chosen_folder(root: Path, scene: str, *, inside: str = "") -> tuple[Path, Path]:
+    """A scene's folder, and the pictures that its name chooses: of a variant, else the largest."""
+    home = root / scene
+    if _factor(home.name):
+        for folder in (home.parent / inside / home.name, home):
+            if folder.is_dir():
+                return home.parent, folder
+    folders = picture_folders(home / inside)
+    if not folders:
+        raise ProjectError(
+            f"{home / inside}: no pictures in a folder {FULL} or {FULL}_N; complete the download"
+        )
+    return home, folders[0]
+
+
+def _factor(name: str) -> int:
+    """By how much the pictures of a folder of that name are reduced; 0 for any other name."""
+    match = re.fullmatch(rf"{FULL}(?:_(\d+))?", name, re.ASCII)
+    return int(match[1] or 1) if match else 0
+
+
+# --- Mip-NeRF 360 -----------------------------------------------------------------------------
+#
+# ``SCENE/sparse/0`` with ``images`` and its copies. The model's cameras are of the pictures in
+# ``images``; copies have another size, rounded to whole pixels, so intrinsics follow each picture's
+# own width and height. The unit is COLMAP's, without metric scale.
+
+
+def _mipnerf360_scenes(root: Path) -> tuple[str, ...]:
+    folders = [path for path in root.glob("*") if path.is_dir()]
+    return natural(p.name for p in folders if find_model(p) is not None and picture_folders(p))
+
+
+def _read_mipnerf360(root: Path, scene: str) -> Scene:
+    folder, pictures = chosen_folder(root, scene)
+    model = model_in(folder)
+    by_stem = pictures_by_stem(pictures)
+
+    def picture_of(image: RegisteredImage) -> Path:
+        exact = pictures / image.name
+        return exact if is_file(exact) else by_stem.get(Path(image.name).stem, exact)
+
+    return colmap_scene(folder, model, colmap_frames(model, picture_of))
+
+
+MIPNERF360 = Layout(
+    "mipnerf360",
+    "SCENE/sparse/0 with SCENE/images or images_N",
+    _mipnerf360_scenes,
+    _read_mipnerf360,
+    lambda root: variants_of(root, _mipnerf360_scenes(root)),
+)
+
+
+# --- LLFF -------------------------------------------------------------------------------------
+#
+# ``SCENE/poses_bounds.npy`` with ``images`` and its copies. Each row holds a 3x5 matrix, the first
+# three columns of which are the camera's axes "down, right, backwards" in the world, then its
+# centre, then height, width and focal length in pixels of ``images``; and the nearest and farthest
+# depth. The principal point is the picture's middle. Rows follow the pictures in the order of their
+# names, so that a row's picture is known only where a folder is complete, where ``sparse/0`` names
+# the pictures, or where copies are numbered.
+
+POSES_BOUNDS = "poses_bounds.npy"
+# Columns "right, down, forward" of the columns "down, right, backwards".
+RIGHT_DOWN_FORWARD = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
+
+
+def _llff_scenes(root: Path) -> tuple[str, ...]:
+    found = scenes_holding(root, f"*/{POSES_BOUNDS}")
+    return tuple(name for name in found if picture_folders(root / name))
+
+
+def _read_llff(root: Path, scene: str) -> Scene:
+    folder, home = chosen_folder(root, scene)
+    path = folder / POSES_BOUNDS
+    try:
+        rows = load_array(path).astype(np.float64)
+    except (OSError, ValueError, TypeError) as error:
+        raise ProjectError(f"{path}: {error}; expected an array of N x 17 numbers") from None
+    if rows.ndim != 2 or rows.shape[1] != 17:
+        raise ProjectError(f"{path}: shape {rows.shape}; expected N x 17")
+    rows = rows[:, :15].reshape(-1, 3, 5)
+    if not np.isfinite(rows[..., 4]).all():
+        raise ProjectError(f"{path}: a picture's size or focal length is not finite; copy it again")
+    frames = []
+    for row, file in zip(rows, _llff_files(folder, home, len(rows)), strict=True):
+        height, width, focal = (float(value) for value in row[:, 4])
+        pose = np.concatenate([row[:, :3] @ RIGHT_DOWN_FORWARD, row[:, 3:4]], axis=1)
+        lens = pinhole_lens([focal, focal, width / 2, height / 2], (round(width), round(height)))
+        frames.append(PosedFrame(file.name, file, lens, pose))
+    return posed_scene(folder, frames, poses="world_from_cam", metric=False)
+
+
+def _llff_files(folder: Path, home: Path, count: int) -> list[Path]:
+    """For each row the picture in the folder ``home``, on disk or not."""
+    found = pictures_by_stem(home)
+    ordered = sorted(found)
+    if len(found) == count:
+        return [found[stem] for stem in ordered]
+    model = find_model(folder)
+    if model is not None:
+        names = sorted(image.name for image in load_model(model).images)
+        if len(names) == count and any(Path(name).stem in found for name in names):
+            return [found.get(Path(name).stem, home / name) for name in names]
+    if found and all(re.fullmatch(r"image\d{3}", stem) for stem in ordered):
+        return [found.get(f"image{i:03d}", home / f"image{i:03d}.png") for i in range(count)]
+    raise ProjectError(
+        f"{home}: {len(found)} pictures for {count} poses, which follow the pictures' order; "
+        "complete the folder, or the scene's sparse/0, which names them"
+    )
+
+
+# --- DL3DV ------------------------------------------------------------------------------------
+#
+# ``[SUBSET/]HASH/transforms.json`` of nerfstudio, with ``images_4`` or ``images_8``. The file's
+# intrinsics are of the full pictures and its paths name the folder ``images``, also where only
+# ``images_4`` (960P) or ``images_8`` (480P) was downloaded: paths are taken below the folder that
+# is there, and intrinsics follow each picture's own size. The benchmark keeps all of this in
+# ``HASH/nerfstudio``. A download of the COLMAP cache alone (``HASH/colmap/sparse/0`` beside the
+# pictures) is read through the model. The unit is COLMAP's, without metric scale.
+
+INSIDE = "nerfstudio"  # where the benchmark keeps a scene
+
+
+def _inside(folder: Path) -> str:
+    return INSIDE if (folder / INSIDE).is_dir() else ""
+
+
+def _dl3dv_scenes(root: Path) -> tuple[str, ...]:
+    found = []
+    for folder in (*root.glob("*"), *root.glob("*/*")):
+        if not folder.is_dir() or folder.name == INSIDE:
+            continue
+        home = folder / _inside(folder)
+        cameras = (home / TRANSFORMS).is_file() or find_model(folder) is not None
+        if cameras and picture_folders(home):
+            found.append(folder.relative_to(root).as_posix())
+    return natural(found)
+
+
+def _read_dl3dv(root: Path, scene: str) -> Scene:
+    home = root / scene
+    inside = _inside(home) or ("" if home.parent == root else _inside(home.parent))
+    folder, pictures = chosen_folder(root, scene, inside=inside)
+    file = folder / inside / TRANSFORMS
+    if file.is_file():
+        frames = nerfstudio_frames(file, pictures)
+        return posed_scene(folder, frames, poses="world_from_cam", metric=False)
+    if find_model(folder) is None:
+        raise ProjectError(
+            f"{folder}: neither {TRANSFORMS} nor a COLMAP model; complete the download"
+        )
+    model = model_in(folder)
+    frames = colmap_frames(model, lambda image: pictures / Path(image.name).name)
+    return colmap_scene(folder, model, frames)
+
+
+def _dl3dv_variants(root: Path) -> tuple[str, ...]:
+    scenes = _dl3dv_scenes(root)
+    inside = {scene: _inside(root / scene) for scene in scenes}
+    return tuple(n for scene in scenes for n in variants_of(root, [scene], inside=inside[scene]))
+
+
+# --- ETH3D, high-resolution multi-view --------------------------------------------------------
+#
+# ``SCENE/dslr_calibration_undistorted`` with ``images``. The undistorted pictures
+# (``images/dslr_images_undistorted``) are read where they are there, else the original ones
+# (``dslr_calibration_jpg``, a fisheye model) are undistorted here. Depth (``ground_truth_depth/
+# dslr_images/NAME``: raw 4-byte floats row by row, infinite for none, metres) was rendered for the
+# *original* pictures. It goes through the original camera to the undistorted one, for which
+# ``dslr_calibration_jpg`` is needed.
+
+UNDISTORTED, ORIGINAL = "dslr_calibration_undistorted", "dslr_calibration_jpg"
+
+
+def _eth3d_scenes(root: Path) -> tuple[str, ...]:
+    patterns = [f"{above}{held}/" for above in ("*/", "*/*/") for held in (UNDISTORTED, ORIGINAL)]
+    folders = (path for pattern in patterns for path in root.glob(pattern) if has_model(path))
+    return natural(path.parent.relative_to(root).as_posix() for path in folders)
+
+
+def _read_eth3d(root: Path, scene: str) -> Scene:
+    folder = root / scene
+    home, maps = folder / "images", folder / "ground_truth_depth" / "dslr_images"
+    original = load_model(folder / ORIGINAL) if has_model(folder / ORIGINAL) else None
+    model = original
+    if has_model(folder / UNDISTORTED):
+        undistorted = load_model(folder / UNDISTORTED)
+        if original is None or any(is_file(home / image.name) for image in undistorted.images):
+            model = undistorted
+    if model is None:
+        raise ProjectError(f"{folder}: neither {UNDISTORTED} nor {ORIGINAL}; complete the download")
+    frames = colmap_frames(model, lambda image: home / image.name)
+    findings = []
+    if maps.is_dir() and original is None:
+        line = f"depth is of the original pictures and needs {ORIGINAL}, which is absent"
+        findings.append(Finding("warning", line))
+    elif maps.is_dir() and original is not None:
+        frames = _with_raw_depth(maps, frames, original=original, model=model)
+    opened = colmap_scene(folder, model, frames, metric=True)
+    return replace(opened, findings=(*opened.findings, *findings))
+
+
+def _with_raw_depth(
+    folder: Path, frames: list[PosedFrame], *, original: ColmapModel, model: ColmapModel
+) -> list[PosedFrame]:
+    """The frames with their depth maps, which are of the original cameras."""
+    source = {Path(image.name).name: original.lenses[image.camera_id] for image in original.images}
+    target = {image.name: model.lenses[image.camera_id] for image in model.images}
+    changes: dict[tuple[int, int], Undistortion] = {}
+    found = []
+    for frame in frames:
+        name = Path(frame.name).name
+        if name in source:
+            recorded, change = source[name], None
+            if model is not original:
+                key = id(recorded), id(target[frame.name])
+                lens = Undistortion(recorded.source, target[frame.name].target, False)
+                change = changes.setdefault(key, lens)
+            reader = partial(read_raw_depth, size=recorded.source_size, lens=change)
+            frame = replace(frame, depth=folder / name, read_depth=reader)
+        found.append(frame)
+    return found
+
+
+def read_raw_depth(path: Path, *, size: tuple[int, int], lens: Undistortion | None = None) -> Depth:
+    """(H, W) float32 z-depth, metres, of 4-byte floats without head; 0 for infinity.
+
+    Args:
+        path: the file.
+        size: width and height of the original picture, pixels.
+        lens: from the original camera to that of the picture at hand; None for the original.
+    """
+    width, height = size
+    try:
+        values = np.fromfile(regular(path), "<f4")
+    except OSError as error:
+        raise ProjectError(f"{path}: unreadable ({error}); copy it again") from None
+    if values.size != width * height:
+        raise ProjectError(
+            f"{path}: {values.size} floats; expected {width} x {height}, as the original camera "
+            f"in {ORIGINAL} says; copy it again"
+        )
+    depth = readings(values.reshape(height, width))
+    return depth if lens is None else np.ascontiguousarray(lens.nearest(depth))
+
+
+# --- ScanNet++ v2 -----------------------------------------------------------------------------
+#
+# ``[data/]SCENE/dslr`` and ``[data/]SCENE/iphone``, each a scene of its own.
+#
+# DSLR: poses and the fisheye camera come from ``dslr/colmap``, whose world is the laser scan's, in
+# metres (that of ``nerfstudio/transforms.json`` is another). Pictures that the data set's tools
+# undistorted (``resized_undistorted_images`` with ``nerfstudio/transforms_undistorted.json``) are
+# read where they are there, else ``resized_images`` are undistorted here. ``render_depth`` of the
+# tools (millimetres) is of the fisheye pictures and is read with those alone. Anonymisation masks
+# (``resized_anon_masks``) are read with either.
+#
+# iPhone: ``iphone/rgb`` and ``iphone/depth`` (millimetres, 256x192) as the data set's tools extract
+# them from ``rgb.mp4`` and ``depth.bin``, with ``pose_intrinsic_imu.json``: ``aligned_pose`` is
+# world_from_cam with OpenCV axes in the scan's world, ``intrinsic`` is of the picture.
+
+IPHONE_POSES = "pose_intrinsic_imu.json"
+
+
+def _scannetpp_scenes(root: Path) -> tuple[str, ...]:
+    patterns = ("*/dslr/", "*/iphone/", "data/*/dslr/", "data/*/iphone/")
+    folders = (path for pattern in patterns for path in root.glob(pattern))
+    found = (p for p in folders if has_model(p / "colmap") or (p / IPHONE_POSES).is_file())
+    return natural(path.relative_to(root).as_posix() for path in found)
+
+
+def _read_scannetpp(root: Path, scene: str) -> Scene:
+    folder = root / scene
+    return _read_dslr(folder) if folder.name == "dslr" else _read_iphone(folder)
+
+
+def _read_dslr(folder: Path) -> Scene:
+    model = model_in(folder / "colmap")
+    home, masks = folder / "resized_undistorted_images", folder / "resized_undistorted_masks"
+    cameras = folder / "nerfstudio" / "transforms_undistorted.json"
+    undistorted = cameras.is_file() and home.is_dir()
+    if not undistorted:
+        home, masks = folder / "resized_images", folder / "resized_anon_masks"
+    lenses, depths = {}, folder / "render_depth"
+    if undistorted:
+        keys = ("frames", "test_frames")
+        lenses = {frame.name: frame.lens for frame in nerfstudio_frames(cameras, home, keys=keys)}
+    frames = []
+    for frame in colmap_frames(model, lambda image: home / Path(image.name).name):
+        png = f"{Path(frame.name).stem}.png"
+        if undistorted:
+            # Poses stay those of COLMAP: a pinhole looks along the fisheye camera's own axes.
+            frame = replace(frame, lens=lenses.get(Path(frame.name).name))
+        elif depths.is_dir():
+            reader = partial(read_depth, unit=MILLIMETRES)
+            frame = replace(frame, depth=depths / png, read_depth=reader)
+        frames.append(replace(frame, mask=masks / png))
+    return colmap_scene(folder, model, frames, metric=True)
+
+
+def _read_iphone(folder: Path) -> Scene:
+    home, depths = folder / "rgb", folder / "depth"
+    if not home.is_dir():
+        raise ProjectError(
+            f"{folder}: no folder rgb; extract it from rgb.mp4 (and depth from depth.bin) with the "
+            "data set's own tool, iphone.prepare_iphone_data"
+        )
+    records = json_file(folder / IPHONE_POSES)
+    if not isinstance(records, dict) or not all(
+        isinstance(record, dict) for record in records.values()
+    ):
+        raise ProjectError(f"{folder / IPHONE_POSES}: expected a record for each frame")
+    size = first_size(home / f"{name}.jpg" for name in records) or (1920, 1440)
+    frames = []
+    for name, record in records.items():
+        K = finite_array(record.get("intrinsic"), 3, 3)
+        frames.append(
+            PosedFrame(
+                f"{name}.jpg",
+                home / f"{name}.jpg",
+                None if K is None else pinhole_lens(K, size),
+                finite_array(record.get("aligned_pose"), 4, 4),
+                depths / f"{name}.png" if depths.is_dir() else None,
+                partial(read_depth, unit=MILLIMETRES),
+            )
+        )
+    return posed_scene(folder, frames, poses="world_from_cam", metric=True)
+
+
+LAYOUTS = (
+    MIPNERF360,
+    Layout(
+        "llff",
+        f"SCENE/{POSES_BOUNDS} with SCENE/images or images_N",
+        _llff_scenes,
+        _read_llff,
+        lambda root: variants_of(root, _llff_scenes(root)),
+    ),
+    Layout(
+        "dl3dv",
+        f"HASH/{TRANSFORMS} with HASH/images_4 or images_8",
+        _dl3dv_scenes,
+        _read_dl3dv,
+        _dl3dv_variants,
+    ),
+    Layout("eth3d", f"SCENE/{UNDISTORTED} with SCENE/images", _eth3d_scenes, _read_eth3d),
+    Layout(
+        "scannetpp",
+        f"SCENE/dslr/colmap or SCENE/iphone/{IPHONE_POSES} with pictures",
+        _scannetpp_scenes,
+        _read_scannetpp,
+    ),
+)

@@ -1,0 +1,58 @@
+"""How posed pictures lie on disk: an RGB-D folder, a phone's export, or a data set's download."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gvtools.scenes.scene import Scene
+
+if TYPE_CHECKING:
+    from gvtools.scenes.rgbd import RgbdOptions
+
+
+@dataclass(frozen=True)
+class Layout:
+    """A layout and its reader.
+
+    Names of scenes are relative paths with "/", in natural order; "" is the folder itself. A
+    partial download is no error: ``scenes`` names what is there at least in part, and what is
+    missing of a scene is reported in its findings.
+    """
+
+    name: str
+    holds: str  # what its folder holds, for messages
+    scenes: Callable[[Path], tuple[str, ...]]
+    reader: Callable[..., Scene]  # takes the root, the scene's name and, if any, ``options``
+    # Further names that it reads: the same scenes with reduced pictures, such as SCENE/images_4.
+    variants: Callable[[Path], tuple[str, ...]] = lambda _: ()
+
+    @classmethod
+    def of_folder(
+        cls,
+        name: str,
+        holds: str,
+        *,
+        matches: Callable[[Path], bool],
+        read: Callable[..., Scene],
+    ) -> Layout:
+        """A layout of which a folder or file is one scene."""
+        return cls(
+            name,
+            f"{name} ({holds})",
+            lambda root: ("",) if matches(root) else (),
+            lambda root, scene, **options: read(root, **options),
+        )
+
+    def matches(self, root: Path) -> bool:
+        """Whether a folder or file is of this layout, at least in part."""
+        return bool(self.scenes(root))
+
+    def read(self, root: Path, scene: str = "", *, options: RgbdOptions | None = None) -> Scene:
+        """A scene; ProjectError where nothing of it can be read.
+
+        ``options`` are what a posed RGB-D folder does not tell by itself.
+        """
+        return self.reader(Path(root), scene, **({} if options is None else {"options": options}))

@@ -1,0 +1,163 @@
+"""Matching of pictures, depth maps and poses by file name, number and time stamp."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.errors import ProjectError
+from gvtools.scenes.scene import natural_key
+from gvtools.untrusted import is_file, named_file
+
+Float64 = NDArray[np.float64]
+
+PICTURES = (".jpg", ".jpeg", ".png")
+# Stamps of the other list within the limit of one, on average, at most.
+MOST_CANDIDATES = 100
+NAMED_AT_MOST = 3  # a message names this many files and counts the rest
+
+
+def named(items: Sequence[object]) -> str:
+    """The first few of ``items`` and how many more, for a message."""
+    shown = ", ".join(str(item) for item in items[:NAMED_AT_MOST])
+    rest = len(items) - NAMED_AT_MOST
+    return shown + (f" and {rest} more" if rest > 0 else "")
+
+
+def natural(names: Iterable[str]) -> tuple[str, ...]:
+    """Names in natural order, each once.
+
+    >>> natural(["b10", "b9", "b9"])
+    ('b9', 'b10')
+    """
+    return tuple(sorted(set(names), key=natural_key))
+
+
+def scenes_holding(root: Path, *patterns: str) -> tuple[str, ...]:
+    """Folders below ``root`` that hold something, as relative names in natural order.
+
+    "*/images" finds "0000", not "0000/images".
+    """
+    found = (path.parent for pattern in patterns for path in root.glob(pattern))
+    return natural(path.relative_to(root).as_posix() for path in found)
+
+
+def pictures_in(folder: Path) -> list[Path]:
+    """The folder's pictures in natural order of their names; none where it is absent."""
+    if not folder.is_dir():
+        return []
+    paths = (path for path in folder.iterdir() if path.suffix.lower() in PICTURES)
+    return sorted(paths, key=lambda path: natural_key(path.name))
+
+
+def pictures_by_stem(folder: Path) -> dict[str, Path]:
+    """The folder's pictures by name without suffix, since copies often have another suffix."""
+    return {path.stem: path for path in pictures_in(folder)}
+
+
+def numbers_in(folder: Path, template: str) -> set[int]:
+    """Which numbers the files of a folder have whose names are like "rgb_{:05d}.jpg"."""
+    before, after = re.split(r"\{.*\}", template)
+    name = re.compile(f"{re.escape(before)}([0-9]+){re.escape(after)}")
+    try:
+        matches = [name.fullmatch(entry) for entry in os.listdir(folder)]
+    except (FileNotFoundError, NotADirectoryError):
+        return set()
+    return {int(match[1]) for match in matches if match}
+
+
+def pair_by_name(pictures: Sequence[Path], depths: Sequence[Path]) -> dict[Path, Path]:
+    """For each picture its depth map: of the same stem, else of the same leading number."""
+    stems = {path.stem: path for path in depths}
+    if any(path.stem in stems for path in pictures):
+        return {path: stems[path.stem] for path in pictures if path.stem in stems}
+    leading = {_leading_number(path): path for path in depths}
+    numbered = ((path, _leading_number(path)) for path in pictures)
+    return {path: leading[number] for path, number in numbered if number in leading}
+
+
+def _leading_number(path: Path) -> int | str:
+    match = re.match(r"\D*(\d+)", path.stem)
+    return int(match.group(1)) if match else path.stem
+
+
+def listed_file(folder: Path, name: str, *, where: str) -> Path:
+    r"""The path of a file that a list names, which has to lie in a folder, on disk or not.
+
+    Lists of Windows programs separate folders by "\", which may also be part of a name here.
+    """
+    path = named_file(folder, name, where=where)
+    if "\\" in name and not is_file(path):
+        return named_file(folder, name.replace("\\", "/"), where=where)
+    return path
+
+
+def associate(first: Float64, second: Float64, limit: float) -> dict[int, int]:
+    """Pairs of nearest time stamps, each stamp used once, the closest pairs first.
+
+    Args:
+        first: (A,) seconds.
+        second: (B,) seconds.
+        limit: the largest accepted difference, seconds.
+
+    Returns:
+        For indices of ``first``, the index of ``second``.
+    """
+    order = np.argsort(second, kind="stable")
+    low = np.searchsorted(second[order], first - limit, side="left")
+    high = np.searchsorted(second[order], first + limit, side="right")
+    if int((high - low).sum()) > MOST_CANDIDATES * (len(first) + len(second)):
+        raise ProjectError(
+            f"{int((high - low).sum())} pairs of {len(first)} and {len(second)} time stamps are "
+            f"within {limit:g} s; expected a few of each; give a smaller max_time_difference"
+        )
+    candidates = sorted(
+        (abs(first[i] - second[j]), i, int(j))
+        for i in range(len(first))
+        for j in order[low[i] : high[i]]
+    )
+    pairs: dict[int, int] = {}
+    taken: set[int] = set()
+    for _, i, j in candidates:
+        if i not in pairs and j not in taken:
+            pairs[i] = j
+            taken.add(j)
+    return pairs
+
+
+def pose_at(
+    time: float, times: Float64, poses: Float64, *, same: float, longest_gap: float = 0.0
+) -> Float64 | None:
+    """(4, 4) cam_from_world at a time: a stored pose, or one interpolated between its neighbours.
+
+    The camera's centre is interpolated linearly, its rotation spherically (slerp). None outside of
+    the trajectory, and where the neighbours are too far apart in time.
+
+    Args:
+        time: of the frame; all times are in one unit.
+        times: (N,) of the poses, increasing; at least one.
+        poses: (N, 4, 4) cam_from_world, rigid.
+        same: a pose whose time differs by no more than this is taken as it is.
+        longest_gap: longest time between two poses that may be interpolated.
+    """
+    from scipy.spatial.transform import Rotation, Slerp
+
+    after = int(np.searchsorted(times, time))
+    near = [i for i in (after - 1, after) if 0 <= i < len(times)]
+    nearest = min(near, key=lambda i: abs(times[i] - time))
+    if abs(times[nearest] - time) <= same:
+        return np.asarray(poses[nearest], np.float64)
+    if len(near) < 2 or times[after] - times[after - 1] > longest_gap:
+        return None
+    pair = poses[after - 1 : after + 1]
+    share = (time - times[after - 1]) / (times[after] - times[after - 1])
+    centers = -np.einsum("nji,nj->ni", pair[:, :3, :3], pair[:, :3, 3])
+    pose = np.eye(4)
+    pose[:3, :3] = Slerp([0, 1], Rotation.from_matrix(pair[:, :3, :3]))(share).as_matrix()
+    pose[:3, 3] = -pose[:3, :3] @ (centers[0] + share * (centers[1] - centers[0]))
+    return pose

@@ -1,0 +1,324 @@
+"""Exports of phones: Polycam, 3D Scanner App and Stray Scanner, all of them ARKit recordings.
+
+ARKit's camera looks along -z with y up, its world has y up and metres. Depth and its confidence
+come from the LiDAR scanner at a lower resolution (256x192 as a rule) than the picture, of the same
+camera and the same window: intrinsics of the picture, scaled, are those of the depth map, and each
+pixel of the picture takes the reading that it falls into. Confidence is low, medium or high; what
+is low is no reading. ARKit counts the principal point from the picture's upper left corner, as
+gvtools does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.errors import ProjectError
+from gvtools.scenes.calibration import (
+    MILLIMETRES,
+    Float64,
+    csv_rows,
+    finite_array,
+    json_object,
+    load_matrix,
+    opencv_pose,
+    pinhole_lens,
+    quaternion_pose,
+    sky_findings,
+)
+from gvtools.scenes.images import read_depth, read_image, read_mask, resize_nearest
+from gvtools.scenes.layout import Layout
+from gvtools.scenes.matching import natural
+from gvtools.scenes.photographs import Depth, PosedFrame, first_size, posed_scene
+from gvtools.scenes.scene import Finding, Frame, Scene
+from gvtools.scenes.video import frame_seconds, read_frame, video_header
+
+WORLD_UP = 1  # y
+
+
+def phone_scene(
+    root: Path,
+    name: str,
+    frames: Sequence[PosedFrame],
+    *,
+    upright: bool = True,
+    findings: Iterable[Finding] = (),
+) -> Scene:
+    """The scene of an app's export, metric, in the poses' own world.
+
+    Args:
+        root: the export.
+        name: the app's.
+        frames: poses are world_from_cam for OpenCV's axes.
+        upright: whether y of the world points up, as gravity has it.
+        findings: what the reader met.
+    """
+    scene = posed_scene(
+        root, frames, poses="world_from_cam", metric=True, kind=name, findings=tuple(findings)
+    )
+    sky = sky_findings(scene.cameras.cam_from_world, WORLD_UP) if upright else []
+    return replace(scene, findings=(*scene.findings, *sky))
+
+
+def confident(depth: Depth, trusted: NDArray[np.bool_]) -> Depth:
+    """(h, w) depth, 0 where a map of any size says that it is not to be trusted."""
+    height, width = depth.shape
+    return np.where(resize_nearest(trusted, width, height), depth, np.float32(0))
+
+
+def read_lidar(path: Path, *, confidence: Path | None) -> Depth:
+    """A depth map of millimetres (16-bit PNG or ``.npy``) and its confidence, in which 0 is low."""
+    depth = read_depth(path, unit=MILLIMETRES)
+    return depth if confidence is None else confident(depth, read_mask(confidence))
+
+
+@dataclass
+class LidarMaps:
+    """Counts of depth maps that are there, and of those of them without a confidence map."""
+
+    maps: int = 0
+    bare: int = 0
+
+    def reader(self, depth: Path, confidence: Path) -> Callable[[Path], Depth]:
+        """How a depth map is read: with its confidence where that is there."""
+        there = confidence.is_file()
+        if depth.is_file():
+            self.maps += 1
+            self.bare += not there
+        return partial(read_lidar, confidence=confidence if there else None)
+
+    def findings(self) -> list[Finding]:
+        """One line when depth maps lack their confidence."""
+        if not self.bare:
+            return []
+        line = f"{self.bare} of {self.maps} depth maps have no confidence map: all of them is used"
+        return [Finding("info", line)]
+
+
+# --- Polycam, raw data ------------------------------------------------------------------------
+#
+# ``keyframes/{images, cameras, depth, confidence}``. A frame's camera, a JSON, has t_00 to t_23,
+# world_from_cam row by row for ARKit's axes, and fx, fy, cx, cy, width, height of the picture.
+# Where ``corrected_images`` and ``corrected_cameras`` are there, both are read instead: poses are
+# optimised and pictures undistorted, with a black border where undistortion found nothing, which
+# is masked. Poses of the two kinds are never mixed. Depth is in millimetres, confidence 0, 127 or
+# 255.
+
+_CORRECTED = "corrected_cameras", "corrected_images"
+_RECORDED = "cameras", "images"
+_BLACK = 8  # the compression of a JPEG leaves no more of a black border
+
+
+def _keyframes(root: Path) -> Path:
+    """The folder of the keyframes, which may be given itself."""
+    return root if root.name == "keyframes" else root / "keyframes"
+
+
+def _is_polycam(root: Path) -> bool:
+    return any((_keyframes(root) / cameras).is_dir() for cameras, _ in (_CORRECTED, _RECORDED))
+
+
+def _read_polycam(root: Path) -> Scene:
+    home, lidar = _keyframes(root), LidarMaps()
+    corrected = all((home / folder).is_dir() for folder in _CORRECTED)
+    cameras, images = _CORRECTED if corrected else _RECORDED
+    names = natural(
+        path.stem
+        for folder, kind in ((cameras, ".json"), (images, ".jpg"))
+        for path in (home / folder).glob(f"*{kind}")
+    )
+    pose_keys = [f"t_{row}{column}" for row in range(3) for column in range(4)]
+    frames = []
+    for name in names:
+        camera = json_object(home / cameras / f"{name}.json")
+        pose = finite_array([camera.get(key) for key in pose_keys], 3, 4)
+        K = finite_array([camera.get(key) for key in ("fx", "fy", "cx", "cy")], 4)
+        size = finite_array([camera.get(key) for key in ("width", "height")], 2)
+        image, depth = home / images / f"{name}.jpg", home / "depth" / f"{name}.png"
+        lens = None
+        if K is not None and size is not None:
+            lens = pinhole_lens(K, (int(size[0]), int(size[1])))
+        # A reader of its own is given where a picture is readable and of its camera's size.
+        whole = lens is not None and first_size([image]) == lens.size
+        frames.append(
+            PosedFrame(
+                f"{name}.jpg",
+                image,
+                lens,
+                None if pose is None else opencv_pose(pose),
+                depth,
+                lidar.reader(depth, home / "confidence" / f"{name}.png"),
+                read=_read_undistorted if corrected and whole else None,
+            )
+        )
+    said = "optimised, pictures undistorted" if corrected else "as ARKit tracked them"
+    findings = [Finding("info", f"poses: {said}"), *lidar.findings()]
+    return phone_scene(root, "Polycam", frames, findings=findings)
+
+
+def _read_undistorted(path: Path) -> Frame:
+    """An undistorted picture, masked where black pixels hang together with its edge."""
+    from scipy.ndimage import label
+
+    rgb = read_image(path).rgb
+    places, count = label(rgb.max(axis=-1) <= _BLACK)
+    edge: Float64 = np.concatenate([places[[0, -1]].ravel(), places[:, [0, -1]].ravel()])
+    outside = np.zeros(count + 1, bool)
+    outside[edge] = True
+    outside[0] = False
+    return Frame(rgb, mask=~outside[places])
+
+
+POLYCAM = Layout.of_folder(
+    "Polycam",
+    "raw data: keyframes/ with cameras, images, depth",
+    matches=_is_polycam,
+    read=_read_polycam,
+)
+
+
+# --- 3D Scanner App, "All Data" ---------------------------------------------------------------
+#
+# ``frame_N.json``, ``frame_N.jpg``, ``depth_N.png``, ``conf_N.png``. A frame's JSON has
+# ``cameraPoseARFrame``, world_from_cam row by row for ARKit's axes, and ``intrinsics``, 3x3 row by
+# row, of the picture. The app stores more poses and depth maps than pictures; only frames with a
+# picture become views. Depth is in millimetres, confidence 0, 1 or 2.
+
+_POSE = "cameraPoseARFrame"
+_PROBES = 5  # frames by which an export is recognised
+
+
+def _is_scanner_app(root: Path) -> bool:
+    # Other programs name frames like that, too; a damaged file or two decide nothing.
+    frames = root.glob("frame_*.json") if root.is_dir() else ()
+    return any(_POSE in json_object(path) for path in islice(frames, _PROBES))
+
+
+def _read_scanner_app(root: Path) -> Scene:
+    poses = {path.stem for path in root.glob("frame_*.json")}
+    shown = natural(path.stem for path in root.glob("frame_*.jpg"))
+    # All pictures are of one camera, and no file says their size.
+    size = first_size(root / f"{name}.jpg" for name in shown) or (2, 2)
+    lidar, frames = LidarMaps(), []
+    for name in shown:
+        number = name.removeprefix("frame_")
+        said = json_object(root / f"{name}.json")
+        pose, K = finite_array(said.get(_POSE), 4, 4), finite_array(said.get("intrinsics"), 3, 3)
+        depth = root / f"depth_{number}.png"
+        frames.append(
+            PosedFrame(
+                f"{name}.jpg",
+                root / f"{name}.jpg",
+                None if K is None else pinhole_lens(K, size),
+                None if pose is None else opencv_pose(pose),
+                depth,
+                lidar.reader(depth, root / f"conf_{number}.png"),
+            )
+        )
+    unseen, findings = len(poses - set(shown)), lidar.findings()
+    if unseen:
+        line = f"{unseen} of {len(poses)} frames were recorded without a picture: not used"
+        findings.append(Finding("info", line))
+    return phone_scene(root, "3D Scanner App", frames, findings=findings)
+
+
+SCANNER_APP = Layout.of_folder(
+    "3D Scanner App",
+    "all data: frame_*.json, frame_*.jpg, depth_*.png",
+    matches=_is_scanner_app,
+    read=_read_scanner_app,
+)
+
+
+# --- Stray Scanner ----------------------------------------------------------------------------
+#
+# ``rgb.mp4``, ``odometry.csv``, ``camera_matrix.csv``, ``depth``, ``confidence``. A row of the
+# odometry is a frame: its number names the depth map and the confidence map, its place among the
+# rows is the frame's in the video. Poses are world_from_cam, quaternion x, y, z, w, and, unlike
+# other apps', already of OpenCV's camera axes; the world has y up. Newer versions of the app write
+# fx, fy, cx, cy with each row; ``camera_matrix.csv`` holds the last frame's.
+#
+# The app appends the first frame before the video's session begins, so that the file's edit list
+# hides it. Players follow that list, which shifts every picture by one frame against the poses;
+# here the list is ignored.
+
+_VIDEO, _ODOMETRY, _MATRIX = "rgb.mp4", "odometry.csv", "camera_matrix.csv"
+_MOST_FRAMES = 3e10  # of a recording: a year at a thousand a second
+
+
+def _is_stray_scanner(root: Path) -> bool:
+    return (root / _ODOMETRY).is_file() and (root / _VIDEO).is_file()
+
+
+def _read_stray_scanner(root: Path) -> Scene:
+    rows = _odometry(root / _ODOMETRY)
+    video, lidar = root / _VIDEO, LidarMaps()
+    seconds, size = frame_seconds(video, edits=False), video_header(video).size
+    shared = None
+    if (root / _MATRIX).is_file():
+        shared = load_matrix(root / _MATRIX, (3, 3))[[0, 1, 0, 1], [0, 1, 2, 2]]
+    frames = []
+    for row in rows:
+        place = int(row["frame"]) - int(rows[0]["frame"])
+        number = f"{int(row['frame']):06d}"
+        depth = root / "depth" / f"{number}.npy"  # of early versions of the app
+        depth = depth if depth.is_file() else depth.with_suffix(".png")
+        own = finite_array([row.get(key) for key in ("fx", "fy", "cx", "cy")], 4)
+        K = shared if own is None else own
+        inside = 0 <= place < len(seconds)
+        turn = finite_array([row.get(key) for key in ("qw", "qx", "qy", "qz")], 4)
+        centre = finite_array([row.get(key) for key in "xyz"], 3)
+        frames.append(
+            PosedFrame(
+                number,
+                video if inside else root / f"{_VIDEO}, frame {number}",
+                None if K is None else pinhole_lens(K, size),
+                None if turn is None or centre is None else quaternion_pose(turn, centre),
+                depth,
+                lidar.reader(depth, root / "confidence" / f"{number}.png"),
+                read=partial(read_frame, seconds=seconds[place], edits=False) if inside else None,
+            )
+        )
+    findings = lidar.findings()
+    if len(seconds) != len(rows):
+        line = (
+            f"{_VIDEO} has {len(seconds)} frames for {len(rows)} poses: pictures may belong to "
+            "poses beside theirs; give the video as the app wrote it"
+        )
+        findings.insert(0, Finding("warning", line))
+    return phone_scene(root, "Stray Scanner", frames, findings=findings)
+
+
+def _odometry(path: Path) -> list[dict[str, float]]:
+    """The rows by the names of the header; what is no number is left out."""
+    rows = []
+    for line in csv_rows(path, again="export the recording again"):
+        row = {}
+        for key, word in line.items():
+            try:
+                row[key.strip()] = float(word)
+            except (AttributeError, TypeError, ValueError):
+                continue  # a device without that value leaves it empty
+        # A broken last line, of an export that was cut off, has no frame number.
+        if abs(row.get("frame", np.nan)) < _MOST_FRAMES:
+            rows.append(row)
+    if not rows:
+        raise ProjectError(
+            f"{path}: no row with a frame number; expected columns timestamp, frame, x, y, z, qx, "
+            "qy, qz and qw; export the recording again"
+        )
+    return rows
+
+
+STRAY_SCANNER = Layout.of_folder(
+    "Stray Scanner",
+    f"{_VIDEO}, {_ODOMETRY}, {_MATRIX}, depth",
+    matches=_is_stray_scanner,
+    read=_read_stray_scanner,
+)
