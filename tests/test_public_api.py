@@ -58,6 +58,7 @@ DOCTESTED = (
     "gvtools.untrusted",
     "pipelines.blocks.appearance",
     "pipelines.blocks.cells",
+    "pipelines.commands.options",
     "pipelines.data_sets.log_histogram",
 )
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from types import NoneType
 from typing import Any, Literal, get_args, get_origin
 
 from gvtools.settings.base import Entry, Settings, entries, hidden
 
-_TYPES = {bool: "true or false", int: "integer", float: "number", str: "text"}
+_TYPES = {bool: "true or false", int: "integer", float: "number", str: "text", Path: "path"}
 
 
 def listing(*settings: Settings, width: int = 100) -> str:
@@ -57,7 +58,7 @@ def _sections(settings: Any, prefix: str = "", doc: str = "") -> Iterator[tuple[
             continue
         key, value = f"{prefix}{name}", getattr(settings, name, "(required)")
         if entry.section is None:
-            rows.append((key, _shown(value), _accepts(entry), entry))
+            rows.append((key, shown(value), accepts(entry), entry))
         else:
             # What an absent section would hold.
             inner.append((key, entry.section() if value is None else value, entry.doc))
@@ -67,15 +68,16 @@ def _sections(settings: Any, prefix: str = "", doc: str = "") -> Iterator[tuple[
         yield from _sections(value, f"{key}.", doc)
 
 
-def _shown(value: Any) -> str:
+def shown(value: Any) -> str:
+    """A value as it is given on the command line."""
     if isinstance(value, tuple):
-        return f"[{', '.join(map(_shown, value))}]"
+        return f"[{', '.join(map(shown, value))}]"
     named = {None: "none", True: "true", False: "false"}
     known = value is None or isinstance(value, bool)
     return named[value] if known else f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def _accepts(entry: Entry) -> str:
+def accepts(entry: Entry) -> str:
     """The type or the choices, and the range."""
     kinds = get_args(entry.kind) if entry.optional else (entry.kind,)
     words = [", ".join(get_args(k)) if get_origin(k) is Literal else _named(k)

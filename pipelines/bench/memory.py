@@ -163,7 +163,7 @@ def memory_figures(options: CompleteOptions) -> dict[str, Any]:
         "steps": options.steps,
         "cascade_steps": options.cascade_steps,
         "precision": name_of(options.compute_type),
-        "training_precision": name_of(options.trained_type),
+        "training_precision": name_of(_trained_type(options)),
         "card_gb": options.card,
         "inference": [],
         "training": [],
@@ -205,7 +205,7 @@ def _training(
     options: CompleteOptions, config: GeoVerseConfig, stage: str, *, recompute: bool
 ) -> dict[str, Any]:
     """A step of one sample; the video prior stays on the card."""
-    dtype = options.trained_type
+    dtype = _trained_type(options)
     with predicted():
         model = _model(config)
         views = _views(options, config)
@@ -222,6 +222,12 @@ def _training(
         **{f"{part}_bytes": weights + peak for part, peak in peaks.items()},
         "total_bytes": weights + max(peaks.values()),
     }
+
+
+def _trained_type(options: CompleteOptions) -> torch.dtype:
+    """Training knows no float16."""
+    found = options.compute_type
+    return torch.float32 if found == torch.float16 else found
 
 
 def _views(options: CompleteOptions, config: GeoVerseConfig) -> ViewBatch:

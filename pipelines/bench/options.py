@@ -1,33 +1,34 @@
-"""What ``gvtools bench complete`` measures: the model, its views, and where it runs."""
+"""Options of ``gvtools bench complete``: the model, its views, and its device."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import torch
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
-from gvtools.completers.geoverse.config import GeoVerseConfig, named
-from gvtools.completers.geoverse.weights import config_of
 from gvtools.errors import OptionError
-from gvtools.networks.compute import inference_type, named_type
 from gvtools.settings import Settings
+
+if TYPE_CHECKING:
+    import torch
+
+    from gvtools.completers.geoverse.config import GeoVerseConfig
 
 Count = Annotated[int, Field(ge=1)]
 
 
 class CompleteOptions(Settings):
-    """See the module; none is derived, and written with the figures."""
+    """Model, views, device and steps of the measured passes, as they are written with figures."""
 
     section = "bench complete"
 
-    config: str | None = None
-    """Tiny or base; none for the weights' own, tiny without weights."""
+    config: Literal["tiny", "base"] | None = None
+    """Of random weights; none for the weights' own, tiny without weights."""
     weights: Path | None = None
     """Folder of a model; none for random numbers."""
     size: tuple[int, int] | None = None
-    """(H, W); none for the configuration's square. [px]"""
+    """HxW or N of the pictures; none for the configuration's square. [px]"""
     context: Count = 2
     """Photographs in a pass."""
     targets: Count = 6
@@ -37,20 +38,34 @@ class CompleteOptions(Settings):
     cascade_steps: Count = 1
     """Of level 0."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Where the model runs; "auto" takes a GPU where there is one."""
+    """Auto takes a GPU where there is one."""
     precision: Literal["float32", "bfloat16", "float16"] | None = None
-    """None for what the device computes in: float32 on a CPU, bfloat16 on a GPU, float16 on one
-    before compute capability 8.0; for ``memory`` bfloat16."""
+    """Of products; none for what the device computes in: float32 on a CPU, bfloat16 on a GPU,
+    float16 on one before compute capability 8.0; for a prediction of memory bfloat16."""
     video: bool | None = None
-    """Run the video prior; none: where the configuration has one, but not on a CPU."""
+    """Run the video prior, 15 GB of weights; none: on a GPU, where the configuration has one."""
     repeat: Count = 9
     """Timed passes."""
     compile: bool = False
-    """Compile the denoisers and the RGB head first."""
+    """Compile the denoisers and the RGB head first: needs a C++ compiler and most of a minute."""
     memory: bool = False
-    """Predict the peak memory of a pass and of a training step instead of timing anything."""
+    """Predict the peak memory of a pass and of a training step, by stage; runs nothing."""
     card: float | None = Field(None, gt=0)
-    """Memory of a card that ``memory`` compares its figures with. [GB]"""
+    """Memory of a card: say what of the predicted memory fits it. [GB]"""
+
+    @field_validator("size", mode="before")
+    @classmethod
+    def _parsed_size(cls, value: Any) -> Any:
+        if not isinstance(value, str):
+            return value
+        parts = value.lower().split("x")
+        try:
+            height, width = (int(part) for part in (parts * 2 if len(parts) == 1 else parts))
+        except ValueError:
+            raise OptionError(
+                f"--size {value}: expected HxW or N, in pixels, such as 504"
+            ) from None
+        return height, width
 
     @model_validator(mode="after")
     def _check(self) -> CompleteOptions:
@@ -62,7 +77,7 @@ class CompleteOptions(Settings):
             raise OptionError("bench complete: --card is of --memory; give both")
         if self.memory and self.compile:
             raise OptionError("bench complete: --compile, and --memory runs nothing")
-        if self.device == "cuda" and not torch.cuda.is_available():
+        if self.device == "cuda" and self.place.type != "cuda":
             raise OptionError("bench complete: --device cuda, and torch sees no CUDA device here")
         config = self.network()
         if self.video and config.video is None:
@@ -77,6 +92,9 @@ class CompleteOptions(Settings):
 
     def network(self) -> GeoVerseConfig:
         """Of the model."""
+        from gvtools.completers.geoverse.config import named
+        from gvtools.completers.geoverse.weights import config_of
+
         return named(self.config or "tiny") if self.weights is None else config_of(self.weights)
 
     def picture(self, config: GeoVerseConfig) -> tuple[int, int]:
@@ -86,34 +104,22 @@ class CompleteOptions(Settings):
     @property
     def place(self) -> torch.device:
         """The device."""
-        auto = "cuda" if torch.cuda.is_available() else "cpu"
-        return torch.device(auto if self.device == "auto" else self.device)
+        import torch
+
+        cuda = self.device != "cpu" and torch.cuda.is_available()
+        return torch.device("cuda" if cuda else "cpu")
 
     @property
     def compute_type(self) -> torch.dtype:
         """Of products."""
+        from gvtools.networks.compute import inference_type, named_type
+
         if self.memory:
             return named_type(self.precision or "bfloat16")
         return inference_type(self.precision or "auto", self.place)
-
-    @property
-    def trained_type(self) -> torch.dtype:
-        """Of products in training, which knows no float16."""
-        found = self.compute_type
-        return torch.float32 if found == torch.float16 else found
 
     def runs_video(self, config: GeoVerseConfig) -> bool:
         """The video prior is part of the pass."""
         if self.video is None:
             return config.video is not None and self.place.type == "cuda"
         return self.video
-
-
-def parsed_size(text: str) -> tuple[int, int]:
-    """HxW, or N for N x N."""
-    parts = text.lower().split("x")
-    try:
-        height, width = (int(part) for part in (parts * 2 if len(parts) == 1 else parts))
-    except ValueError:
-        raise OptionError(f"--size {text}: expected HxW or N, in pixels, such as 504") from None
-    return height, width

@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from gvtools.errors import OptionError
+from pipelines.bench.options import CompleteOptions
+from pipelines.commands.options import add_settings, given_settings
 
 if TYPE_CHECKING:
     from pipelines.bench.side_by_side import Comparison
@@ -27,21 +29,12 @@ EXAMPLES = (
 
 FEWEST_POINTS = 1000
 POINTS = {"fuse": 3_200_000, "splat": 4_000_000}
-COMPLETE = (
-    "config",
-    "weights",
-    "size",
-    "context",
-    "targets",
-    "steps",
-    "cascade_steps",
-    "device",
-    "precision",
-    "video",
-    "compile",
-    "memory",
-    "card",
-)
+# Options of ``CompleteOptions`` that bear its fields' names; --repeat is of all benchmarks.
+COMPLETE = {
+    name: name
+    for name in ("config", "weights", "size", "context", "targets", "steps", "cascade_steps",
+                 "device", "precision", "video", "compile", "memory", "card")
+}  # fmt: skip
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -63,49 +56,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--repeat", type=int, default=9, metavar="N", help="timed turns of each (%(default)s)"
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there")
-    _add_complete(parser.add_argument_group("of complete alone"))
-
-
-def _add_complete(group: argparse._ArgumentGroup) -> None:
-    """Options that None leaves to ``CompleteOptions``."""
-    group.add_argument("--config", choices=("tiny", "base"), help="random weights (tiny)")
-    group.add_argument("--weights", type=Path, metavar="DIR", help="a model's folder instead")
-    group.add_argument("--size", metavar="HxW|N", help="of the pictures, px (the model's own)")
-    group.add_argument("--context", type=int, metavar="N", help="photographs in a pass (2)")
-    group.add_argument("--targets", type=int, metavar="N", help="views to complete (6)")
-    group.add_argument("--steps", type=int, metavar="N", help="of level 1 (3)")
-    group.add_argument("--cascade-steps", type=int, metavar="N", help="of level 0 (1)")
-    group.add_argument("--device", choices=("auto", "cpu", "cuda"), help="(auto)")
-    group.add_argument(
-        "--precision",
-        choices=("float32", "bfloat16", "float16"),
-        help="of products (float32 on a CPU, bfloat16 on a GPU, float16 on an old one)",
-    )
-    group.add_argument(
-        "--video",
-        action=argparse.BooleanOptionalAction,
-        help="run the video prior, 15 GB of weights (on a GPU, where the model has one)",
-    )
-    group.add_argument(
-        "--compile",
-        action="store_true",
-        default=None,
-        help="torch.compile first: needs a C++ compiler and most of a minute, pays in long runs",
-    )
-    group.add_argument(
-        "--memory",
-        action="store_true",
-        default=None,
-        help="predict the peak memory of a pass and of a training step, by stage; runs nothing",
-    )
-    group.add_argument(
-        "--card", type=float, metavar="GB", help="with --memory: say what fits a card of so many GB"
-    )
+    group = parser.add_argument_group("of complete alone")
+    # Without a check, which loads torch.
+    defaults = CompleteOptions.model_construct()
+    add_settings(group, defaults, COMPLETE, metavars={"size": "HxW|N", "weights": "DIR"})
 
 
 def run(args: argparse.Namespace, console: Console) -> None:
     """Run the benchmark and show or write its rows."""
-    given = {name for name in COMPLETE if getattr(args, name) is not None}
+    given = given_settings(args, COMPLETE)
     if args.what == "complete":
         if args.points is not None:
             raise OptionError("bench complete: --points is of fuse and splat")
@@ -133,14 +92,10 @@ def run(args: argparse.Namespace, console: Console) -> None:
     report(rows, console, args.json, bench=args.what, points=points, load=os.getloadavg()[0])
 
 
-def _run_complete(args: argparse.Namespace, given: set[str], console: Console) -> None:
+def _run_complete(args: argparse.Namespace, given: dict[str, Any], console: Console) -> None:
     from pipelines.bench.complete import complete_figures, show
-    from pipelines.bench.options import CompleteOptions, parsed_size
 
-    options = {name: getattr(args, name) for name in given}
-    if "size" in options:
-        options["size"] = parsed_size(options["size"])
-    chosen = CompleteOptions(repeat=args.repeat, **options)
+    chosen = CompleteOptions(repeat=args.repeat, **given)
     if chosen.memory:
         from pipelines.bench.memory import memory_figures
         from pipelines.bench.memory_tables import show_memory

@@ -16,7 +16,7 @@ from gvtools.errors import OptionError
 from gvtools.networks.compute import attend
 from pipelines.bench import side_by_side
 from pipelines.bench.complete import parameters, weight_bytes
-from pipelines.bench.options import parsed_size
+from pipelines.bench.options import CompleteOptions
 from pipelines.bench.random_model import random_features, random_model, random_video, random_views
 from pipelines.bench.stage_clock import StageClock, total
 from pipelines.bench.timing import TimedPass
@@ -213,8 +213,8 @@ def test_other_benchmarks_know_no_model():
 
 
 def test_sizes():
-    assert parsed_size("504") == (504, 504)
-    assert parsed_size("336x504") == (336, 504)
+    assert CompleteOptions(size="504").size == (504, 504)
+    assert CompleteOptions(size="336x504").size == (336, 504)
 
 
 # Random models and views.
