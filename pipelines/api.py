@@ -118,7 +118,8 @@ def evaluate(
     from gvtools.errors import OptionError
     from gvtools.runs.run import load_run
     from pipelines.console import Console
-    from pipelines.evaluation.run_evaluation import PARTS, evaluate_run
+    from pipelines.scoring.evaluation import evaluate_run
+    from pipelines.scoring.measurement import PARTS
 
     unknown = [part for part in parts if part not in PARTS]
     if unknown or not parts:

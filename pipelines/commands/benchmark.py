@@ -12,8 +12,8 @@ from pipelines.commands.arguments import add_lpips_arguments, open_lpips
 
 if TYPE_CHECKING:
     from gvtools.evaluation.published import Benchmark
-    from pipelines.benchmark.measure import Cell
     from pipelines.console import Console
+    from pipelines.scoring.benchmark import BenchmarkCell
 
 SUMMARY = "run a whole benchmark, and stand its means beside published rows"
 EXAMPLES = (
@@ -67,8 +67,8 @@ def run(args: argparse.Namespace, console: Console) -> None:
     """Measure what is not measured yet, and write the tables."""
     from gvtools.evaluation.published import load_benchmark
     from gvtools.runs.folder_lock import folder_lock
-    from pipelines.benchmark.cells import measure_apart, measure_cells
-    from pipelines.benchmark.results import PAGE, print_tables, write_results
+    from pipelines.scoring.benchmark import measure_apart, measure_cells
+    from pipelines.scoring.benchmark_results import PAGE, print_tables, write_results
 
     benchmark = load_benchmark(args.name)
     cells = planned_cells(args, benchmark, console)
@@ -88,7 +88,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
 
 def _refuse_others(out: Path, name: str) -> None:
     """Refuse a folder with the tables of another benchmark, which would be overwritten."""
-    from pipelines.benchmark.results import RESULTS
+    from pipelines.scoring.benchmark_results import RESULTS
 
     try:
         found = read_json(out / RESULTS)["benchmark"]
@@ -100,9 +100,9 @@ def _refuse_others(out: Path, name: str) -> None:
         )
 
 
-def _check_some_measured(cells: tuple[Cell, ...], root: Path) -> None:
+def _check_some_measured(cells: tuple[BenchmarkCell, ...], root: Path) -> None:
     """Refuse a benchmark without any figure, which a script would take for a success."""
-    from pipelines.benchmark.cells import MEASURED, read_cell
+    from pipelines.scoring.benchmark import MEASURED, read_cell
 
     results = [read_cell(cell) for cell in cells]
     if not any(result and result["status"] == MEASURED for result in results):
@@ -112,11 +112,10 @@ def _check_some_measured(cells: tuple[Cell, ...], root: Path) -> None:
 
 def planned_cells(
     args: argparse.Namespace, benchmark: Benchmark, console: Console
-) -> tuple[Cell, ...]:
+) -> tuple[BenchmarkCell, ...]:
     """Every scene, number of views and method, scene by scene."""
-    from pipelines.benchmark.measure import Cell
-    from pipelines.benchmark.methods import parse_methods
-    from pipelines.benchmark.scenes import scene_names
+    from pipelines.scoring.benchmark import BenchmarkCell, parse_methods
+    from pipelines.scoring.benchmark_scenes import scene_names
 
     if args.seconds is not None and not args.seconds > 0:
         raise OptionError(f"--seconds {args.seconds:g}; expected more than 0")
@@ -131,7 +130,7 @@ def planned_cells(
     scenes = _chosen_scenes(args.scenes, scene_names(benchmark, root))
     out = args.out or Path("runs") / f"benchmark-{args.name}"
     return tuple(
-        Cell(
+        BenchmarkCell(
             benchmark=args.name,
             root=root,
             scene=scene,

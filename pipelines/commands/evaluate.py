@@ -22,7 +22,7 @@ EXAMPLES = (
     "gvtools evaluate runs/kitchen --json kitchen.json",
     "gvtools evaluate scans/kitchen --protocol long --stride 3 --out runs/kitchen_long",
 )
-# As pipelines.evaluation.protocol_run has them, which is not loaded for the parser.
+# As pipelines.scoring.evaluation has them, which is not loaded for the parser.
 PROTOCOLS = ("pass", "long")
 
 
@@ -74,13 +74,13 @@ def run(args: argparse.Namespace, console: Console) -> None:
     """Measure, print, write."""
     from gvtools.evaluation.published import benchmark_names
     from gvtools.files import write_json
-    from pipelines.evaluation.evaluate import (
+    from pipelines.scoring.evaluation import (
+        EvaluationOptions,
         evaluate_runs,
         load_benchmarks,
         load_runs,
         write_evaluation,
     )
-    from pipelines.evaluation.record import EvaluationOptions
 
     if args.seed < 0:
         raise OptionError(f"--seed {args.seed}; expected at least 0")
@@ -112,7 +112,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
 
 def parts_of(text: str) -> tuple[str, ...]:
     """The parts that a list with commas names."""
-    from pipelines.evaluation.run_evaluation import PARTS
+    from pipelines.scoring.measurement import PARTS
 
     parts = tuple(part.strip() for part in text.split(",") if part.strip())
     unknown = [part for part in parts if part not in PARTS]
@@ -140,7 +140,7 @@ def _folder(args: argparse.Namespace) -> Path:
 
 def _run_protocol(args: argparse.Namespace, out: Path, console: Console) -> Path:
     from pipelines.commands.arguments import open_scene, reading_of
-    from pipelines.evaluation.protocol_run import run_protocol
+    from pipelines.scoring.evaluation import run_protocol
 
     return run_protocol(
         open_scene(args.runs[0], args),

@@ -17,7 +17,7 @@ from pipelines.commands.arguments import (
 
 if TYPE_CHECKING:
     from pipelines.console import Console
-    from pipelines.judging.reference import Reference
+    from pipelines.scoring.method_pictures import Reference
 
 SUMMARY = "judge pictures of any method, several side by side, with the figures of evaluate"
 EXAMPLES = (
@@ -80,8 +80,8 @@ def run(args: argparse.Namespace, console: Console) -> None:
     """Match, measure, print, write."""
     from gvtools.files import make_folder, write_json
     from pipelines.commands.evaluate import parts_of
-    from pipelines.judging.judge import JudgeOptions, judge
-    from pipelines.judging.methods import method_names
+    from pipelines.scoring.judging import JudgeOptions, judge
+    from pipelines.scoring.method_pictures import method_names
 
     for name, value in (("seed", args.seed), ("sheet-views", args.sheet_views)):
         if value < 0:
@@ -125,7 +125,7 @@ def _check_apart(pictures: Sequence[Path], out: Path) -> None:
 def _reference(args: argparse.Namespace, console: Console) -> Reference:
     from gvtools.runs.layout import RECORD
     from pipelines.commands.arguments import open_scene, reading_of
-    from pipelines.judging.reference import observe_context, open_reference
+    from pipelines.scoring.method_pictures import open_reference, reference_from_context
 
     if (args.against / RECORD).is_file():
         given = [name for name in ("context", "targets") if getattr(args, name) is not None]
@@ -134,7 +134,7 @@ def _reference(args: argparse.Namespace, console: Console) -> Reference:
                 f"--{given[0]}: {args.against} is a run, whose views are its own; leave it out"
             )
         return open_reference(args.against, cameras=args.cameras)
-    return observe_context(
+    return reference_from_context(
         open_scene(args.against, args),
         args.out / "memory",
         context=args.context,

@@ -72,8 +72,8 @@ def run(args: argparse.Namespace, console: Console) -> None:
     """Associate, align, measure."""
     from gvtools.evaluation.trajectories import absolute_errors, pose_auc, relative_errors
     from gvtools.files import write_json
-    from pipelines.evaluation.pose_figures import pose_figures
     from pipelines.inputs.trajectory_source import LAYOUTS, associate, open_trajectory
+    from pipelines.scoring.measurement import pose_figures
 
     if args.layout not in LAYOUTS:
         raise OptionError(f"--layout {args.layout!r}; expected one of {', '.join(LAYOUTS)}")
@@ -124,7 +124,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
 
 
 def _print(figures: dict[str, Any], errors: PoseErrors, console: Console) -> None:
-    from pipelines.evaluation.pose_figures import FIGURES, statistics_figures
+    from pipelines.scoring.measurement import POSE_STATISTICS, statistics_figures
 
     console.line(
         f"{figures['metric'].upper()}: {figures['associated']} poses of "
@@ -135,7 +135,7 @@ def _print(figures: dict[str, Any], errors: PoseErrors, console: Console) -> Non
     rows = [
         [
             name,
-            *(statistics_figures(statistics)[key] for key in FIGURES),
+            *(statistics_figures(statistics)[key] for key in POSE_STATISTICS),
             statistics_figures(statistics)["n"],
         ]
         for name, statistics in (
@@ -144,7 +144,7 @@ def _print(figures: dict[str, Any], errors: PoseErrors, console: Console) -> Non
             ("rotation, degrees", errors.rotation_deg),
         )
     ]
-    console.table(["error", *FIGURES, "n"], rows)
+    console.table(["error", *POSE_STATISTICS, "n"], rows)
     if figures.get("auc"):
         shares = ", ".join(
             f"@{key} {value:.4f}" for key, value in figures["auc"].items() if value is not None

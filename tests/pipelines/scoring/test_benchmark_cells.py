@@ -17,26 +17,37 @@ from tiny_scan import write_colmap_scan, write_scan
 from gvtools.evaluation.images import psnr, ssim
 from gvtools.evaluation.published import load_benchmark
 from gvtools.scenes.project import open_project
-from pipelines.benchmark.cells import _ended, measure_apart, read_cell
-from pipelines.benchmark.measure import Cell, peak_bytes
-from pipelines.benchmark.methods import parse_methods
-from pipelines.benchmark.pictures import masked_figures, object_mask, pictures_folder
-from pipelines.benchmark.scenes import picture_size, prepared, split_of_scene
+from pipelines.scoring.benchmark import (
+    BenchmarkCell,
+    _end_of_process,
+    measure_apart,
+    parse_methods,
+    peak_bytes,
+    read_cell,
+)
+from pipelines.scoring.benchmark_scenes import (
+    at_benchmark_size,
+    masked_figures,
+    object_mask,
+    picture_size,
+    pictures_folder,
+    split_of_scene,
+)
 
 pytestmark = pytest.mark.usefixtures("unpainted")
 
 
-def cell(root, out, **changes) -> Cell:
+def cell(root, out, **changes) -> BenchmarkCell:
     values = {"benchmark": "few-view", "root": root, "scene": "scan", "views": 3, "seconds": None,
               "method": parse_methods("fast")[0], "lpips": None, "out": out}  # fmt: skip
-    return Cell(**{**values, **changes})
+    return BenchmarkCell(**{**values, **changes})
 
 
 def test_pictures_have_the_benchmarks_size_and_points_of_the_context_alone(tmp_path):
     scene = open_project(write_colmap_scan(tmp_path / "scan", views=12))
     few = load_benchmark("few-view").at(3)
     split = split_of_scene(few, scene)
-    found = prepared(scene, split, size=picture_size(few, scene))
+    found = at_benchmark_size(scene, split, size=picture_size(few, scene))
     assert found[scene.names[0]].load().rgb.shape == (72, 96, 3)
     # Each point of this project is seen by one view alone.
     assert found.points is not None and len(found.points.positions) == 0
@@ -44,7 +55,7 @@ def test_pictures_have_the_benchmarks_size_and_points_of_the_context_alone(tmp_p
     eighth = load_benchmark("mipnerf360-few").at(12)
     assert picture_size(eighth, scene) == (12, 9)
     assert picture_size(load_benchmark("mipnerf360-few").at(3), scene) is None
-    found = prepared(scene, split, size=(48, 48))
+    found = at_benchmark_size(scene, split, size=(48, 48))
     assert found[scene.names[0]].load().rgb.shape == (48, 48, 3)
 
 
@@ -121,7 +132,7 @@ def test_a_cell_in_a_process_of_its_own_leaves_its_reason(tmp_path):
     measure_apart(one)
     found = read_cell(one)
     assert found is not None and found["status"] == "failed" and "no such folder" in found["reason"]
-    assert "memory runs out" in _ended(-9) and "exit status 3" in _ended(3)
+    assert "memory runs out" in _end_of_process(-9) and "exit status 3" in _end_of_process(3)
 
 
 @pytest.mark.slow

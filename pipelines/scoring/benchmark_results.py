@@ -1,4 +1,4 @@
-"""What a benchmark writes: comparison with published rows, intervals, scenes, an HTML page."""
+"""The results of a benchmark: comparison with published rows, intervals, scenes, an HTML page."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from gvtools.evaluation.intervals import Interval, mean_interval
 from gvtools.evaluation.published import Benchmark
@@ -19,12 +19,16 @@ from gvtools.evaluation.ranking import (
     side_by_side,
 )
 from gvtools.evaluation.tables import Cell as Ranked
-from gvtools.evaluation.tables import Column, Table, Value
-from gvtools.files import write_json
-from pipelines.benchmark.cells import FAILED, read_cell
-from pipelines.benchmark.measure import Cell
+from gvtools.evaluation.tables import Column, Table, Value, markdown
+from gvtools.files import write_json, write_text
 from pipelines.console import Console
-from pipelines.evaluation.tables import write_tables
+from pipelines.scoring.benchmark import BenchmarkCell, read_cell
+from pipelines.scoring.sweep import FAILED
+from pipelines.scoring.tables import write_tables
+
+if TYPE_CHECKING:
+    from viz.report.benchmark_page import BenchmarkPage, PictureRow
+    from viz.report.contact_sheet import Tile
 
 RESULTS, PAGE = "results.json", "index.html"
 MIB = 2**20
@@ -32,31 +36,20 @@ MIB = 2**20
 
 @dataclass(frozen=True, kw_only=True)
 class MethodResult:
-    """One method with one number of context views, over the scenes.
+    """One method with one number of context views, over the scenes."""
 
-    Attributes:
-        row: means over the scenes, and how they were measured.
-        intervals: by figure, the mean over the scenes that have it with its bootstrap interval.
-        seconds: mean wall-clock time of a run; None for pictures that were made elsewhere.
-        peak_bytes: most main memory of any run; None likewise.
-        failures: by scene that failed, why.
-        scenes: by scene that was measured, what ``measure_cell`` returned.
-    """
-
-    row: MeasuredRow
-    intervals: Mapping[str, Interval]
-    seconds: float | None
-    peak_bytes: int | None
-    failures: Mapping[str, str]
-    scenes: Mapping[str, Mapping[str, Any]]
+    row: MeasuredRow  # means over the scenes, and how they were measured
+    intervals: Mapping[str, Interval]  # by figure, of the mean over the scenes that have it
+    seconds: float | None  # mean of a run; None for pictures that were made elsewhere
+    peak_bytes: int | None  # most main memory of any run; None likewise
+    failures: Mapping[str, str]  # by scene that failed, why
+    scenes: Mapping[str, Mapping[str, Any]]  # by scene, what ``measure_cell`` returned
 
 
-def collected(benchmark: Benchmark, cells: Sequence[Cell]) -> list[MethodResult]:
+def method_results(benchmark: Benchmark, cells: Sequence[BenchmarkCell]) -> list[MethodResult]:
     """The results of the methods, in the cells' order, without methods not yet measured.
 
-    Args:
-        benchmark: with one number of context views; cells with another are ignored.
-        cells: of all methods and numbers of views.
+    The benchmark has one number of context views; cells with another are ignored.
     """
     own = [cell for cell in cells if cell.views == benchmark.context]
     names = dict.fromkeys(cell.method.name for cell in own)
@@ -130,12 +123,7 @@ def _setting(
 
 
 def comparison(benchmark: Benchmark, results: Sequence[MethodResult]) -> Table:
-    """A table of published and measured rows, with ranks where they are comparable.
-
-    Args:
-        benchmark: with one number of context views.
-        results: of the methods.
-    """
+    """A table of published and measured rows, with ranks where they are comparable."""
     rows = side_by_side([result.row for result in results], benchmark)
     by_name = {result.row.system: result for result in results}
     first, *others = benchmark.figures.values()
@@ -218,25 +206,16 @@ def scene_table(benchmark: Benchmark, by_views: Mapping[int, Sequence[MethodResu
 
 
 def write_results(
-    benchmark: Benchmark, cells: Sequence[Cell], out: Path, *, title: str
+    benchmark: Benchmark, cells: Sequence[BenchmarkCell], out: Path, *, title: str
 ) -> dict[int, Table]:
     """Write results.json, the tables (CSV, Markdown, LaTeX), and the HTML page.
 
-    Args:
-        benchmark: of the cells.
-        cells: all, measured or not.
-        out: folder of the benchmark's results.
-        title: of the page.
-
-    Returns:
-        The comparison tables by number of context views.
+    Cells may be measured or not. Returns the comparison tables by number of context views.
     """
-    from gvtools.files import write_text
-    from pipelines.benchmark.page import page_of
     from viz.report.benchmark_page import benchmark_html
 
     views = dict.fromkeys(cell.views for cell in cells)
-    by_views = {number: collected(benchmark.at(number), cells) for number in views}
+    by_views = {number: method_results(benchmark.at(number), cells) for number in views}
     by_views = {number: results for number, results in by_views.items() if results}
     compared = {n: comparison(benchmark.at(n), results) for n, results in by_views.items()}
     tables = {f"{number}_views": table for number, table in compared.items()}
@@ -244,7 +223,7 @@ def write_results(
     tables["scenes"] = scene_table(benchmark, by_views)
     write_tables(out, tables)
     write_json(out / RESULTS, {"benchmark": cells[0].benchmark, **_plain(by_views)})
-    page = page_of(benchmark, cells, by_views, tables=tables, title=title)
+    page = _page(benchmark, cells, by_views, tables=tables, title=title)
     write_text(out / PAGE, benchmark_html(page))
     return compared
 
@@ -270,7 +249,78 @@ def _plain(by_views: Mapping[int, Sequence[MethodResult]]) -> dict[str, Any]:
 
 def print_tables(tables: Mapping[int, Table], console: Console) -> None:
     """Print the comparison tables in Markdown."""
-    from gvtools.evaluation.tables import markdown
-
     for table in tables.values():
         console.line(markdown(table))
+
+
+def _page(
+    benchmark: Benchmark,
+    cells: Sequence[BenchmarkCell],
+    by_views: Mapping[int, Sequence[MethodResult]],
+    *,
+    tables: Mapping[str, Table],
+    title: str,
+) -> BenchmarkPage:
+    from viz.report.benchmark_page import BenchmarkPage
+
+    methods = dict.fromkeys(cell.method.name for cell in cells)
+    scenes = dict.fromkeys(cell.scene for cell in cells)
+    lines: dict[str, list[tuple[int, float, float | None, float | None]]] = {}
+    for views, results in by_views.items():
+        for result in results:
+            interval = result.intervals["psnr"]
+            if interval.mean is not None:
+                point = (views, interval.mean, interval.low, interval.high)
+                lines.setdefault(result.row.system, []).append(point)
+    rules = dict.fromkeys(benchmark.split_of(views).source for views in by_views)
+    size = benchmark.resolution
+    return BenchmarkPage(
+        title=title,
+        facts=(
+            ("scenes", ", ".join(scenes)),
+            ("methods", ", ".join(methods)),
+            ("context views", ", ".join(map(str, by_views))),
+            ("pictures", f"{size[0]}x{size[1]}" if size else "as recorded, or the split's share"),
+            ("views chosen by", "; ".join(rules)),
+        ),
+        tables=tables,
+        lines=lines,
+        pictures=tuple(
+            row
+            for scene in scenes
+            for views in by_views
+            if (row := _pictures(scene, [c for c in cells if (c.scene, c.views) == (scene, views)]))
+        ),
+    )
+
+
+def _pictures(scene: str, cells: Sequence[BenchmarkCell]) -> PictureRow | None:
+    """The middle target of a scene: a given view, the photograph, each method and its error."""
+    from viz.report.benchmark_page import PictureRow
+
+    folder, views = cells[0].result.parent, cells[0].views
+    heading = f"{scene}, {views} context views"
+    shared = (("context", "a given view"), ("truth", "photograph"))
+    tiles = [_tile(folder / f".{name}.jpg", label, heading) for name, label in shared]
+    for cell in cells:
+        for ending, label in ((".jpg", cell.method.name), (".error.jpg", "error")):
+            path = cell.result.with_name(f"{cell.method.name}{ending}")
+            # What a failed cell left of an earlier attempt is not its own.
+            if cell.result.is_file():
+                tiles.append(_tile(path, label, f"{heading}, {cell.method.name}"))
+    known = tuple(tile for tile in tiles if tile is not None)
+    return PictureRow(heading, known) if len(known) > 2 else None
+
+
+def _tile(path: Path, label: str, where: str) -> Tile | None:
+    from PIL import Image
+
+    from viz.report.contact_sheet import Tile, data_uri
+
+    if not path.is_file():
+        return None
+    with Image.open(path) as picture:
+        width, height = picture.size
+    return Tile(
+        label, f"{where}: {label}", data_uri(path.read_bytes(), "image/jpeg"), width, height
+    )

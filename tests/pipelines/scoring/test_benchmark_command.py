@@ -17,8 +17,8 @@ from gvtools.evaluation import published
 from gvtools.evaluation.images import psnr
 from gvtools.evaluation.published import load_benchmark
 from gvtools.scenes.project import open_project
-from pipelines.benchmark import cells, measure
 from pipelines.cli import main
+from pipelines.scoring import benchmark
 
 pytestmark = pytest.mark.usefixtures("unpainted")
 
@@ -34,9 +34,9 @@ def in_process(monkeypatch):
 
     def measure(cell):
         measured.append((cell.scene, cell.views, cell.method.name))
-        cells.measure_and_write(cell)
+        benchmark.measure_and_write(cell)
 
-    monkeypatch.setattr(cells, "measure_apart", measure)
+    monkeypatch.setattr(benchmark, "measure_apart", measure)
     return measured
 
 
@@ -187,7 +187,7 @@ def test_the_papers_protocol_runs_in_rounds_and_measures_poses(tmp_path, in_proc
             "data_set": spec.data_set.model_copy(update={"spec": ""}),
         }
     )
-    monkeypatch.setattr(measure, "load_benchmark", lambda name: small)
+    monkeypatch.setattr(benchmark, "load_benchmark", lambda name: small)
     monkeypatch.setattr(published, "load_benchmark", lambda name: small)
     command = ["benchmark", "scannetv2", "--root", str(root), "--out", str(out), "--quiet"]
     assert main([*command, "--methods", "fast"]) == 0

@@ -15,11 +15,11 @@ from gvtools.evaluation.published import load_benchmark
 from gvtools.runs.run import Run
 from gvtools.scenes.colmap_writer import write_colmap
 from gvtools.scenes.data_sets import catalogue
-from pipelines.benchmark import scenes
-from pipelines.benchmark.scenes import (
+from pipelines.scoring import benchmark_scenes as scenes
+from pipelines.scoring.benchmark_scenes import (
+    at_benchmark_size,
     open_benchmark_scene,
     picture_size,
-    prepared,
     reading_of,
     split_of_scene,
 )
@@ -79,7 +79,7 @@ def test_the_data_sets_own_reduced_pictures_are_read_where_they_are_there(tmp_pa
     assert len(split.context) == 12
     size = picture_size(benchmark, scene)
     assert size == (None if read == 8 else (20, 15))
-    assert size_of(prepared(scene, split, size=size).views[0].camera) == (20, 15)
+    assert size_of(at_benchmark_size(scene, split, size=size).views[0].camera) == (20, 15)
 
 
 def test_copies_that_do_not_tell_the_recorded_size_are_refused(tmp_path):
@@ -97,7 +97,7 @@ def test_llff_has_one_size_and_its_runs_are_opened_again_with_it(tmp_path, copie
     split = split_of_scene(benchmark, scene)
     assert [int(name[5:7]) for name in split.context] == [1, 7, 15]
     size = picture_size(benchmark, scene)
-    found = prepared(scene, split, size=size)
+    found = at_benchmark_size(scene, split, size=size)
     assert {size_of(view.camera) for view in found} == {(504, 378)}
     assert found.views[5].load().rgb.shape == (378, 504, 3)
     assert scene.origin is not None

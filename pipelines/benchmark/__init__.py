@@ -1,1 +1,0 @@
-"""Whole benchmarks: every scene, number of views and method, resumable, and the tables of it."""

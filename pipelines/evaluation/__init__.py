@@ -1,1 +1,0 @@
-"""Evaluation of finished runs, and the tables written from it."""

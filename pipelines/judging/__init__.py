@@ -1,1 +1,0 @@
-"""Pictures that any method made, judged with the figures of gvtools' own."""

@@ -1,0 +1,375 @@
+"""Finished runs measured, ranked beside published rows, and written as JSON and tables."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gvtools.errors import OptionError, ProjectError
+from gvtools.evaluation.intervals import LEVEL, RESAMPLES, mean_interval
+from gvtools.evaluation.protocol import protocol_split
+from gvtools.evaluation.published import Benchmark, benchmark_names, load_benchmark
+from gvtools.evaluation.ranking import Setting, comparison_table, side_by_side
+from gvtools.evaluation.view_figures import FIGURES
+from gvtools.files import write_json
+from gvtools.runs.identity import versions
+from gvtools.runs.layout import RECORD
+from gvtools.runs.memory_file import load_memory
+from gvtools.runs.run import Run, load_run
+from pipelines.console import Console
+from pipelines.report.nested import nested
+from pipelines.scoring.measurement import (
+    Measurement,
+    context_pictures,
+    matcher_called,
+    mean,
+    run_targets,
+    true_pictures,
+)
+from pipelines.scoring.tables import (
+    measured_row,
+    print_table,
+    summary_table,
+    view_table,
+    write_tables,
+)
+
+if TYPE_CHECKING:
+    from gvtools.evaluation.lpips_distance import Lpips
+    from gvtools.features import FeatureMatcher
+    from gvtools.scenes.scene import Scene
+
+# Context and target views of a round, and rounds.
+PROTOCOLS = {"pass": (2, 6, 1), "long": (2, 6, 3)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluationOptions:
+    """What is measured, and how."""
+
+    name: str  # of the measured row
+    parts: tuple[str, ...]  # of measurement.PARTS
+    matcher: str  # of the pose probe, "sift" or "lightglue"
+    control: bool  # measure the true pictures of the targets as well
+    seed: int  # of resampling, matching and robust estimates
+    data_set: str | None  # that the runs are scenes of; None ranks nothing
+    lpips_net: str
+    lpips_measured: bool  # whether the network's weights are there
+
+
+def load_benchmarks(shown: Sequence[str], data_set: str | None) -> dict[str, Benchmark]:
+    """Published benchmarks by name: those with the paper's protocol, and those to be shown."""
+    if data_set is not None:
+        load_benchmark(data_set)
+    known = {name: load_benchmark(name) for name in benchmark_names()}
+    papers = {name: b for name, b in known.items() if b.splits[0].kind == "protocol"}
+    return papers | {name: load_benchmark(name) for name in shown}
+
+
+def load_runs(paths: Sequence[Path], *, project: Path | None) -> list[Run]:
+    """Runs with at least one completed target each."""
+    if len({path.resolve() for path in paths}) < len(paths):
+        raise OptionError("a run is given twice; expected each once")
+    runs = [load_run(path, project=project) for path in paths]
+    for run in runs:
+        if len(run.rounds) < 2:
+            raise ProjectError(
+                f"{run.path}: no round of targets is done; expected one; add --resume to it"
+            )
+    return runs
+
+
+def run_protocol(
+    scene: Scene,
+    out: Path,
+    *,
+    protocol: str,
+    stride: int | None,
+    seed: int,
+    completer: str | None,
+    profile: str | None,
+    changes: Sequence[str],
+    reading: Mapping[str, Any],
+    console: Console,
+) -> Path:
+    """Split the views by one of PROTOCOLS, run, and write the split beside the run; its folder.
+
+    Args:
+        scene: the project.
+        out: folder for the run and its split.
+        protocol: one of PROTOCOLS.
+        stride: views from one to the next; None takes the widest.
+        seed: of the split and the run.
+        completer: its name; None takes the default.
+        profile: its name; None takes the default.
+        changes: settings as KEY=VALUE.
+        reading: how the user said the project is to be read, JSON-ready.
+        console: where progress goes.
+    """
+    from gvtools.runs.folder import RunDirectory
+    from gvtools.settings import with_texts, with_values
+    from pipelines.reconstruction.run import reconstruct
+    from pipelines.reconstruction.settings import RunSettings
+    from pipelines.report.write import draw_run
+
+    context, targets, rounds = PROTOCOLS[protocol]
+    split = protocol_split(
+        scene.names, context=context, targets=targets, rounds=rounds, stride=stride, seed=seed
+    )
+    start = RunSettings() if profile is None else with_values(RunSettings(), {"profile": profile})
+    decided = {
+        "context": ",".join(split.context),
+        "targets": ",".join(split.targets),
+        "views_per_round": targets,
+        "rounds": rounds,
+        "seed": seed,
+        "completer": completer or start.completer,
+    }
+    for key in (text.partition("=")[0].strip() for text in changes):
+        if key in decided:
+            raise OptionError(f"--set {key}: decided by --protocol; leave it out")
+    config = with_texts(with_values(start, decided), changes)
+    folder = out / "run"
+    resume = (folder / RECORD).is_file()
+    RunDirectory(folder).refuse_foreign()
+    done = reconstruct(
+        scene, config, folder, console=console, resume=resume, reading=reading, draw=draw_run
+    )
+    write_json(out / "split.json", {"protocol": protocol, **split.to_dict()})
+    return done
+
+
+def evaluate_run(
+    run: Run,
+    *,
+    parts: Sequence[str],
+    lpips: Lpips | None,
+    no_lpips: str | None,
+    matcher: FeatureMatcher | None = None,
+    control: bool = True,
+    seed: int = 0,
+    console: Console,
+) -> dict[str, Any]:
+    """Measure one run with at least one round of targets; arguments as of ``Measurement``.
+
+    The figures are JSON-ready, by part; what could not be measured is None, with the reason under
+    ``notes``.
+    """
+    targets, reports = run_targets(run), run.rounds[1:]
+    measurement = Measurement(
+        parts=parts,
+        context=lambda: context_pictures(run, load_memory(run.path, up_to=0)),
+        truths=true_pictures(targets),
+        lpips=lpips,
+        no_lpips=no_lpips,
+        matcher=matcher,
+        control=control,
+        seed=seed,
+        console=console,
+    )
+    views = sum(len(report["views"]) for report in reports)
+    return {
+        "rounds": len(reports),
+        "views": len(targets),
+        "coverage": mean([target.coverage for target in targets]),
+        "seconds_per_view": _seconds(run) / views if views else None,
+        **measurement.of(targets),
+    }
+
+
+def evaluate_runs(
+    runs: Sequence[Run],
+    options: EvaluationOptions,
+    *,
+    lpips: Lpips | None,
+    no_lpips: str | None,
+    console: Console,
+) -> list[dict[str, Any]]:
+    """The figures of each run, with what they were measured on."""
+    matcher = matcher_called(options.matcher)
+    evaluations = []
+    for run in runs:
+        console.line(f"{run.path}: {len(run.rounds) - 1} rounds")
+        if not run.complete:
+            console.warn(f"{run.path}: not every round is done; measured are those that are")
+        figures = evaluate_run(
+            run,
+            parts=options.parts,
+            lpips=lpips,
+            no_lpips=no_lpips,
+            matcher=matcher,
+            control=options.control,
+            seed=options.seed,
+            console=console,
+        )
+        evaluations.append(with_run(figures, run))
+    # Runs of one name are told apart by the folders that they lie in.
+    names = [evaluation["name"] for evaluation in evaluations]
+    for evaluation in evaluations:
+        if names.count(evaluation["name"]) > 1:
+            folder = Path(evaluation["run"]).resolve()
+            evaluation["name"] = f"{folder.parent.name}/{folder.name}"
+    return evaluations
+
+
+def with_run(figures: dict[str, Any], run: Run) -> dict[str, Any]:
+    """The figures with the run that they were measured on: its split, settings and versions."""
+    record = run.record
+    schedule = [[record["targets"][row] for row in rows] for rows in record["schedule"]]
+    return {
+        "name": run.path.resolve().name,
+        "run": str(run.path),
+        "project": record["project"],
+        "split": {"context": record["context"], "rounds": schedule},
+        "seed": record["settings"]["seed"],
+        "settings": record["settings"],
+        "derived": record["derived"],
+        "versions": record["versions"],
+        "seconds_of_rounds": _seconds(run),
+        **figures,
+    }
+
+
+def _seconds(run: Run) -> float:
+    """Of all rounds of targets."""
+    seconds: float = sum(report["seconds"]["total"] for report in run.rounds[1:])
+    return seconds
+
+
+def write_evaluation(
+    runs: Sequence[Run],
+    evaluations: Sequence[dict[str, Any]],
+    options: EvaluationOptions,
+    *,
+    benchmarks: dict[str, Benchmark],
+    shown: Sequence[str],
+    out: Path,
+    console: Console,
+) -> dict[str, Any]:
+    """Write evaluation.json and the tables, print the summary, and return the figures.
+
+    Args:
+        runs: that were measured.
+        evaluations: of these, see ``evaluate_runs``.
+        options: what was measured.
+        benchmarks: published rows by name.
+        shown: names of those that are printed.
+        out: folder.
+        console: where the tables go.
+    """
+    setting = _setting(options, runs, evaluations)
+    row = measured_row(options.name, evaluations, setting)
+    comparisons = {}
+    for name, benchmark in benchmarks.items():
+        # Of several numbers of context views, that of the runs, if there are rows of it.
+        alike = benchmark.at(
+            setting.context if setting.context in benchmark.views else benchmark.context
+        )
+        comparisons[name] = comparison_table(side_by_side([row], alike), alike)
+    figures = _over_runs(evaluations, row.figures, options)
+    over = figures["over_scenes"] if len(evaluations) > 1 else {}
+    tables = {"summary": summary_table(evaluations, "Evaluation", over)}
+    for number, evaluation in enumerate(evaluations):
+        if "images" in evaluation:
+            views = evaluation["images"]["views"]
+            key = "views" if len(evaluations) == 1 else f"views_{number:03d}"
+            tables[key] = view_table(views, evaluation["name"])
+    tables |= {f"published_{name}": table for name, table in comparisons.items()}
+    write_json(out / "evaluation.json", figures)
+    write_tables(out, tables)
+    for table in (tables["summary"], *(comparisons[name] for name in shown)):
+        if table.caption:
+            console.line(table.caption)
+        print_table(table, console, ranks=True)
+    console.line(f"results in {out}: evaluation.json, and tables as .csv, .md and .tex")
+    return figures
+
+
+def _setting(
+    options: EvaluationOptions, runs: Sequence[Run], evaluations: Sequence[Mapping[str, Any]]
+) -> Setting:
+    """How the figures were measured, as far as it decides what they may be ranked with."""
+    reports = [report for run in runs for report in run.rounds[1:]]
+    sizes = {
+        (view["camera"]["width"], view["camera"]["height"])
+        for report in reports
+        for view in report["views"]
+    }
+    met3r = [nested(e, "consistency", "generated", "met3r", "status") for e in evaluations]
+    poses = [e["poses"] for e in evaluations if nested(e, "poses", "pictures")]
+    located = sum(part["located"] for part in poses), sum(part["pictures"] for part in poses)
+    masked = max(
+        (e["images"]["settings"]["masked_share"] for e in evaluations if "images" in e), default=0
+    )
+    return Setting(
+        data_set=options.data_set,
+        # Mixed sizes and numbers are none of the published ones.
+        resolution=sizes.pop() if len(sizes) == 1 else None,
+        context=_common([len(run.record["context"]) for run in runs]),
+        targets=_common([len(report["views"]) for report in reports]),
+        rounds=_common([len(run.rounds) - 1 for run in runs]),
+        scenes=len({run.record["project"] for run in runs}),
+        pixels="inside masks" if masked > 0 else "all",
+        lpips_net=options.lpips_net if options.lpips_measured else None,
+        poses_from=f"pose probe ({options.matcher}), {located[0]} of {located[1]} views located",
+        pose_unit="scene units",
+        reprojection=None,
+        met3r="original" if set(met3r) == {"measured"} else None,
+        hardware=f"{os.cpu_count()} CPU cores",
+    )
+
+
+def _common(numbers: Sequence[int]) -> int | None:
+    return numbers[0] if len(set(numbers)) == 1 else None
+
+
+def _over_runs(
+    evaluations: Sequence[Mapping[str, Any]],
+    row: Mapping[str, float | None],
+    options: EvaluationOptions,
+) -> dict[str, Any]:
+    """What evaluation.json holds: figures over all runs at the top, then each run's."""
+    over = {}
+    for name in FIGURES:
+        means = [nested(e, "images", "mean", name, "mean") for e in evaluations]
+        over[name] = mean_interval(means, seed=options.seed)
+    poses = [e["poses"] for e in evaluations if nested(e, "poses", "pictures")]
+    notes: dict[str, str] = {}
+    for evaluation in evaluations:
+        notes |= nested(evaluation, "images", "notes") or {}
+    return {
+        **{name: interval.mean for name, interval in over.items()},
+        "coverage": mean([e["coverage"] for e in evaluations]),
+        "views": sum(e["views"] for e in evaluations),
+        "seconds_per_view": mean([e["seconds_per_view"] for e in evaluations]),
+        "scenes": len(evaluations),
+        "over_scenes": {name: asdict(interval) for name, interval in over.items()},
+        "protocol_row": {
+            **row,
+            "located": sum(part["located"] for part in poses) if poses else None,
+            "probed": sum(part["pictures"] for part in poses) if poses else None,
+        },
+        "evaluation": {
+            "seed": options.seed,
+            "parts": list(options.parts),
+            "matcher": options.matcher,
+            "lpips_net": options.lpips_net,
+            "control": options.control,
+            **provenance(),
+        },
+        "runs": list(evaluations),
+        "notes": notes,
+    }
+
+
+def provenance() -> dict[str, Any]:
+    """By what figures were made, and when."""
+    return {
+        "bootstrap": {"level": LEVEL, "resamples": RESAMPLES},
+        "versions": versions(),
+        "date": time.strftime("%Y-%m-%d", time.gmtime()),
+    }

@@ -1,0 +1,202 @@
+"""Several methods' pictures measured on the same targets, with tables and contact sheets."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.evaluation.tables import csv_text
+from gvtools.files import replaced_when_written, write_json, write_text
+from pipelines.scoring.evaluation import provenance
+from pipelines.scoring.measurement import (
+    JUDGED,
+    MeasuredTarget,
+    Measurement,
+    evenly,
+    matcher_called,
+    true_pictures,
+)
+from pipelines.scoring.method_pictures import MethodPictures, Reference, open_method
+from pipelines.scoring.tables import differences, judge_markdown, judge_tables, print_judgement
+from viz.report.judge_sheet import JudgedView, sheet
+
+if TYPE_CHECKING:
+    from gvtools.evaluation.lpips_distance import Lpips
+    from gvtools.evaluation.tables import Table
+    from pipelines.console import Console
+
+VIEWS_A_SHEET = 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class JudgeOptions:
+    """What is measured, and how."""
+
+    parts: tuple[str, ...]  # of measurement.PARTS
+    matcher: str  # of the pose probe, "sift" or "lightglue"
+    control: bool  # measure the true pictures as well
+    rule: str  # how pictures are matched with views, see match_pictures
+    sheet_views: int  # views on the contact sheets; 0 writes none
+    seed: int  # of resampling, matching and robust estimates
+    lpips_net: str
+
+
+def judge(
+    paths: Sequence[Path],
+    names: Sequence[str],
+    reference: Reference,
+    *,
+    options: JudgeOptions,
+    lpips: Lpips | None,
+    no_lpips: str | None,
+    out: Path,
+    console: Console,
+) -> dict[str, Any]:
+    """Measure the methods, write figures, tables and sheets, print the table.
+
+    Args:
+        paths: of the methods' pictures.
+        names: of the methods.
+        reference: what they are judged against.
+        options: what to measure.
+        lpips: the network, or None.
+        no_lpips: why there is none.
+        out: folder for the results.
+        console: for progress and the table.
+
+    Returns:
+        What ``judge.json`` holds.
+    """
+    targets = reference.targets
+    measurement = Measurement(
+        parts=options.parts,
+        context=reference.context,
+        truths=true_pictures(targets),
+        lpips=lpips,
+        no_lpips=no_lpips,
+        matcher=matcher_called(options.matcher),
+        control=options.control,
+        names=JUDGED,
+        seed=options.seed,
+        console=console,
+    )
+    sheets = _SheetPictures(targets, options.sheet_views)
+    measured = []
+    for path, name in zip(paths, names, strict=True):
+        method = _open(path, name, reference, options=options, console=console)
+        sheets.add(method)
+        measured.append(_measure(method, measurement))
+    figures = {
+        "against": str(reference.run.path),
+        "project": reference.run.record["project"],
+        "context": list(reference.run.context),
+        "poses": reference.poses,
+        "cameras": None if reference.cameras is None else str(reference.cameras),
+        "targets": [target.picture.name for target in targets],
+        "with_truth": sum(target.truth is not None for target in targets),
+        "methods": measured,
+        "differences": differences(measured, options.seed) if "images" in options.parts else [],
+        "judge": {**asdict(options), "lpips_measured": lpips is not None, **provenance()},
+    }
+    tables = judge_tables(figures)
+    files = _write(figures, tables, sheets.views(), out=out)
+    print_judgement(tables, console)
+    console.line(
+        f"results in {out}: judge.json, judge.md, judge.csv, "
+        f"{', '.join(f'{name}.csv' for name in tables if name != 'means')}"
+        + (f", {len(files)} contact sheets" if files else "")
+    )
+    return figures
+
+
+def _open(
+    path: Path, name: str, reference: Reference, *, options: JudgeOptions, console: Console
+) -> MethodPictures:
+    """The method's pictures; those without depth get the memory's, where it is needed."""
+    method = open_method(path, name, reference.targets, rule=options.rule)
+    if "consistency" in options.parts:
+        method = replace(method, targets=reference.with_surfaces(method.targets))
+    matching, pictures = method.matching, method.pictures
+    console.line(
+        f"{name}: {len(method.targets)} of {len(reference.targets)} views, matched by "
+        f"{matching.rule} ({pictures.layout})"
+    )
+    for note in pictures.notes:
+        console.line(f"  {note}")
+    if matching.missing:
+        listed = ", ".join(matching.missing[:3]) + (", ..." if len(matching.missing) > 3 else "")
+        console.warn(f"{name}: no picture of {len(matching.missing)} views ({listed})")
+    if matching.left_over:
+        console.line(f"  {len(matching.left_over)} pictures of no judged view left out")
+    for (width, height), count in sorted(method.resized.items()):
+        console.warn(f"{name}: {count} pictures of {width}x{height} pixels resized to their views'")
+    return method
+
+
+def _measure(method: MethodPictures, measurement: Measurement) -> dict[str, Any]:
+    about = method.to_dict()
+    if about["depth"] is None and any(t.surface is not None for t in method.targets):
+        about["depth"] = "none; features are carried by the memory's"
+    return {
+        **about,
+        "rounds": max((target.number for target in method.targets), default=0),
+        "views": len(method.targets),
+        **measurement.of(method.targets),
+    }
+
+
+class _SheetPictures:
+    """The pictures that contact sheets show, kept while the methods come one by one."""
+
+    def __init__(self, targets: Sequence[MeasuredTarget], most: int) -> None:
+        self._targets = [targets[row] for row in evenly(len(targets), most)]
+        self._methods: dict[str, dict[tuple[str, int], NDArray[np.uint8]]] = {}
+
+    def add(self, method: MethodPictures) -> None:
+        """Keep a method's pictures of the shown views."""
+        shown = {(target.picture.name, target.number) for target in self._targets}
+        self._methods[method.name] = {
+            (target.picture.name, target.number): target.picture.rgb
+            for target in method.targets
+            if (target.picture.name, target.number) in shown
+        }
+
+    def views(self) -> list[JudgedView]:
+        """The shown views, each with the methods' pictures."""
+        return [
+            JudgedView(
+                name=target.picture.name,
+                truth=None if target.truth is None else target.truth.rgb,
+                mask=None if target.truth is None else target.truth.mask,
+                never_observed=~target.observed,
+                pictures={
+                    name: pictures.get((target.picture.name, target.number))
+                    for name, pictures in self._methods.items()
+                },
+            )
+            for target in self._targets
+        ]
+
+
+def _write(
+    figures: dict[str, Any], tables: Mapping[str, Table], views: Sequence[JudgedView], *, out: Path
+) -> list[str]:
+    """Write the results; returns the names of the contact sheets."""
+    from PIL import Image
+
+    sheets = []
+    for number, first in enumerate(range(0, len(views), VIEWS_A_SHEET)):
+        sheets.append(f"sheet_{number:03d}.png")
+        picture = Image.fromarray(sheet(views[first : first + VIEWS_A_SHEET]))
+        with replaced_when_written(out / sheets[-1]) as temporary:
+            picture.save(temporary, format="PNG")
+    write_json(out / "judge.json", figures)
+    for name, table in tables.items():
+        write_text(out / ("judge.csv" if name == "means" else f"{name}.csv"), csv_text(table))
+    write_text(out / "judge.md", judge_markdown(figures, tables, sheets))
+    return sheets
