@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import argparse
+import json
+import shlex
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gvtools.errors import OptionError, ProjectError
-from pipelines.commands.arguments import add_rgbd_arguments, rgbd_reading_of
+from gvtools.errors import OptionError, ProjectError, UnposedError
+from pipelines.commands.arguments import add_rgbd_arguments, open_scene, reading_of, rgbd_reading_of
 
 if TYPE_CHECKING:
     from gvtools.capture.project import CaptureReport
     from gvtools.capture.rgbd_project import RgbdCaptureReport
     from gvtools.features import LightGlueMatcher
+    from gvtools.scenes.scene import Scene
     from pipelines.console import Console
 
 SUMMARY = "find the cameras of photographs, a video or an RGB-D recording; write a project"
@@ -26,6 +30,8 @@ EXAMPLES = (
 )
 # The picture of the cameras, in the project.
 PICTURE = "capture.png"
+# Options of photographs and videos.
+PHOTOGRAPHIC = ("frames", "masks", "distance", "features", "weights", "lens")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -75,49 +81,124 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace, console: Console) -> None:
     """Find the cameras and write the project."""
-    from gvtools.capture.project import capture_photographs
+    given = {name: getattr(args, name) for name in PHOTOGRAPHIC if getattr(args, name) is not None}
+    capture(args.input, args.out, console=console, reading=rgbd_reading_of(args), **given)
+
+
+def capture(
+    source: Path, out: Path, *, console: Console, reading: Mapping[str, Any], **options: Any
+) -> None:
+    """Find the cameras of an input without, and write the project.
+
+    Args:
+        source: photographs, a video, or colour and depth.
+        out: a new folder.
+        console: where progress and figures go.
+        reading: what the user said of RGB-D, see ``rgbd_reading_of``.
+        options: what the user said of photographs and videos, by names of PHOTOGRAPHIC.
+    """
     from gvtools.scenes.project import BAG, VIDEOS, is_recording
     from gvtools.scenes.rgbd import count_unposed
 
-    if not args.input.exists():
+    if not source.exists():
         raise ProjectError(
-            f"{args.input}: no such file or folder; expected photographs, a video, or a folder of "
+            f"{source}: no such file or folder; expected photographs, a video, or a folder of "
             "colour and depth"
         )
-    is_bag = args.input.is_file() and args.input.suffix.lower() == BAG
-    if args.input.is_file() and not is_bag and args.input.suffix.lower() not in VIDEOS:
+    is_bag = source.is_file() and source.suffix.lower() == BAG
+    if source.is_file() and not is_bag and source.suffix.lower() not in VIDEOS:
         raise OptionError(
-            f"{args.input}: expected a folder of photographs or of colour and depth, a video "
+            f"{source}: expected a folder of photographs or of colour and depth, a video "
             f"({', '.join(VIDEOS)}), or a RealSense recording ({BAG})"
         )
-    if args.masks is not None and not args.masks.is_dir():
-        raise ProjectError(f"--masks {args.masks}: no such folder")
-    reading = rgbd_reading_of(args)
-    if is_bag or (args.input.is_dir() and count_unposed(args.input)):
-        _run_rgbd(args, reading, console)
-        return
-    if reading:
+    masks = options.get("masks")
+    if masks is not None and not masks.is_dir():
+        raise ProjectError(f"--masks {masks}: no such folder")
+    if is_bag or (source.is_dir() and count_unposed(source)):
+        _capture_rgbd(source, out, console=console, reading=reading, options=options)
+    elif reading:
         raise OptionError(
-            f"{args.input}: no folder of colour and depth; expected none of the options of RGB-D "
+            f"{source}: no folder of colour and depth; expected none of the options of RGB-D "
             f"recordings ({', '.join(reading)})"
         )
-    if args.input.is_dir() and is_recording(args.input):
+    elif source.is_dir() and is_recording(source):
         raise ProjectError(
-            f"{args.input}: has poses and depth already; give it to gvtools reconstruct as it is"
+            f"{source}: has poses and depth already; give it to gvtools reconstruct as it is"
         )
-    report = capture_photographs(
-        args.input, args.out, frames=args.frames, masks=args.masks, distance=args.distance,
-        learned=_learned(args), lens=args.lens or "auto", say=console.line,
-        draw=partial(_draw, title=args.out.name),
-    )  # fmt: skip
-    _print(report, console)
-    console.line(f"{args.out}: gvtools check {args.out}; gvtools reconstruct {args.out} --out RUN")
+    else:
+        from gvtools.capture.project import capture_photographs
+
+        matcher = _matcher(options.pop("features", None), options.pop("weights", None))
+        report = capture_photographs(
+            source, out, learned=matcher, say=console.line, draw=partial(_draw, title=out.name),
+            **options,
+        )  # fmt: skip
+        _print(report, console)
+    console.line(f"{out}: gvtools check {out}; gvtools reconstruct {out} --out RUN")
 
 
-def _learned(args: argparse.Namespace) -> LightGlueMatcher | None:
-    """What finds features, where it is not SIFT."""
-    if args.features in (None, "sift"):
-        if args.weights is not None:
+def open_or_capture(args: argparse.Namespace, console: Console) -> tuple[Scene, dict[str, Any]]:
+    """The scene that ``reconstruct`` is asked for, and how it is read.
+
+    An input without cameras is captured to ``OUT-project`` beside the run's folder where --capture
+    or the user's answer says so. A project that was captured from this input before is used again.
+    """
+    reading = reading_of(args)
+    try:
+        return open_scene(args.project, args), reading
+    except UnposedError as error:
+        unposed = error
+    project = args.out.with_name(f"{args.out.name}-project")
+    of_rgbd = rgbd_reading_of(args)
+    if _is_of(project, args.project):
+        console.line(f"{args.project}: {unposed.found}; captured before: {project}")
+    else:
+        _check_capture(args, project, console=console, unposed=unposed)
+        masks = {} if args.masks is None else {"masks": args.masks}
+        capture(args.project, project, console=console, reading=of_rgbd, **masks)
+    from gvtools.scenes.reading import open_as
+
+    # What the options say of RGB-D is in the captured project.
+    reading = {name: value for name, value in reading.items() if name not in of_rgbd}
+    return open_as(project, reading), reading
+
+
+def _check_capture(
+    args: argparse.Namespace, project: Path, *, console: Console, unposed: UnposedError
+) -> None:
+    """Refuse a capture that nobody asked for, and options that it cannot heed."""
+    source, out = (shlex.quote(str(path)) for path in (args.project, project))
+    command = f"gvtools capture {source} --out {out}"
+    if args.dry_run:
+        raise UnposedError(args.project, unposed.found, f"a run would find them first: {command}")
+    if not args.capture and not console.ask(
+        f"{args.project}: {unposed.found}. Capture now to {project}?"
+    ):
+        raise UnposedError(
+            args.project, unposed.found, f"find the cameras first: {command}; or add --capture"
+        )
+    for name in ("images", "model"):
+        if getattr(args, name) is not None:
+            raise OptionError(
+                f"--{name}: of a COLMAP project; {args.project} has {unposed.found}; leave it out"
+            )
+
+
+def _is_of(project: Path, source: Path) -> bool:
+    """Whether a project was captured from an input."""
+    from gvtools.capture.project import REPORT
+
+    try:
+        report = json.loads((project / REPORT).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(report, dict) and report.get("source") == str(source.resolve())
+
+
+def _matcher(features: str | None, weights: Sequence[Path] | None) -> LightGlueMatcher | None:
+    """None for SIFT."""
+    if features in (None, "sift"):
+        if weights is not None:
             raise OptionError("--weights: of --features aliked or disk; SIFT has none")
         return None
     import torch
@@ -126,33 +207,32 @@ def _learned(args: argparse.Namespace) -> LightGlueMatcher | None:
     from gvtools.features import LightGlueMatcher
 
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    return LightGlueMatcher(
-        args.features, max_features=MAX_FEATURES, weights=args.weights, device=device
-    )
+    return LightGlueMatcher(features, max_features=MAX_FEATURES, weights=weights, device=device)
 
 
-def _run_rgbd(args: argparse.Namespace, reading: dict[str, Any], console: Console) -> None:
+def _capture_rgbd(
+    source: Path, out: Path, *, console: Console, reading: Mapping[str, Any],
+    options: Mapping[str, Any],
+) -> None:  # fmt: skip
     from gvtools.capture.rgbd_project import capture_rgbd
     from gvtools.scenes.project import is_project
     from gvtools.scenes.reading import rgbd_options
 
-    if args.input.is_dir() and is_project(args.input):
+    if source.is_dir() and is_project(source):
         raise ProjectError(
-            f"{args.input}: has poses already; expected a recording without; give it to gvtools "
+            f"{source}: has poses already; expected a recording without; give it to gvtools "
             "reconstruct as it is"
         )
-    for name in ("frames", "masks", "distance", "features", "weights", "lens"):
-        if getattr(args, name) is not None:
-            raise OptionError(
-                f"--{name}: of photographs and videos; {args.input} is an RGB-D recording, of "
-                "which all frames are taken and depth tells the metres"
-            )
+    for name in options:
+        raise OptionError(
+            f"--{name}: of photographs and videos; {source} is an RGB-D recording, of which all "
+            "frames are taken and depth tells the metres"
+        )
     report = capture_rgbd(
-        args.input, args.out, options=rgbd_options(reading), say=console.line,
-        draw=partial(_draw_rgbd, title=args.out.name),
+        source, out, options=rgbd_options(reading), say=console.line,
+        draw=partial(_draw_rgbd, title=out.name),
     )  # fmt: skip
     _print_rgbd(report, console)
-    console.line(f"{args.out}: gvtools check {args.out}; gvtools reconstruct {args.out} --out RUN")
 
 
 def _distance(text: str) -> tuple[str, str, float]:

@@ -117,7 +117,7 @@ def _settings(args: argparse.Namespace) -> list[Settings]:
 
 def run(args: argparse.Namespace, console: Console) -> None:
     """Run ``gvtools reconstruct``."""
-    from pipelines.commands.capture_first import open_or_capture
+    from pipelines.commands.capture import open_or_capture
     from pipelines.reconstruction.run import reconstruct
     from pipelines.report.write import draw_run
     from pipelines.viewing.live import live_viewer

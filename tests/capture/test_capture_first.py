@@ -16,7 +16,7 @@ from gvtools.errors import OptionError, UnposedError
 from gvtools.procedural.room_sample import write_room
 from pipelines.cli import build_parser, main
 from pipelines.commands import capture
-from pipelines.commands.capture_first import open_or_capture
+from pipelines.commands.capture import open_or_capture
 from pipelines.console import Console
 
 pytestmark = pytest.mark.usefixtures("unpainted")
