@@ -7,6 +7,7 @@ import json
 import shutil
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 from command_line import refused
@@ -19,6 +20,8 @@ from pipelines.commands import capture
 from pipelines.commands.capture import open_or_capture
 from pipelines.console import Console
 
+# Source, project and masks of a capture.
+Asked = tuple[Path, Path, Path | None]
 pytestmark = pytest.mark.usefixtures("unpainted")
 
 
@@ -34,17 +37,16 @@ def arguments(*given: object) -> argparse.Namespace:
 
 
 @pytest.fixture
-def captures(room: Path, monkeypatch: pytest.MonkeyPatch) -> list[argparse.Namespace]:
+def captures(room: Path, monkeypatch: pytest.MonkeyPatch) -> list[Asked]:
     """What ``gvtools capture`` was asked for; it gives the room's own cameras here."""
-    asked = []
+    asked: list[Asked] = []
 
-    def run(args: argparse.Namespace, console: Console) -> None:
-        asked.append(args)
-        shutil.copytree(room, args.out)
-        report = {"source": str(args.input.resolve())}
-        (args.out / "capture.json").write_text(json.dumps(report))
+    def stand_in(source: Path, out: Path, **options: Any) -> None:
+        asked.append((source, out, options.get("masks")))
+        shutil.copytree(room, out)
+        (out / "capture.json").write_text(json.dumps({"source": str(source.resolve())}))
 
-    monkeypatch.setattr(capture, "run", run)
+    monkeypatch.setattr(capture, "capture", stand_in)
     return asked
 
 
@@ -86,9 +88,7 @@ def test_without_a_terminal_one_line_gives_the_command(
     )
 
 
-def test_capture_comes_unasked_and_once(
-    room: Path, captures: list[argparse.Namespace], tmp_path: Path
-) -> None:
+def test_capture_comes_unasked_and_once(room: Path, captures: list[Asked], tmp_path: Path) -> None:
     masks = tmp_path / "masks"
     masks.mkdir()
     args = arguments(room / "images", "--out", tmp_path / "run", "--capture", "--masks", masks)
@@ -97,9 +97,7 @@ def test_capture_comes_unasked_and_once(
         assert len(scene) == 8
         assert reading == {"masks": str(masks)}
         assert scene.root == tmp_path / "run-project"
-    assert [(call.input, call.out, call.masks) for call in captures] == [
-        (room / "images", tmp_path / "run-project", masks)
-    ]
+    assert captures == [(room / "images", tmp_path / "run-project", masks)]
     with pytest.raises(OptionError, match="--images: of a COLMAP project"):
         open_or_capture(
             arguments(room / "images", "--out", tmp_path / "b", "--capture", "--images", masks),
@@ -112,7 +110,7 @@ def test_a_user_at_a_terminal_is_asked(
     answer: str,
     calls: int,
     room: Path,
-    captures: list[argparse.Namespace],
+    captures: list[Asked],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
