@@ -70,7 +70,7 @@ def reconstruct(
         GvError: wrong input or settings; nothing of an earlier run is lost.
     """
     from gvtools.runs.run import load_run
-    from gvtools.scenes.reading import open_as
+    from gvtools.scenes.project import open_as
     from gvtools.settings import with_values
     from pipelines.console import Console
     from pipelines.reconstruction.run import reconstruct as run_reconstruct

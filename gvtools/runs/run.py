@@ -111,9 +111,8 @@ class Run:
     @cached_property
     def scenes(self) -> tuple[Scene, Scene | None]:
         """The project, and the scene with the true pictures of the targets, if there is one."""
-        from gvtools.scenes.data_sets.address import is_address
-        from gvtools.scenes.project import open_project
-        from gvtools.scenes.reading import open_recorded
+        from gvtools.scenes.layout import is_address
+        from gvtools.scenes.project import open_project, open_recorded
         from gvtools.scenes.reduced import reduced
 
         max_side = self.settings.get("max_side")

@@ -1,4 +1,4 @@
-"""Many scenes by name, each opened when it is needed: a data set, a folder of shards, a project."""
+"""Collections of scenes by name, each opened when it is needed."""
 
 from __future__ import annotations
 
@@ -13,23 +13,17 @@ from gvtools.scenes.scene import Scene
 
 @dataclass(frozen=True, eq=False)
 class SceneCollection:
-    """Scenes by name; picklable where its reader is.
+    """Scenes by name; picklable where its reader is."""
 
-    Attributes:
-        title: what messages and logs call it.
-        names: the scenes, in order.
-        read: opens the scene of a name; ProjectError where nothing of it can be read.
-        counts: views with depth of each scene; None where only opening a scene tells.
-        digest: changes when what is in it does, as far as that is known without opening scenes.
-        data_set: which data set it is of, as ``load_spec`` takes it; "" for none.
-    """
-
-    title: str
-    names: tuple[str, ...]
+    title: str  # what messages and logs call it
+    names: tuple[str, ...]  # in order
+    # Opens the scene of a name; ProjectError where nothing of it can be read.
     read: Callable[[str], Scene]
+    # Views with depth of each scene; None where only opening a scene tells.
     counts: tuple[int, ...] | None = None
+    # Changes when what is in it does, as far as that is known without opening scenes.
     digest: str = ""
-    data_set: str = ""
+    data_set: str = ""  # which one it is of, as ``load_spec`` takes it; "" for none
 
     def __post_init__(self) -> None:
         if not self.names:

@@ -7,10 +7,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gvtools.scenes.scene import Scene
-
 if TYPE_CHECKING:
     from gvtools.scenes.rgbd import RgbdOptions
+    from gvtools.scenes.scene import Scene
+
+# A scene of a data set as a project is named, beside folders and files.
+SPEC = "spec:"
+FORM = f"{SPEC}NAME:SCENE"
+
+
+def is_address(path: Path | str) -> bool:
+    """Whether it names a scene of a data set rather than a file or folder.
+
+    >>> is_address("spec:7-Scenes:chess/seq-01"), is_address("scans/kitchen")
+    (True, False)
+    """
+    return str(path).startswith(SPEC)
 
 
 @dataclass(frozen=True)

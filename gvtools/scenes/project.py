@@ -1,14 +1,21 @@
-"""What a folder is, found out rather than declared."""
+"""Opening of projects: recognition of folders, and options as plain data that a run records."""
 
 from __future__ import annotations
 
+import difflib
 import shlex
+from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from gvtools.errors import OptionError, ProjectError, UnposedError
+from gvtools.files import digest
+from gvtools.scenes.calibration import load_matrix
+from gvtools.scenes.collection import SceneCollection, of_scenes
 from gvtools.scenes.colmap_files import find_model
-from gvtools.scenes.data_sets.address import FORM, is_address
+from gvtools.scenes.layout import FORM, SPEC, is_address
 from gvtools.scenes.matching import named
 from gvtools.scenes.phones import POLYCAM, SCANNER_APP, STRAY_SCANNER
 from gvtools.scenes.record3d import RECORD3D
@@ -128,8 +135,6 @@ def is_project(folder: Path) -> bool:
 
 
 def _nearest(path: Path) -> str:
-    import difflib
-
     if not path.parent.is_dir():
         return ""
     near = difflib.get_close_matches(path.name, [p.name for p in path.parent.iterdir()], n=1)
@@ -158,3 +163,107 @@ def _unknown(path: Path) -> ProjectError:
 
 def _is_other(entry: Path) -> bool:
     return entry.suffix.lower() not in PICTURES and not entry.name.startswith(".")
+
+
+# --- options and addresses as users and runs have them -----------------------------------------
+
+# Options of a project by name, with the name that RgbdOptions has for those of RGB-D folders.
+READING = {
+    "root": None,
+    "images": None,
+    "masks": None,
+    "model": None,
+    "depth_unit": "depth_unit",
+    "depth_max": "depth_max",
+    "color_intrinsics": "color_K",
+    "depth_intrinsics": "depth_K",
+    "color_from_depth": "color_from_depth",
+    "max_time_difference": "max_time_difference",
+}
+
+
+def open_as(path: Path, reading: Mapping[str, Any]) -> Scene:
+    """The project at ``path``, with options by the names of READING as a run records them.
+
+    Absent and None leave the default. ``resolution``, width and height in pixels, is that of a
+    benchmark: see ``gvtools.scenes.resized``.
+    """
+    folders = {
+        name: None if reading.get(name) is None else Path(reading[name])
+        for name in ("images", "masks", "root")
+    }
+    scene = open_project(path, **folders, rgbd=rgbd_options(reading), model=reading.get("model"))
+    if reading.get("resolution") is None:
+        return scene
+    from gvtools.scenes.resized import resized
+
+    width, height = reading["resolution"]
+    return resized(scene, width, height)
+
+
+def open_recorded(project: str, reading: Mapping[str, Any], *, moved: Path | None = None) -> Scene:
+    """A project as a run recorded it.
+
+    ``moved`` is where it lies now, or where the download of its data set does; None: where it lay.
+    """
+    if moved is None:
+        return open_as(Path(project), reading)
+    if is_address(project) and not is_address(moved):
+        return open_as(Path(project), {**reading, "root": str(moved)})
+    return open_as(moved, reading)
+
+
+def rgbd_options(reading: Mapping[str, Any]) -> RgbdOptions | None:
+    """The options of RGB-D folders; None where there are none."""
+    options = {
+        option: reading[name]
+        for name, option in READING.items()
+        if option is not None and reading.get(name) is not None
+    }
+    if not options:
+        return None
+    if "color_from_depth" in options:
+        path = Path(options["color_from_depth"])
+        try:
+            options["color_from_depth"] = load_matrix(path, (4, 4))
+        except ProjectError as error:
+            raise OptionError(f"--color-from-depth {error}") from None
+    return RgbdOptions(**options)
+
+
+def open_collection(address: str, root: Path | None = None) -> SceneCollection:
+    """The scenes that an address names.
+
+    It is the folder of a project or of shards, "spec:NAME" for all scenes of a data set, or
+    "spec:NAME:SCENE" for one, in the folder ``root`` of its download. A project and a single scene
+    are opened at once; the scenes of shards and of a whole data set when they are needed.
+    """
+    if not address.startswith(SPEC):
+        if root is not None:
+            raise OptionError(
+                f"{address}: a root {root} is given; expected one for spec:NAME alone"
+            )
+        from gvtools.scenes.shards.index import is_shards
+        from gvtools.scenes.shards.reader import open_shards
+
+        path = Path(address)
+        return open_shards(path) if is_shards(path) else of_scenes([open_project(path)])
+    from gvtools.scenes.data_sets.catalogue import load_spec, name_key, open_data_set, scenes_of
+
+    name, colon, scene = address.removeprefix(SPEC).partition(":")
+    spec = load_spec(name)
+    if root is None:
+        raise OptionError(f"{address}: no root; give the folder of the download of {spec.name}")
+    key = name_key(name)
+    if colon:
+        opened = open_data_set(name, scene, root)
+        return replace(of_scenes([opened], title=f"{spec.name} {scene}".strip()), data_set=key)
+    names = scenes_of(name, root)
+    read = partial(_read_scene, key, root=Path(root))
+    return SceneCollection(spec.name, names, read, None, digest(list(names)), key)
+
+
+def _read_scene(data_set: str, scene: str, *, root: Path) -> Scene:
+    from gvtools.scenes.data_sets.catalogue import load_spec, read_scene
+
+    return read_scene(load_spec(data_set), scene, root)

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gvtools.errors import OptionError
-from gvtools.scenes.addresses import open_collection
 from gvtools.scenes.collection import SceneCollection
+from gvtools.scenes.project import open_collection
 from gvtools.training.mixture import ROOMS, OwnOrEstimated, Redrawable, Source
 from gvtools.training.options import SceneSource
 

@@ -28,7 +28,7 @@ from gvtools.runs.folder import RunDirectory
 from gvtools.runs.layout import APPEARANCE, POSES, round_folder
 from gvtools.runs.poses import RunPoses
 from gvtools.runs.run import RunTarget
-from gvtools.scenes.reading import open_recorded
+from gvtools.scenes.project import open_recorded
 from gvtools.settings import dotted, with_values
 from pipelines.blocks.appearance import BlockAppearance, joined
 from pipelines.blocks.completions import BlockCompletions

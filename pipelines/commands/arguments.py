@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from gvtools.errors import OptionError
-from gvtools.scenes.data_sets.address import FORM, is_address
+from gvtools.scenes.layout import FORM, is_address
 
 if TYPE_CHECKING:
     from gvtools.evaluation.lpips_distance import Lpips
@@ -86,21 +86,21 @@ def refuse_root(root: Path | None, paths: Iterable[Path | None]) -> None:
 
 def open_scene(path: Path, args: argparse.Namespace) -> Scene:
     """The project at ``path``, read with the options of ``add_scene_arguments``."""
-    from gvtools.scenes.reading import open_as
+    from gvtools.scenes.project import open_as
 
     return open_as(path, reading_of(args))
 
 
 def reading_of(args: argparse.Namespace) -> dict[str, Any]:
     """The options of ``add_scene_arguments`` that were given, JSON-ready."""
-    from gvtools.scenes.reading import READING
+    from gvtools.scenes.project import READING
 
     return _given(args, READING)
 
 
 def rgbd_reading_of(args: argparse.Namespace) -> dict[str, Any]:
     """The options of ``add_rgbd_arguments`` that were given, JSON-ready."""
-    from gvtools.scenes.reading import READING
+    from gvtools.scenes.project import READING
 
     return _given(args, [name for name, option in READING.items() if option is not None])
 

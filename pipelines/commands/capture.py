@@ -156,7 +156,7 @@ def open_or_capture(args: argparse.Namespace, console: Console) -> tuple[Scene, 
         _check_capture(args, project, console=console, unposed=unposed)
         masks = {} if args.masks is None else {"masks": args.masks}
         capture(args.project, project, console=console, reading=of_rgbd, **masks)
-    from gvtools.scenes.reading import open_as
+    from gvtools.scenes.project import open_as
 
     # What the options say of RGB-D is in the captured project.
     reading = {name: value for name, value in reading.items() if name not in of_rgbd}
@@ -215,8 +215,7 @@ def _capture_rgbd(
     options: Mapping[str, Any],
 ) -> None:  # fmt: skip
     from gvtools.capture.rgbd_project import capture_rgbd
-    from gvtools.scenes.project import is_project
-    from gvtools.scenes.reading import rgbd_options
+    from gvtools.scenes.project import is_project, rgbd_options
 
     if source.is_dir() and is_project(source):
         raise ProjectError(

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from gvtools.scenes.shards.index import Skipped
-    from gvtools.scenes.shards.writer import Progress
+    from gvtools.scenes.shards.writer import WrittenShard
     from pipelines.console import Console
 
 # Of what could not be converted, so many are named; all are in index.json.
@@ -45,8 +45,9 @@ def verify_options(option: Callable[..., object]) -> None:
 
 def shards(args: argparse.Namespace, console: Console) -> None:
     """Convert scenes to shards, or go on where a conversion stopped."""
-    from gvtools.scenes.addresses import SPEC, open_collection
     from gvtools.scenes.data_sets.catalogue import name_key, spec_names
+    from gvtools.scenes.layout import SPEC
+    from gvtools.scenes.project import open_collection
     from gvtools.scenes.shards.writer import MEGABYTE, ShardOptions, write_shards
 
     address = args.scenes_of
@@ -58,12 +59,12 @@ def shards(args: argparse.Namespace, console: Console) -> None:
     if args.scenes:
         collection = collection.subset(args.scenes)
 
-    def said(done: Progress) -> None:
+    def said(done: WrittenShard) -> None:
         shard = done.shard
         at = shard.views[-1].scene + 1
         console.line(
             f"{shard.file}: {len(shard.views)} views, {shard.bytes / MEGABYTE:.1f} MB, up to scene "
-            f"{at} of {done.scenes}{' (complete before)' if done.kept else ''}"
+            f"{at} of {done.scenes}{' (complete before)' if done.before else ''}"
         )
 
     options = ShardOptions(args.size, args.max_side)

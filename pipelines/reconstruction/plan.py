@@ -17,7 +17,7 @@ from gvtools.completers.base import Completer
 from gvtools.errors import OptionError
 from gvtools.runs.identity import array_digest, fingerprint
 from gvtools.runs.poses import RunPoses, posed, with_poses
-from gvtools.scenes.data_sets.address import is_address
+from gvtools.scenes.layout import is_address
 from gvtools.scenes.reduced import reduced
 from gvtools.scenes.scene import Scene, View
 from gvtools.scenes.selection import check_disjoint, select

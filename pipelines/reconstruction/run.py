@@ -33,8 +33,8 @@ from gvtools.runs.layout import (
 )
 from gvtools.runs.run import Run, load_run
 from gvtools.runs.target_files import TargetFiles, read_target
-from gvtools.scenes.data_sets.address import is_address
-from gvtools.scenes.reading import open_recorded
+from gvtools.scenes.layout import is_address
+from gvtools.scenes.project import open_recorded
 from gvtools.settings import dotted, with_values
 from gvtools.untrusted import read_json
 from pipelines.console import Console

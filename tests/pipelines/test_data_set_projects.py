@@ -14,7 +14,7 @@ from tiny_scan import WIDTH, world_from_cam, write_scan
 import gvtools
 from gvtools.errors import OptionError, ProjectError
 from gvtools.runs.run import load_run
-from gvtools.scenes.reading import open_recorded
+from gvtools.scenes.project import open_recorded
 from pipelines.cli import main
 
 pytestmark = pytest.mark.usefixtures("unpainted")

@@ -7,7 +7,7 @@ import pytest
 from scenes_workspace import sevenscenes, workspace
 
 from gvtools.errors import OptionError, ProjectError
-from gvtools.scenes.reading import rgbd_options
+from gvtools.scenes.project import rgbd_options
 from gvtools.scenes.scene import Scene
 from pipelines.commands.arguments import add_scene_arguments, open_scene, reading_of
 

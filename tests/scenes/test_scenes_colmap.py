@@ -9,8 +9,7 @@ from gvtools.errors import ProjectError
 from gvtools.scenes.colmap import read_colmap
 from gvtools.scenes.colmap_depth import write_depth_map
 from gvtools.scenes.inspection import reprojection_errors
-from gvtools.scenes.project import open_project
-from gvtools.scenes.reading import open_as
+from gvtools.scenes.project import open_as, open_project
 
 UNTOUCHED = ("SIMPLE_PINHOLE", "PINHOLE")
 

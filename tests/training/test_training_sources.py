@@ -16,8 +16,8 @@ import torch
 from tiny_scan import write_scan
 
 from gvtools.errors import OptionError, ProjectError
-from gvtools.scenes.addresses import open_collection
 from gvtools.scenes.data_sets.catalogue import load_spec
+from gvtools.scenes.project import open_collection
 from gvtools.scenes.shards.writer import ShardOptions, write_shards
 from gvtools.settings import with_texts
 from gvtools.training.batch import TrainingBatch

@@ -20,8 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from gvtools.errors import OptionError, ProjectError
 from gvtools.scenes.data_sets import aria, captures, hypersim, mvs, reconstructed, synthetic, waymo
-from gvtools.scenes.data_sets.address import FORM, SPEC
-from gvtools.scenes.layout import Layout
+from gvtools.scenes.layout import FORM, SPEC, Layout
 from gvtools.scenes.scene import Origin, Scene
 from gvtools.untrusted import parse_yaml
 

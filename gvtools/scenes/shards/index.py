@@ -1,4 +1,4 @@
-"""What a folder of shards holds: ``index.json`` for all, ``shard-NNNNNN.json`` beside each tar.
+"""Indices of shards: ``index.json`` for all of a folder, ``shard-NNNNNN.json`` beside each tar.
 
 ``index.json`` says which shards hold a scene; only the indices of these are read to open it.
 """
@@ -17,16 +17,15 @@ from gvtools.untrusted import read_bytes, regular
 
 INDEX = "index.json"
 FORMAT, VERSION = "gvtools shards", 1
-# How many shards' indices a process keeps in memory.
-KEPT_INDICES = 64
+KEPT_INDICES = 64  # of shards, in the memory of a process
 _CHUNK = 2**22
 
+# Number of a scene, number of a view in it: where a shard begins, and where the next one does.
 Position = tuple[int, int]
-"""Number of a scene, number of a view in it: where a shard begins, and where the next one does."""
 
 
 class _Record(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+    model_config = ConfigDict(frozen=True, extra="forbid")
 
 
 R = TypeVar("R", bound=_Record)
@@ -35,24 +34,18 @@ R = TypeVar("R", bound=_Record)
 class ViewRecord(_Record):
     """One view of a shard."""
 
-    scene: int
-    """Number of its scene."""
-    view: int
-    """Number of the view in its scene."""
+    scene: int  # number of its scene
+    view: int  # its number in the scene
     name: str
-    """Of the view."""
-    width: int
-    """Pixels."""
+    width: int  # pixels
     height: int
-    """Pixels."""
+    # (3, 3), pixels, the first pixel's centre is (0.5, 0.5).
     K: tuple[tuple[float, float, float], ...]
-    """(3, 3), pixels, the first pixel's centre is (0.5, 0.5)."""
-    cam_from_world: tuple[tuple[float, float, float, float], ...]
-    """(4, 4), scene units."""
+    cam_from_world: tuple[tuple[float, float, float, float], ...]  # (4, 4), scene units
+    # Scene units of a stored value of 1, where depth is a 16-bit picture.
     depth_unit: float | None = None
-    """Scene units of a stored value of 1, where depth is a 16-bit picture."""
+    # By file extension, such as "depth.png": byte offset in the tar, size in bytes, CRC-32.
     members: dict[str, tuple[int, int, int]]
-    """By file extension, such as "depth.png": byte offset in the tar, size in bytes, CRC-32."""
 
     @property
     def has_depth(self) -> bool:
@@ -63,95 +56,63 @@ class ViewRecord(_Record):
 class SceneRecord(_Record):
     """One scene of which a shard holds views."""
 
-    number: int
-    """In the order of conversion."""
-    name: str
-    """Unique."""
-    kind: str
-    """Of the project that it was read from."""
-    metric: bool
-    """Whether scene units are metres."""
+    number: int  # in the order of conversion
+    name: str  # unique
+    kind: str  # of the project that it was read from
+    metric: bool  # whether scene units are metres
 
 
 class Skipped(_Record):
-    """What could not be converted."""
+    """What could not be converted: a view, or with "" for it a whole scene."""
 
     scene: str
-    """Its name."""
     view: str = ""
-    """Name of the view; "" for a whole scene."""
-    reason: str
-    """As its reader says it."""
+    reason: str  # as its reader says it
 
 
 class ShardRecord(_Record):
     """One shard: the index beside its tar."""
 
-    file: str
-    """Name of the tar."""
-    bytes: Annotated[int, Field(ge=0)]
-    """Size of the tar."""
-    sha256: str
-    """Of the tar."""
-    first: Position
-    """Its first view."""
-    next: Position
-    """The first view after it."""
+    file: str  # name of the tar
+    bytes: Annotated[int, Field(ge=0)]  # size of the tar
+    sha256: str  # of the tar
+    first: Position  # its first view
+    next: Position  # the first view after it
     scenes: tuple[SceneRecord, ...]
-    """Scenes of its views."""
-    views: tuple[ViewRecord, ...]
-    """In the order of the tar."""
-    skipped: tuple[Skipped, ...] = ()
-    """Of what lies between ``first`` and ``next``."""
+    views: tuple[ViewRecord, ...]  # in the order of the tar
+    skipped: tuple[Skipped, ...] = ()  # of what lies between ``first`` and ``next``
 
 
 class ListedShard(_Record):
     """A shard as ``index.json`` lists it."""
 
-    file: str
-    """Name of the tar."""
-    samples: int
-    """Views."""
-    bytes: int
-    """Size of the tar."""
-    sha256: str
-    """Of the tar."""
-    index_sha256: str
-    """Of the index beside it."""
+    file: str  # name of the tar
+    samples: int  # views
+    bytes: int  # size of the tar
+    sha256: str  # of the tar
+    index_sha256: str  # of the index beside it
 
 
 class ListedScene(_Record):
     """A scene as ``index.json`` lists it."""
 
-    name: str
-    """Unique."""
+    name: str  # unique
     views: int
-    """All of them."""
-    with_depth: int
-    """Views that have depth."""
-    shards: tuple[int, ...]
-    """Numbers of the shards that hold its views."""
+    with_depth: int  # views that have depth
+    shards: tuple[int, ...]  # numbers of the shards that hold its views
 
 
 class ShardsIndex(_Record):
     """All shards of a folder; written when they are complete."""
 
     format: str = FORMAT
-    """Tells shards from other folders."""
     version: int = VERSION
-    """Of this file."""
-    title: str
-    """Of what was converted."""
-    data_set: str = ""
-    """Its spec, or ""."""
-    max_side: int | None = None
-    """Longest side that pictures were reduced to. [px]"""
-    scenes: tuple[ListedScene, ...]
-    """In the order of conversion."""
+    title: str  # of what was converted
+    data_set: str = ""  # its spec, or ""
+    max_side: int | None = None  # longest side that pictures were reduced to, pixels
+    scenes: tuple[ListedScene, ...]  # in the order of conversion
     shards: tuple[ListedShard, ...]
-    """In order."""
     skipped: tuple[Skipped, ...] = ()
-    """Views and scenes that could not be converted."""
 
 
 def shard_name(number: int) -> str:
@@ -192,10 +153,8 @@ def read_index(folder: Path) -> ShardsIndex:
 def read_shard_index(path: Path, checksum: str) -> ShardRecord:
     """The index beside a shard; the last ones read are cached.
 
-    Args:
-        path: of the file.
-        checksum: as ``index.json`` lists it; part of the cache's key, so that a shard that was
-            converted anew is read again.
+    Its checksum, as ``index.json`` lists it, is part of the cache's key, so that a shard that was
+    converted anew is read again.
     """
     record = read_record(path, ShardRecord)
     if sha256_of(path) != checksum:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -31,26 +30,12 @@ JPEG = {"quality": 95, "subsampling": 0}
 UNITS = (0.001, 0.0002)
 
 
-@dataclass(frozen=True)
-class Members:
-    """A view's files.
+def encoded(
+    view: View, frame: Frame, about: Mapping[str, Any]
+) -> tuple[dict[str, bytes], float | None]:
+    """A view's files by the end of their names, and scene units of a stored one of depth pictures.
 
-    Attributes:
-        files: their contents by the end of their names.
-        depth_unit: scene units of a stored unit of depth, where that is a picture.
-    """
-
-    files: dict[str, bytes]
-    depth_unit: float | None
-
-
-def encoded(view: View, frame: Frame, about: Mapping[str, Any]) -> Members:
-    """A view as files.
-
-    Args:
-        view: whose name, camera and files are used.
-        frame: its pixels.
-        about: what else the camera's file tells.
+    ``about`` is what else the camera's file tells.
     """
     lossy = any(path.suffix.lower() in LOSSY for path in view.files[:1])
     members = {"jpg" if lossy else "png": _picture(frame.rgb, lossy=lossy)}
@@ -74,17 +59,11 @@ def encoded(view: View, frame: Frame, about: Mapping[str, Any]) -> Members:
         **about,
     }
     members[CAMERA] = json.dumps(camera).encode()
-    return Members(members, unit)
+    return members, unit
 
 
 def decoded(members: Mapping[str, bytes], *, depth_unit: float | None, where: str) -> Frame:
-    """The pixels of a view from its files.
-
-    Args:
-        members: by the end of their names.
-        depth_unit: scene units of a stored one, where depth is a picture.
-        where: for messages.
-    """
+    """The pixels of a view from its files, by the end of their names."""
     try:
         picture = next(members[name] for name in PICTURES if name in members)
         rgb = np.array(open_picture(picture).convert("RGB"))

@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -45,12 +44,7 @@ def open_shards(folder: Path) -> SceneCollection:
 
 
 class ShardScenes:
-    """Called with a scene's name, opens that scene of a folder of shards.
-
-    Args:
-        folder: of the shards.
-        index: what its ``index.json`` holds.
-    """
+    """Called with a scene's name, opens that scene of a folder of shards."""
 
     def __init__(self, folder: Path, index: ShardsIndex) -> None:
         self.folder, self.index = folder, index
@@ -66,7 +60,9 @@ class ShardScenes:
         views: list[View] = []
         found = None
         for number in self.index.scenes[self._numbers[name]].shards:
-            listed = self._listed(number)
+            if not 0 <= number < len(self.index.shards):
+                raise ProjectError(f"{self.folder / INDEX}: names shard {number}; {AGAIN}")
+            listed = self.index.shards[number]
             tar = named_file(self.folder, listed.file, where=str(self.folder / INDEX))
             _check_size(tar, listed)
             shard = read_shard_index(tar.with_suffix(".json"), listed.index_sha256)
@@ -78,21 +74,11 @@ class ShardScenes:
             raise ProjectError(f"{self.folder / INDEX}: no shard of {name!r}; {AGAIN}")
         return Scene(self.folder / name, found.kind, tuple(views), metric=found.metric)
 
-    def _listed(self, number: int) -> ListedShard:
-        if not 0 <= number < len(self.index.shards):
-            raise ProjectError(f"{self.folder / INDEX}: names shard {number}; {AGAIN}")
-        return self.index.shards[number]
-
 
 def verify(folder: Path, *, progress: Callable[[str], None] = lambda text: None) -> list[str]:
-    """Compare every shard and its index with their checksums.
+    """A line for each shard that is missing or does not fit its checksums.
 
-    Args:
-        folder: of the shards.
-        progress: is called with each shard's file name before it is read.
-
-    Returns:
-        What is wrong, one line for each damaged or missing shard; empty if nothing is.
+    ``progress`` is called with each shard's file name before it is read.
     """
     problems = []
     for listed in read_index(folder).shards:
@@ -102,7 +88,13 @@ def verify(folder: Path, *, progress: Callable[[str], None] = lambda text: None)
             _check_size(tar, listed)
             index = tar.with_suffix(".json")
             for path, wanted in ((tar, listed.sha256), (index, listed.index_sha256)):
-                _check_sum(path, wanted)
+                if not path.is_file():
+                    raise ProjectError(f"{path}: no such file; {INDEX} lists its shard; {AGAIN}")
+                if (found := sha256_of(path)) != wanted:
+                    raise ProjectError(
+                        f"{path}: damaged: its SHA-256 begins with {found[:12]}, {INDEX} says "
+                        f"{wanted[:12]}; {AGAIN}"
+                    )
         except ProjectError as error:
             problems.append(str(error))
     return problems
@@ -116,17 +108,6 @@ def _check_size(tar: Path, listed: ListedShard) -> None:
         raise ProjectError(f"{tar}: {size} bytes; {INDEX} says {listed.bytes}; {AGAIN}")
 
 
-def _check_sum(path: Path, wanted: str) -> None:
-    if not path.is_file():
-        raise ProjectError(f"{path}: no such file; {INDEX} lists its shard; {AGAIN}")
-    found = sha256_of(path)
-    if found != wanted:
-        raise ProjectError(
-            f"{path}: damaged: its SHA-256 begins with {found[:12]}, {INDEX} says {wanted[:12]}; "
-            f"{AGAIN}"
-        )
-
-
 def _view(tar: Path, record: ViewRecord) -> View:
     camera = Cameras(
         np.array(record.K)[None],
@@ -135,50 +116,29 @@ def _view(tar: Path, record: ViewRecord) -> View:
         np.array([record.height]),
         (record.name,),
     )
-    size = record.width, record.height
-    load = partial(_load, _Place(tar, record.members, record.depth_unit, record.name, size))
-    return View(record.name, camera, load, record.has_depth, (tar,))
+    return View(record.name, camera, partial(_load, tar, record), record.has_depth, (tar,))
 
 
-@dataclass(frozen=True)
-class _Place:
-    """Where a view's files lie in a tar.
-
-    Attributes:
-        tar: the file.
-        members: by file extension, such as "depth.png": offset, size in bytes, CRC-32.
-        depth_unit: scene units of 1 in a 16-bit depth picture; None for other depth.
-        name: of the view, for error messages.
-        size: width and height, pixels.
-    """
-
-    tar: Path
-    members: dict[str, tuple[int, int, int]]
-    depth_unit: float | None
-    name: str
-    size: tuple[int, int]
-
-
-def _load(place: _Place) -> Frame:
-    where = f"{place.tar}, view {place.name}"
+def _load(tar: Path, record: ViewRecord) -> Frame:
+    where, shape = f"{tar}, view {record.name}", (record.height, record.width)
     members = {}
     try:
-        with regular(place.tar).open("rb") as file:
-            for name, (offset, size, checksum) in place.members.items():
+        with regular(tar).open("rb") as file:
+            for name, (offset, size, checksum) in record.members.items():
                 file.seek(offset)
                 content = file.read(size)
                 if len(content) != size or zlib.crc32(content) != checksum:
                     raise ProjectError(
-                        f"{where}: {name} is damaged; gvtools data verify {place.tar.parent} "
-                        f"lists all that is; {AGAIN}"
+                        f"{where}: {name} is damaged; gvtools data verify {tar.parent} lists all "
+                        f"that is; {AGAIN}"
                     )
                 members[name] = content
     except OSError as error:
         raise ProjectError(f"{where}: unreadable ({error.strerror}); {AGAIN}") from None
-    frame = decoded(members, depth_unit=place.depth_unit, where=where)
+    frame = decoded(members, depth_unit=record.depth_unit, where=where)
     shapes = {a.shape[:2] for a in (frame.rgb, frame.depth, frame.mask) if a is not None}
-    if shapes != {place.size[::-1]}:
-        raise ProjectError(f"{where}: pixels {shapes}; expected {place.size[::-1]}; {AGAIN}")
+    if shapes != {shape}:
+        raise ProjectError(f"{where}: pixels {shapes}; expected {shape}; {AGAIN}")
     if frame.depth is not None and not (np.isfinite(frame.depth) & (frame.depth >= 0)).all():
         raise ProjectError(f"{where}: depth that is not finite, or negative; {AGAIN}")
     return frame

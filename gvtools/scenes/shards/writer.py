@@ -6,45 +6,49 @@ the first shard that is absent or does not fit its checksum, and ends with the s
 
 from __future__ import annotations
 
+import io
 import json
+import tarfile
+import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from gvtools.errors import OptionError, ProjectError
-from gvtools.files import make_folder, write_text
+from gvtools.errors import GvError, OptionError, ProjectError
+from gvtools.files import make_folder, replaced_when_written, write_text
 from gvtools.scenes.collection import SceneCollection
-from gvtools.scenes.reduced import check_max_side
+from gvtools.scenes.reduced import check_max_side, reduced
+from gvtools.scenes.scene import Scene, View
 from gvtools.scenes.shards.index import (
     INDEX,
     ListedScene,
     ListedShard,
     Position,
+    SceneRecord,
     ShardRecord,
     ShardsIndex,
+    Skipped,
+    ViewRecord,
     read_index,
     read_record,
     sha256_of,
     shard_name,
 )
-from gvtools.scenes.shards.walk import Walk, write_shard
+from gvtools.scenes.shards.members import encoded
 from gvtools.untrusted import read_json
 
 CONVERSION = "conversion.json"
 MEGABYTE = 10**6
+_BLOCK = 512  # of a tar
 
 
 @dataclass(frozen=True)
 class ShardOptions:
-    """How scenes become shards.
+    """How scenes become shards."""
 
-    Attributes:
-        megabytes: a shard is closed by the view that reaches this size.
-        max_side: pictures are reduced to it, pixels; None keeps every size.
-    """
-
-    megabytes: float = 256
-    max_side: int | None = None
+    megabytes: float = 256  # a shard is closed by the view that reaches this size
+    max_side: int | None = None  # pictures are reduced to it, pixels; None keeps every size
 
     def __post_init__(self) -> None:
         if not self.megabytes > 0:
@@ -53,18 +57,12 @@ class ShardOptions:
 
 
 @dataclass(frozen=True)
-class Progress:
-    """What a conversion tells after each shard.
-
-    Attributes:
-        shard: its record.
-        kept: whether it was complete before.
-        scenes: all that are to be converted.
-    """
+class WrittenShard:
+    """A shard of a conversion, for those who follow it."""
 
     shard: ShardRecord
-    kept: bool
-    scenes: int
+    before: bool  # whether it was complete before
+    scenes: int  # all that are to be converted
 
 
 def write_shards(
@@ -72,33 +70,29 @@ def write_shards(
     out: Path,
     *,
     options: ShardOptions | None = None,
-    progress: Callable[[Progress], None] = lambda done: None,
+    progress: Callable[[WrittenShard], None] = lambda done: None,
 ) -> ShardsIndex:
     """Convert scenes, or go on with a conversion; what cannot be read is left out and listed.
 
-    Args:
-        collection: the scenes.
-        out: the folder of the shards.
-        options: see ShardOptions.
-        progress: is called after each shard.
+    ``progress`` is called after each shard.
     """
     options = options or ShardOptions()
     make_folder(out)
     _settle_description(collection, out, options)
     before = _listed_before(out)
     shards: list[ShardRecord] = []
-    walk = Walk(collection, max_side=options.max_side)
+    views = _Views(collection, max_side=options.max_side)
     while True:
         tar = out / shard_name(len(shards))
-        kept = _kept(tar, walk.position, before.get(tar.name))
-        if kept is not None:
-            walk.go_to(kept.next)
-        shard = kept or write_shard(walk, tar, limit=options.megabytes * MEGABYTE)
+        complete = _complete(tar, views.position, before.get(tar.name))
+        if complete is not None:
+            views.position = complete.next
+        shard = complete or _write_shard(views, tar, limit=options.megabytes * MEGABYTE)
         if shard is None:
             break
         shards.append(shard)
-        progress(Progress(shard, kept is not None, len(collection)))
-    skipped = (*(item for shard in shards for item in shard.skipped), *walk.skipped)
+        progress(WrittenShard(shard, complete is not None, len(collection)))
+    skipped = (*(item for shard in shards for item in shard.skipped), *views.skipped)
     if not shards:
         why = f"; first: {skipped[0].reason}" if skipped else ""
         raise ProjectError(f"{collection.title}: no view could be converted{why}")
@@ -156,7 +150,7 @@ def _listed_before(out: Path) -> dict[str, ListedShard]:
         return {}
 
 
-def _kept(tar: Path, start: Position, listed: ListedShard | None) -> ShardRecord | None:
+def _complete(tar: Path, start: Position, listed: ListedShard | None) -> ShardRecord | None:
     """A shard that is complete, undamaged, and begins where it should."""
     path = tar.with_suffix(".json")
     try:
@@ -202,3 +196,118 @@ def _remove_others(out: Path, count: int) -> None:
         number = path.stem.removeprefix("shard-")
         if number.isdecimal() and int(number) >= count:
             path.unlink()
+
+
+@dataclass(frozen=True, eq=False)
+class _EncodedView:
+    """One view of a scene, as files."""
+
+    number: int  # of its scene
+    place: int  # of the view in its scene
+    name: str  # of the scene
+    scene: Scene
+    view: View
+    files: dict[str, bytes]  # by the end of their names
+    depth_unit: float | None
+
+
+class _Views:
+    """All views of a collection in order, from any position on."""
+
+    def __init__(self, collection: SceneCollection, *, max_side: int | None) -> None:
+        self.collection, self.max_side = collection, max_side
+        self.position: Position = (0, 0)
+        self.skipped: list[Skipped] = []  # what could not be read since the last shard
+        self._opened: tuple[int, Scene] | None = None
+
+    def next(self) -> _EncodedView | None:
+        """The next view that can be read; None at the end."""
+        while self.position[0] < len(self.collection):
+            number, place = self.position
+            name = self.collection.names[number]
+            scene = self._scene(number, name)
+            if scene is None or place >= len(scene):
+                self.position = (number + 1, 0)
+                continue
+            self.position = (number, place + 1)
+            view = scene.views[place]
+            try:
+                files, unit = encoded(view, view.load(), {"scene": name, "metric": scene.metric})
+            except GvError as error:
+                self.skipped.append(Skipped(scene=name, view=view.name, reason=str(error)))
+                continue
+            return _EncodedView(number, place, name, scene, view, files, unit)
+        return None
+
+    def _scene(self, number: int, name: str) -> Scene | None:
+        if self._opened is None or self._opened[0] != number:
+            try:
+                scene = reduced(self.collection.read(name), self.max_side)
+            except GvError as error:
+                self.skipped.append(Skipped(scene=name, reason=str(error)))
+                return None
+            self._opened = (number, scene)
+        return self._opened[1]
+
+
+def _write_shard(views: _Views, tar: Path, *, limit: float) -> ShardRecord | None:
+    """Write one shard, and its index after it; None where no view is left.
+
+    The view that reaches ``limit``, in bytes, is the last.
+    """
+    first = views.position
+    item = views.next()
+    if item is None:
+        return None
+    records: list[ViewRecord] = []
+    scenes: dict[int, SceneRecord] = {}
+    with replaced_when_written(tar) as temporary:
+        with tarfile.open(temporary, "w", format=tarfile.USTAR_FORMAT) as archive:
+            while item is not None:
+                records.append(_added(archive, item))
+                about = {"kind": item.scene.kind, "metric": item.scene.metric}
+                scene = SceneRecord(number=item.number, name=item.name, **about)
+                scenes.setdefault(item.number, scene)
+                item = None if archive.offset >= limit else views.next()
+        size, checksum = temporary.stat().st_size, sha256_of(temporary)
+    record = ShardRecord(
+        file=tar.name,
+        bytes=size,
+        sha256=checksum,
+        first=first,
+        next=views.position,
+        scenes=tuple(scenes.values()),
+        views=tuple(records),
+        skipped=tuple(views.skipped),
+    )
+    views.skipped = []
+    write_text(tar.with_suffix(".json"), record.model_dump_json() + "\n")
+    return record
+
+
+def _added(archive: tarfile.TarFile, item: _EncodedView) -> ViewRecord:
+    """Add a view's files; where each of them lies is part of the record."""
+    places = {}
+    for ending, content in item.files.items():
+        # No date and no owner: equal views are equal bytes. Names of scenes and views may hold
+        # signs that mean something in WebDataset's keys, so that keys are numbers.
+        info = tarfile.TarInfo(f"{item.number:06d}/{item.place:06d}.{ending}")
+        info.size = len(content)
+        archive.addfile(info, io.BytesIO(content))
+        begin = archive.offset - -(-len(content) // _BLOCK) * _BLOCK
+        places[ending] = (begin, len(content), zlib.crc32(content))
+    camera = item.view.camera
+    values: dict[str, Any] = {
+        "K": camera.K[0].tolist(),
+        "cam_from_world": camera.cam_from_world[0].tolist(),
+    }
+    return ViewRecord(
+        scene=item.number,
+        view=item.place,
+        name=item.view.name,
+        width=int(camera.width[0]),
+        height=int(camera.height[0]),
+        depth_unit=item.depth_unit,
+        members=places,
+        **values,
+    )

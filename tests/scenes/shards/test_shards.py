@@ -139,7 +139,7 @@ def test_a_killed_conversion_ends_with_the_same_bytes(whole, tmp_path):
         open_shards(out)
     kept: list[bool] = []
     write_shards(
-        small_collection(), out, options=SMALL, progress=lambda done: kept.append(done.kept)
+        small_collection(), out, options=SMALL, progress=lambda done: kept.append(done.before)
     )
     assert kept[0] and not kept[-1]
     assert contents(out) == contents(whole)
@@ -161,7 +161,7 @@ def test_damage_is_found_named_and_mended(whole, tmp_path):
         scene[record["name"]].load()
     kept: list[bool] = []
     write_shards(
-        small_collection(), out, options=SMALL, progress=lambda done: kept.append(done.kept)
+        small_collection(), out, options=SMALL, progress=lambda done: kept.append(done.before)
     )
     assert kept.count(False) == 1 and not kept[1]
     assert contents(out) == contents(whole)
