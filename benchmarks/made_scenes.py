@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras, invert_rigid
 from gvtools.procedural.builder import Light, ProceduralScene, SceneBuilder
-from gvtools.procedural.clutter import add_clutter
 from gvtools.procedural.furnished_room import furnished_room
-from gvtools.procedural.geometry import BALL, BOX, TUBE
-from gvtools.procedural.photographs import photograph_names
+from gvtools.procedural.layouts import add_clutter
+from gvtools.procedural.ray_cast import BALL, BOX, TUBE
 from gvtools.procedural.room_sample import photographed
 from gvtools.procedural.sample_workspace import SampleContent, write_sample
+from gvtools.procedural.textures import photograph_names
 from gvtools.trajectories import look_at
 
 Float64 = NDArray[np.float64]

@@ -29,7 +29,7 @@ from benchmarks.experiments.rows import (
 )
 from gvtools.completers.base import Completer
 from gvtools.evaluation.tables import Table
-from gvtools.procedural.photographs import photograph_names
+from gvtools.procedural.textures import photograph_names
 
 READS = ("weights", "teacher", "scenes", "size", "seed", "pictures")
 

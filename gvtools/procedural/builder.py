@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gvtools.procedural.geometry import BOX, Geometry
-from gvtools.procedural.shading import Look
+from gvtools.procedural.ray_cast import BOX, Geometry
+from gvtools.procedural.render import Look
 from gvtools.procedural.textures import level_starts, picture, stacked, texture
 
 Float64 = NDArray[np.float64]

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
-from gvtools.procedural.geometry import Geometry, clearance
-from gvtools.procedural.ray_cast import cast
+from gvtools.procedural.ray_cast import Geometry, cast, clearance
 
 Float64 = NDArray[np.float64]
 

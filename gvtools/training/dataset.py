@@ -14,8 +14,8 @@ import numpy as np
 from gvtools.errors import OptionError
 from gvtools.procedural.layouts import scene
 from gvtools.procedural.paths import camera_path
-from gvtools.procedural.photographs import check_split, photograph_names
 from gvtools.procedural.render import developed, radiance
+from gvtools.procedural.textures import check_split, photograph_names
 from gvtools.training.context_choice import ContextChoice
 from gvtools.training.corruption import CorruptionOptions, drawn
 from gvtools.training.hints import Clip

@@ -26,7 +26,7 @@ from gvtools.errors import CheckpointError, OptionError
 from gvtools.files import write_text
 from gvtools.networks.compute import name_of, training_type
 from gvtools.networks.config_json import to_json
-from gvtools.procedural.photographs import photograph_names
+from gvtools.procedural.textures import photograph_names
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.denoiser_stage import DenoiserStage
 from gvtools.training.distributed import Processes, Replicated, models_of

@@ -8,8 +8,13 @@ from scipy.ndimage import maximum_filter, minimum_filter
 
 from gvtools.cameras import Cameras
 from gvtools.errors import OptionError, ProjectError
-from gvtools.procedural.depth_sensor import Surfaces, measured_depth, range_noise
-from gvtools.procedural.noisy_room import jittered, write_noisy_room
+from gvtools.procedural.noisy_room import (
+    SensorView,
+    jittered,
+    measured_depth,
+    range_noise,
+    write_noisy_room,
+)
 from gvtools.procedural.room_sample import RoomSample, write_room
 from gvtools.scenes.inspection import inspect
 from gvtools.scenes.project import open_project
@@ -37,11 +42,11 @@ def twin(tmp_path_factory: pytest.TempPathFactory) -> Scene:
     return open_project(write_room(tmp_path_factory.mktemp("room") / "room", seed=0, **SIZE).folder)
 
 
-def wall(z: float, *, albedo: float = 0.8, glossy: bool = False, size: int = 240) -> Surfaces:
+def wall(z: float, *, albedo: float = 0.8, glossy: bool = False, size: int = 240) -> SensorView:
     """A wall across the view, at one depth."""
     shape = (size, size)
     camera = Cameras.pinhole(size, size, focal=400.0)
-    return Surfaces(
+    return SensorView(
         np.full(shape, z, np.float32),
         np.full(shape, albedo, np.float32),
         np.full(shape, glossy),

@@ -6,12 +6,10 @@ from reference_rays import first_surface, is_free
 
 from gvtools.cameras import Cameras, invert_rigid
 from gvtools.procedural.builder import Light, ProceduralScene, SceneBuilder
-from gvtools.procedural.geometry import BALL, BOX, TUBE, clearance
 from gvtools.procedural.layouts import scene
 from gvtools.procedural.paths import camera_path
-from gvtools.procedural.ray_cast import cast
-from gvtools.procedural.render import developed, radiance
-from gvtools.procedural.shading import Look
+from gvtools.procedural.ray_cast import BALL, BOX, TUBE, cast, clearance
+from gvtools.procedural.render import Look, developed, radiance
 from gvtools.trajectories import look_at
 
 SEEDS = range(8)

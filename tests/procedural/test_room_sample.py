@@ -12,7 +12,7 @@ from scipy.ndimage import map_coordinates
 from gvtools.cameras import Cameras
 from gvtools.errors import OptionError, ProjectError
 from gvtools.procedural.furnished_room import furnished_room
-from gvtools.procedural.geometry import clearance
+from gvtools.procedural.ray_cast import clearance
 from gvtools.procedural.room_sample import RoomSample, write_room
 from gvtools.scenes.colmap import read_colmap
 from gvtools.scenes.scene import Frame, Scene

@@ -4,11 +4,22 @@ import numpy as np
 import pytest
 
 from gvtools.errors import OptionError
-from gvtools.procedural import materials
-from gvtools.procedural.color import decode_srgb, encode_srgb
-from gvtools.procedural.patterns import color, noise, pattern
-from gvtools.procedural.photographs import LONGEST, PHOTOGRAPHS, photograph, photograph_names
-from gvtools.procedural.textures import SIDE, level_starts, picture, stacked, texture
+from gvtools.procedural import furnished_room as materials
+from gvtools.procedural.render import decode_srgb, encode_srgb
+from gvtools.procedural.textures import (
+    LONGEST,
+    PHOTOGRAPHS,
+    SIDE,
+    color,
+    level_starts,
+    noise,
+    pattern,
+    photograph,
+    photograph_names,
+    picture,
+    stacked,
+    texture,
+)
 
 
 def test_splits_share_no_photograph() -> None:

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from gvtools.errors import OptionError, ShapeError
-from gvtools.procedural.photographs import photograph_names
+from gvtools.procedural.textures import photograph_names
 from gvtools.training.context_choice import ContextChoice
 from gvtools.training.corruption import (
     NOTHING,
