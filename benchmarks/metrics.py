@@ -13,7 +13,7 @@ import statistics
 import time
 from pathlib import Path
 
-from gvtools.evaluation.view_figures import view_figures
+from gvtools.evaluation.images import view_figures
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.scenes.project import open_project
 

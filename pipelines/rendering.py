@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from gvtools.appearance.appearance import Appearance, applied
 from gvtools.cameras import Cameras
+from gvtools.evaluation.images import FIGURES, view_figures
 from gvtools.evaluation.lpips_distance import Lpips
-from gvtools.evaluation.view_figures import FIGURES, view_figures
 from gvtools.files import replaced_when_written
 from gvtools.guidance import Guidance
 from gvtools.memory.spatial_memory import SpatialMemory

@@ -30,7 +30,7 @@ DOCTESTED = (
     "gvtools.completers.base",
     "gvtools.errors",
     "gvtools.evaluation.splits",
-    "gvtools.evaluation.picture_matching",
+    "gvtools.evaluation.picture_sets",
     "gvtools.evaluation.trajectories",
     "gvtools.memory.store.byte_sizes",
     "gvtools.memory.tiled_memory",

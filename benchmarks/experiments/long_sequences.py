@@ -20,8 +20,7 @@ from benchmarks.experiments.rows import INPAINT, geoverse
 from gvtools.completers.base import Completer, ContextView
 from gvtools.errors import DegenerateError
 from gvtools.evaluation.images import psnr
-from gvtools.evaluation.pose_probe.located import Located
-from gvtools.evaluation.pose_probe.probe import PoseProbe
+from gvtools.evaluation.pose_probe import Located, PoseProbe
 from gvtools.evaluation.posed_picture import PosedPicture
 from gvtools.evaluation.tables import Column, Table
 from gvtools.memory.spatial_memory import SpatialMemory

@@ -17,19 +17,13 @@ RESAMPLES = 2000
 
 @dataclass(frozen=True)
 class Interval:
-    """A mean and where 95 % of resampled means lie.
+    """A mean and where 95 % of resampled means lie."""
 
-    Attributes:
-        mean: of the values; None without any, infinite when one is, None for both infinities.
-        low: lower end; None for fewer than two values, or infinite ones.
-        high: upper end, likewise.
-        n: how many values; those that are None are left out.
-    """
-
+    # Of the values; None without any, infinite when one is, None for both infinities.
     mean: float | None
-    low: float | None
-    high: float | None
-    n: int
+    low: float | None  # lower end; None for fewer than two values, or infinite ones
+    high: float | None  # upper end, likewise
+    n: int  # how many values; those that are None are left out
 
 
 def mean_interval(values: Iterable[float | None], *, seed: int = 0) -> Interval:

@@ -71,17 +71,11 @@ def alexnet() -> nn.Sequential:
 
 @dataclass(frozen=True)
 class Backbone:
-    """One network that LPIPS is defined on.
+    """One network that LPIPS is defined on."""
 
-    Attributes:
-        build: makes its layers.
-        compared: numbers of the layers whose output is compared.
-        file: the published weights; the name ends with the first digits of the file's SHA-256.
-    """
-
-    build: Callable[[], nn.Sequential]
-    compared: tuple[int, ...]
-    file: str
+    build: Callable[[], nn.Sequential]  # makes its layers
+    compared: tuple[int, ...]  # numbers of the layers whose output is compared
+    file: str  # the published weights; the name ends with the first digits of the file's SHA-256
 
     @property
     def url(self) -> str:
@@ -102,17 +96,11 @@ BACKBONES = {
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """A network with its weights.
+    """A network with its weights."""
 
-    Attributes:
-        layers: the convolutional ones.
-        compared: numbers of those whose output is compared.
-        heads: (1, C, 1, 1) for each of these, what its channels weigh.
-    """
-
-    layers: nn.Sequential
-    compared: tuple[int, ...]
-    heads: Sequence[Tensor]
+    layers: nn.Sequential  # the convolutional ones
+    compared: tuple[int, ...]  # numbers of those whose output is compared
+    heads: Sequence[Tensor]  # (1, C, 1, 1) for each of these, what its channels weigh
 
 
 class Lpips:

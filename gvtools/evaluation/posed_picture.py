@@ -1,33 +1,27 @@
-"""A picture with its camera and, where known, its depth: what metrics between views compare."""
+"""Posed pictures, and the correspondence of their pixels by depth."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.cameras import Cameras
-from gvtools.errors import ShapeError
+from gvtools.cameras import Cameras, Float64, invert_rigid
+from gvtools.errors import OptionError, ShapeError
 
 
 @dataclass(frozen=True, eq=False)
 class PosedPicture:
-    """One view, observed or generated.
+    """One view, observed or generated."""
 
-    Attributes:
-        name: the view's.
-        camera: a batch of one, where the picture is meant to be seen from.
-        rgb: (H, W, 3) uint8.
-        depth: (H, W) float32 z-depth, scene units, 0 = none; None when there is none.
-        mask: (H, W) bool, True = use; None means all.
-    """
-
-    name: str
-    camera: Cameras
-    rgb: NDArray[np.uint8]
+    name: str  # the view's
+    camera: Cameras  # a batch of one, where the picture is meant to be seen from
+    rgb: NDArray[np.uint8]  # (H, W, 3) uint8
+    # (H, W) float32 z-depth, scene units, 0 = none; None when there is none.
     depth: NDArray[np.float32] | None = None
-    mask: NDArray[np.bool_] | None = None
+    mask: NDArray[np.bool_] | None = None  # (H, W) bool, True = use; None means all
 
     def __post_init__(self) -> None:
         size = (int(self.camera.height[0]), int(self.camera.width[0]))
@@ -44,3 +38,149 @@ class PosedPicture:
                 )
         if self.mask is not None and self.mask.dtype != np.bool_:
             raise ShapeError(f"picture {self.name}: mask {self.mask.dtype}; expected bool")
+
+
+class Seen(IntEnum):
+    """What the second view says about a pixel of the first."""
+
+    OUTSIDE = 0  # beside second's picture, or behind its camera
+    UNKNOWN = 1  # second has no depth there, or masks it
+    OCCLUDED = 2  # behind the surface that second sees
+    CONTRADICTING = 3  # in front of it: second looked through the place and saw nothing
+    COVISIBLE = 4  # on it
+
+
+@dataclass(frozen=True, eq=False)
+class Correspondence:
+    """Where N pixels of the first view lie in the second."""
+
+    rows: NDArray[np.int64]  # (N,) int64, of the first view's pixels
+    columns: NDArray[np.int64]  # (N,) int64
+    xy: Float64  # (N, 2) float64, their places in the second view, pixels; NaN where OUTSIDE
+    z: Float64  # (N,) float64, their depth in the second view, scene units
+    depth: Float64  # (N,) float64, second's own depth at these places, scene units; 0 where none
+    # (N, 2) float64, where the first view sees what second's depth puts at these places, pixels of
+    # the first view; NaN where second has no depth, or where that lies behind the first camera.
+    back: Float64
+    seen: NDArray[np.uint8]  # (N,) uint8, values of `Seen`
+
+    @property
+    def start(self) -> Float64:
+        """(N, 2) float64, centres of the first view's pixels, pixels."""
+        return _centers(self.rows, self.columns)
+
+    def count(self, kind: Seen) -> int:
+        """How many pixels are of a kind."""
+        return int(np.count_nonzero(self.seen == kind))
+
+
+def correspond(
+    first: PosedPicture,
+    second: PosedPicture,
+    *,
+    occlusion: float = 0.05,
+    where: NDArray[np.bool_] | None = None,
+) -> Correspondence:
+    """Project first's known pixels into second, compare the depth there, and come back with it.
+
+    Second's depth at a place between its pixels is interpolated bilinearly in 1/depth, which is
+    exact on a plane, wherever the four neighbours are known and lie on one surface: their depths
+    differ by no more than ``occlusion``. Elsewhere it is that of the nearest pixel.
+
+    Args:
+        first: the view whose pixels are reprojected, those with depth inside its mask.
+        second: the view they are reprojected into; its size may differ.
+        occlusion: largest relative depth difference |z / depth - 1| on one surface.
+        where: (H, W) bool, the only pixels of first to follow; None means all.
+    """
+    if not 0 < occlusion < 1:
+        raise OptionError(
+            f"occlusion {occlusion}; expected a relative depth difference between 0 and 1, "
+            "such as 0.05"
+        )
+    wanted, depth = known_depth(first)
+    if where is not None:
+        if where.shape != wanted.shape:
+            raise ShapeError(f"pixels to follow {where.shape}; expected {wanted.shape} like rgb")
+        wanted = wanted & where
+    rows, columns = np.nonzero(wanted)
+    start = _centers(rows, columns)
+    xy, z = _carry(first.camera, second.camera, start, depth=depth[rows, columns])
+    size = np.array([second.camera.width[0], second.camera.height[0]])
+    with np.errstate(invalid="ignore"):
+        inside = (z > 0) & ((xy >= 0) & (xy < size)).all(-1)
+    xy[~inside] = np.nan
+
+    known, second_depth = known_depth(second)
+    there = np.zeros(len(z))
+    there[inside] = _sample(np.where(known, second_depth, 0), xy[inside], spread=occlusion)
+    back = np.full_like(xy, np.nan)
+    found = there > 0
+    back[found], ahead = _carry(second.camera, first.camera, xy[found], depth=there[found])
+    back[found] = np.where(ahead[:, None] > 0, back[found], np.nan)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = z / there
+    seen = np.full(len(z), Seen.COVISIBLE, np.uint8)
+    # What second's depth puts behind the first camera is not what that camera saw, however near.
+    astray = np.isnan(back[:, 0])
+    seen[(ratio > 1 + occlusion) | (astray & (ratio > 1))] = Seen.OCCLUDED
+    seen[(ratio < 1 - occlusion) | (astray & (ratio <= 1))] = Seen.CONTRADICTING
+    seen[~found] = Seen.UNKNOWN
+    seen[~inside] = Seen.OUTSIDE
+    return Correspondence(rows, columns, xy, z, there, back, seen)
+
+
+def known_depth(picture: PosedPicture) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
+    """(H, W) bool, which pixels have a depth to use (finite, above 0, in the mask), and the depth.
+
+    A picture without depth has no such pixel, and depth 0.
+    """
+    depth = picture.depth
+    if depth is None:
+        depth = np.zeros(picture.rgb.shape[:2], np.float32)
+    with np.errstate(invalid="ignore"):
+        known = np.isfinite(depth) & (depth > 0)
+    return known if picture.mask is None else known & picture.mask, depth
+
+
+def _centers(rows: NDArray[np.int64], columns: NDArray[np.int64]) -> Float64:
+    return np.stack([columns, rows], axis=-1).astype(np.float64) + 0.5
+
+
+def _carry(
+    source: Cameras, target: Cameras, xy: Float64, *, depth: NDArray[np.floating]
+) -> tuple[Float64, Float64]:
+    """Lift (N, 2) places of one view by their (N,) depth: their places and depth in another.
+
+    The poses are chained before they meet the points, so that far world origins cost no digits.
+    """
+    move = (target.cam_from_world @ invert_rigid(source.cam_from_world))[0]
+    lift = move[:3, :3] @ np.linalg.inv(source.K[0])
+    points = xy @ lift[:, :2].T + lift[:, 2]
+    points = points * np.asarray(depth, np.float64)[:, None] + move[:3, 3]
+    image = points @ target.K[0].T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return image[:, :2] / image[:, 2:], points[:, 2]
+
+
+def _sample(depth: NDArray[np.float32], xy: Float64, *, spread: float) -> Float64:
+    """Depth (H, W; 0 = none) at (N, 2) places inside the picture; 0 where there is none."""
+    height, width = depth.shape
+    flat = depth.ravel()
+    column, row = xy.astype(np.int64).T
+    out = flat[row * width + column].astype(np.float64)
+
+    corner = np.floor(xy - 0.5).astype(np.int64)
+    whole = np.flatnonzero(((corner >= 0) & (corner < (width - 1, height - 1))).all(-1))
+    left, top = corner[whole].T
+    base = top * width + left
+    four = flat[np.stack([base, base + 1, base + width, base + width + 1])].astype(np.float64)
+    low, high = four.min(0), four.max(0)
+    smooth = (low > 0) & (high <= low * (1 + spread))
+    whole = whole[smooth]
+    x, y = (xy[whole] - 0.5 - corner[whole]).T
+    inverse = 1 / four[:, smooth]
+    upper = inverse[0] * (1 - x) + inverse[1] * x
+    lower = inverse[2] * (1 - x) + inverse[3] * x
+    out[whole] = 1 / (upper * (1 - y) + lower * y)
+    return out

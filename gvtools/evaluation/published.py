@@ -39,120 +39,77 @@ Texts = Annotated[tuple[str, ...], Field(strict=False)]
 
 
 class Figure(SpecRecord):
-    """A measure as the source has it.
+    """A measure as the source has it."""
 
-    Attributes:
-        name: key, such as ``rpe_r``.
-        label: as printed.
-        better: "higher" or "lower".
-        digits: decimals of the published values.
-        definition: what a measurement has to share, by the names of ASPECTS; None where the source
-            does not state it.
-        stated: what the source says.
-        not_stated: what it leaves open.
-        unit: of the values; empty for none, or for one that is not stated.
-    """
-
-    name: str
-    label: str
-    better: Literal["higher", "lower"]
-    digits: int
+    name: str  # key, such as ``rpe_r``
+    label: str  # as printed
+    better: Literal["higher", "lower"]  # "higher" or "lower"
+    digits: int  # decimals of the published values
+    # What a measurement has to share, by the names of ASPECTS; None where the source does not state
+    # it.
     definition: dict[Aspect, str | None]
-    stated: str
-    not_stated: Texts
-    unit: str = ""
+    stated: str  # what the source says
+    not_stated: Texts  # what it leaves open
+    unit: str = ""  # of the values; empty for none, or for one that is not stated
 
 
 class PublishedRow(SpecRecord):
-    """What a source reports of one system.
+    """What a source reports of one system."""
 
-    Attributes:
-        system: its name.
-        figures: by name; None for one that the source does not report.
-        views: number of context views; None where the benchmark has one number alone.
-        source: name of the publication that reports it, in ``Benchmark.sources``.
-        differs: how it departs from the protocol, so that it has no rank; empty where it does not.
-    """
-
-    system: str
-    figures: dict[str, float | None]
+    system: str  # its name
+    figures: dict[str, float | None]  # by name; None for one that the source does not report
+    # Number of context views; None where the benchmark has one number alone.
     views: int | None = None
-    source: str = ""
+    source: str = ""  # name of the publication that reports it, in ``Benchmark.sources``
+    # How it departs from the protocol, so that it has no rank; empty where it does not.
     differs: str = ""
 
 
 class Source(SpecRecord):
-    """Title of the publication, its table, and where that was read.
+    """Title of the publication, its table, and where that was read."""
 
-    Attributes:
-        title: of the publication.
-        table: where in it.
-        read_in: which copy the rows were taken from; empty for the publication itself.
-    """
-
-    title: str
-    table: str
-    read_in: str = ""
+    title: str  # of the publication
+    table: str  # where in it
+    read_in: str = ""  # which copy the rows were taken from; empty for the publication itself
 
 
 class DataSet(SpecRecord):
-    """Citation, role, licence and where to get it, in words.
+    """Citation, role, licence and where to get it, in words."""
 
-    Attributes:
-        cited_as: key of the citation, or authors and year.
-        role: what it serves for.
-        licence: on what terms.
-        obtain: from where.
-        spec: its name in ``data_specs/data_sets``; empty for projects of the user's own.
-    """
-
-    cited_as: str
-    role: str
-    licence: str
-    obtain: str
-    spec: str = ""
+    cited_as: str  # key of the citation, or authors and year
+    role: str  # what it serves for
+    licence: str  # on what terms
+    obtain: str  # from where
+    spec: str = ""  # its name in ``data_specs/data_sets``; empty for projects of the user's own
 
 
 class Benchmark(SpecRecord):
-    """A published table with its protocol.
+    """A published table with its protocol."""
 
-    Attributes:
-        name: of the data set, as printed.
-        resolution: width and height, pixels; None where pictures have several sizes, which then
-            follow from the split's ``divided_by``.
-        views: the numbers of context views that it is run with.
-        context: context views of a round.
-        targets: target views of a round; None for all that a scene's split holds out.
-        rounds: how many rounds.
-        splits: which views are given and completed; each serves some of ``views``.
-        scenes: their names in the data set; empty for all that are there.
-        masks: where object masks may lie below the root: {scene}, and {index}, the view's number
-            from 0 on; empty where whole pictures are compared alone.
-        figures: by name, in the table's order.
-        rows: one a system and number of context views, in the table's order.
-        sources: where rows are published, by the rows' names for it; "" is the only one.
-        data_set: what is measured on.
-        stated: what the source says of the protocol.
-        not_stated: what it leaves open there.
-        notes: what does not fit together in the source.
-    """
-
-    name: str
+    name: str  # of the data set, as printed
+    # Width and height, pixels; None where pictures have several sizes, which then follow from the
+    # split's ``divided_by``.
     resolution: Annotated[tuple[int, int] | None, Field(strict=False)]
+    # The numbers of context views that it is run with.
     views: Annotated[tuple[int, ...], Field(strict=False)]
-    context: int
-    targets: int | None
-    rounds: int
+    context: int  # context views of a round
+    targets: int | None  # target views of a round; None for all that a scene's split holds out
+    rounds: int  # how many rounds
+    # Which views are given and completed; each serves some of ``views``.
     splits: Annotated[tuple[SplitRule, ...], Field(strict=False)]
-    scenes: Texts = ()
+    scenes: Texts = ()  # their names in the data set; empty for all that are there
+    # Where object masks may lie below the root: {scene}, and {index}, the view's number from 0 on;
+    # empty where whole pictures are compared alone.
     masks: Texts = ()
-    figures: dict[str, Figure]
+    figures: dict[str, Figure]  # by name, in the table's order
+    # One a system and number of context views, in the table's order.
     rows: Annotated[tuple[PublishedRow, ...], Field(strict=False)]
+    # Where rows are published, by the rows' names for it; "" is the only one.
     sources: dict[str, Source]
-    data_set: DataSet
-    stated: Texts
-    not_stated: Texts
-    notes: Texts
+    data_set: DataSet  # what is measured on
+    stated: Texts  # what the source says of the protocol
+    not_stated: Texts  # what it leaves open there
+    notes: Texts  # what does not fit together in the source
 
     @property
     def source(self) -> Source:

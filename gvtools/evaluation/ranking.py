@@ -22,47 +22,28 @@ NOTHING_COMPARABLE = "published rows: none that is comparable has a value"
 
 @dataclass(frozen=True, kw_only=True)
 class Setting:
-    """How figures were measured here. None is "not recorded", and agrees with nothing.
+    """How figures were measured here. None is "not recorded", and agrees with nothing."""
 
-    Attributes:
-        data_set: a benchmark's name; None is a scene of the user's own.
-        resolution: width and height, pixels.
-        context: context views of a round; None, here and below, when the runs differ.
-        targets: target views of a round.
-        rounds: how many rounds.
-        scenes: how many scenes the figures are averages over.
-        failed: how many more were to be measured, and have no figures.
-        split: name of the benchmark whose rule chose the views; None is another choice.
-        divided_by: what the recorded width and height were divided by.
-        pixels: which pixels were compared, "all" or a region's name.
-        mask: what object masks were of, where figures were taken within them: "object".
-        ssim: window of SSIM.
-        lpips_net: "vgg" or "alex".
-        poses_from: what estimated the poses of the pictures: "VGGT", "pose probe".
-        pose_unit: of ATE and RPE_t: "data set", or what they are a share of.
-        reprojection: which reprojection error.
-        met3r: "original" for the authors' program, else what stands in for it.
-        hardware: what the time was taken on.
-    """
-
-    data_set: str | None
-    resolution: tuple[int, int] | None
-    context: int | None
-    targets: int | None
-    rounds: int | None = 1
-    scenes: int = 1
-    failed: int = 0
+    data_set: str | None  # a benchmark's name; None is a scene of the user's own
+    resolution: tuple[int, int] | None  # width and height, pixels
+    context: int | None  # context views of a round; None, here and below, when the runs differ
+    targets: int | None  # target views of a round
+    rounds: int | None = 1  # how many rounds
+    scenes: int = 1  # how many scenes the figures are averages over
+    failed: int = 0  # how many more were to be measured, and have no figures
+    # Name of the benchmark whose rule chose the views; None is another choice.
     split: str | None = None
-    divided_by: int | None = None
-    pixels: str = "all"
+    divided_by: int | None = None  # what the recorded width and height were divided by
+    pixels: str = "all"  # which pixels were compared, "all" or a region's name
+    # What object masks were of, where figures were taken within them: "object".
     mask: str | None = None
-    ssim: str | None = "Gaussian 11x11"
-    lpips_net: str | None = None
-    poses_from: str | None = None
-    pose_unit: str | None = None
-    reprojection: str | None = None
-    met3r: str | None = None
-    hardware: str | None = None
+    ssim: str | None = "Gaussian 11x11"  # window of SSIM
+    lpips_net: str | None = None  # "vgg" or "alex"
+    poses_from: str | None = None  # what estimated the poses of the pictures: "VGGT", "pose probe"
+    pose_unit: str | None = None  # of ATE and RPE_t: "data set", or what they are a share of
+    reprojection: str | None = None  # which reprojection error
+    met3r: str | None = None  # "original" for the authors' program, else what stands in for it
+    hardware: str | None = None  # what the time was taken on
 
 
 @dataclass(frozen=True)
@@ -76,21 +57,13 @@ class MeasuredRow:
 
 @dataclass(frozen=True)
 class SideBySideRow:
-    """A system's row of the comparison; everything by the benchmark's names of figures.
+    """A system's row of the comparison; everything by the benchmark's names of figures."""
 
-    Attributes:
-        system: name.
-        origin: PUBLISHED or MEASURED.
-        figures: values; None for none.
-        ranks: 1 is best; None without a rank.
-        reasons: for each figure without a rank, why.
-    """
-
-    system: str
-    origin: str
-    figures: Mapping[str, float | None]
-    ranks: Mapping[str, int | None]
-    reasons: Mapping[str, tuple[str, ...]]
+    system: str  # name
+    origin: str  # PUBLISHED or MEASURED
+    figures: Mapping[str, float | None]  # values; None for none
+    ranks: Mapping[str, int | None]  # 1 is best; None without a rank
+    reasons: Mapping[str, tuple[str, ...]]  # for each figure without a rank, why
 
 
 def reasons_not_to_rank(setting: Setting, benchmark: Benchmark, figure: str) -> tuple[str, ...]:

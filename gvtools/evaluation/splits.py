@@ -1,9 +1,22 @@
-"""Which views of a scene are given and which are completed, by the rule of a benchmark."""
+"""Splits of a scene's views into context and targets, by the rule of a benchmark.
+
+The protocol's rule: a round has two context views and six target views; long sequences have three
+rounds (``data_specs/benchmarks``). The source publishes neither its scenes' views nor how they were
+chosen, so this is a rule of our own, and every split is written beside its scores:
+
+1. A window of context + targets * rounds views, ``stride`` views apart, begins at a view drawn from
+   ``seed`` among all that let it end inside the scene.
+2. One round, to interpolate (layout "ends"): the context is spread evenly over the window, its
+   first and last view included; the views between them are the targets. Several rounds, to
+   extrapolate (layout "first"): the context comes first, the targets follow.
+3. The targets, in the scene's order, are cut into rounds of equal size.
+"""
 
 from __future__ import annotations
 
+import random
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, Literal
 
@@ -11,7 +24,6 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from gvtools.errors import OptionError, ProjectError
-from gvtools.evaluation.protocol import protocol_split
 from gvtools.untrusted import read_json
 
 Numbers = Annotated[tuple[int, ...], Field(strict=False)]
@@ -24,35 +36,28 @@ class SpecRecord(BaseModel):
 
 
 class SplitRule(SpecRecord):
-    """A rule, and where it is cited from.
+    """A rule, and where it is cited from."""
 
-    Attributes:
-        kind: "every": each K-th view is a target, the context is spread evenly over the others.
-            "listed": numbers of views, the first ones of the context. "files": a file beside the
-            scene's pictures. "protocol": ``gvtools.evaluation.protocol``.
-        views: the numbers of context views that it serves; empty for all.
-        every: K of "every".
-        context: of "listed", numbers from 0 on in the scene's order; the first N are given.
-        targets: of "listed".
-        file: of "files", in the scene's folder; {views} stands for the number of context views. It
-            holds ``train_ids`` and ``test_ids``, numbers of the frames of ``transforms.json``.
-        copies: folder of the data set's own reduced pictures, which are read where they are there.
-        divided_by: what the width and height of the recorded pictures are divided by; None leaves
-            them, or takes the benchmark's resolution.
-        stride: of "protocol", views from one of the window to the next; None takes the widest.
-        source: where the rule is from.
-    """
-
+    # "every": each K-th view is a target, the context is spread evenly over the others. "listed":
+    # numbers of views, the first ones of the context. "files": a file beside the scene's pictures.
+    # "protocol": ``gvtools.evaluation.splits``.
     kind: Literal["every", "listed", "files", "protocol"]
-    views: Numbers = ()
-    every: int | None = Field(None, ge=2)
+    views: Numbers = ()  # the numbers of context views that it serves; empty for all
+    every: int | None = Field(None, ge=2)  # K of "every"
+    # Of "listed", numbers from 0 on in the scene's order; the first N are given.
     context: Numbers = ()
-    targets: Numbers = ()
+    targets: Numbers = ()  # of "listed"
+    # Of "files", in the scene's folder; {views} stands for the number of context views. It holds
+    # ``train_ids`` and ``test_ids``, numbers of the frames of ``transforms.json``.
     file: str = ""
+    # Folder of the data set's own reduced pictures, which are read where they are there.
     copies: str = ""
+    # What the width and height of the recorded pictures are divided by; None leaves them, or takes
+    # the benchmark's resolution.
     divided_by: int | None = Field(None, ge=1)
+    # Of "protocol", views from one of the window to the next; None takes the widest.
     stride: int | None = Field(None, ge=1)
-    source: str
+    source: str  # where the rule is from
 
     @model_validator(mode="after")
     def _complete(self) -> SplitRule:
@@ -65,14 +70,10 @@ class SplitRule(SpecRecord):
 
 @dataclass(frozen=True)
 class SceneSplit:
-    """Views of one scene.
+    """Views of one scene."""
 
-    Attributes:
-        context: names of those that are given, in the scene's order.
-        rounds: names of the targets, round by round; one round where their number is open.
-    """
-
-    context: tuple[str, ...]
+    context: tuple[str, ...]  # names of those that are given, in the scene's order
+    # Names of the targets, round by round; one round where their number is open.
     rounds: tuple[tuple[str, ...], ...]
 
     @property
@@ -163,3 +164,82 @@ def _json(path: Path) -> Any:
         return read_json(path)
     except (OSError, ValueError) as error:
         raise ProjectError(f"{path}: unreadable ({error}); expected the released file") from None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Split:
+    """The views of one scene that are given, and those that are completed."""
+
+    context: tuple[str, ...]  # names of the given views, in the scene's order
+    rounds: tuple[tuple[str, ...], ...]  # per round the names of its targets, in the scene's order
+    layout: str  # "ends" or "first"
+    stride: int  # views from one of the window to the next
+    start: int  # index of the window's first view in the scene
+    views: int  # how many views the scene has
+    seed: int  # what ``start`` was drawn from
+
+    @property
+    def targets(self) -> tuple[str, ...]:
+        """The targets of all rounds, in order."""
+        return tuple(name for names in self.rounds for name in names)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data for JSON."""
+        return asdict(self) | {
+            "context": list(self.context),
+            "rounds": [list(names) for names in self.rounds],
+        }
+
+
+def protocol_split(
+    names: Sequence[str],
+    *,
+    context: int = 2,
+    targets: int = 6,
+    rounds: int = 1,
+    stride: int | None = None,
+    seed: int = 0,
+) -> Split:
+    """The split of a scene by the rule above.
+
+    Args:
+        names: of the scene's views, in its order.
+        context: how many views are given.
+        targets: how many views a round completes.
+        rounds: how many rounds.
+        stride: views from one of the window to the next; None is as wide as the scene allows. In
+            a video's many frames that leaves the views little in common; give a number there.
+        seed: draws where the window begins. The same seed takes about the same part of any scene.
+    """
+    counts = {"context": context, "targets": targets, "rounds": rounds, "stride": stride}
+    for what, number in counts.items():
+        if number is not None and number < 1:
+            raise OptionError(f"{what} {number}; expected at least 1")
+    layout = "ends" if rounds == 1 else "first"
+    window = context + targets * rounds
+    if stride is None:
+        stride = max((len(names) - 1) // (window - 1), 1)
+    places = len(names) - (window - 1) * stride
+    if places < 1:
+        raise OptionError(
+            f"{len(names)} views; expected at least {(window - 1) * stride + 1} for {context} "
+            f"context and {rounds} x {targets} target views, {stride} apart; take a smaller "
+            "stride, fewer rounds or fewer targets"
+        )
+    # Python promises this draw to be the same in every version, as NumPy does not.
+    start = int(random.Random(seed).random() * places)
+    chosen = [names[start + i * stride] for i in range(window)]
+    if layout == "first" or context == 1:
+        given = list(range(context))
+    else:
+        given = [i * (window - 1) // (context - 1) for i in range(context)]
+    left = [name for i, name in enumerate(chosen) if i not in given]
+    return Split(
+        context=tuple(chosen[i] for i in given),
+        rounds=tuple(tuple(left[r * targets : (r + 1) * targets]) for r in range(rounds)),
+        layout=layout,
+        stride=stride,
+        start=start,
+        views=len(names),
+        seed=seed,
+    )

@@ -24,19 +24,12 @@ SIGNIFICANT = 4
 
 @dataclass(frozen=True)
 class Column:
-    """A column's heading, and how its numbers are printed.
+    """A column's heading, and how its numbers are printed."""
 
-    Attributes:
-        title: the heading.
-        unit: in brackets behind it; empty for none.
-        better: "higher" or "lower"; None for neither, and for texts.
-        digits: decimals; None prints four significant digits.
-    """
-
-    title: str
-    unit: str = ""
-    better: str | None = None
-    digits: int | None = None
+    title: str  # the heading
+    unit: str = ""  # in brackets behind it; empty for none
+    better: str | None = None  # "higher" or "lower"; None for neither, and for texts
+    digits: int | None = None  # decimals; None prints four significant digits
 
     @property
     def heading(self) -> str:

@@ -1,4 +1,4 @@
-"""Pose errors between an estimated trajectory and its reference: ATE, RPE, and pose AUC.
+"""Pose errors of an estimated trajectory: association with its reference, ATE, RPE, pose AUC.
 
 ATE and RPE follow J. Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS
 2012, with the conventions of evo: the estimate is aligned to the reference by its camera centres;
@@ -9,8 +9,10 @@ number.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from pathlib import PurePosixPath
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -32,25 +34,15 @@ STILL = 1e-12
 
 @dataclass(frozen=True)
 class Statistics:
-    """What a set of errors sums up to; the unit is that of the errors.
+    """What a set of errors sums up to; the unit is that of the errors."""
 
-    Attributes:
-        rmse: root of the mean square.
-        mean: mean.
-        median: median.
-        std: standard deviation of the population.
-        min: smallest.
-        max: largest.
-        n: how many.
-    """
-
-    rmse: float
+    rmse: float  # root of the mean square
     mean: float
     median: float
-    std: float
-    min: float
-    max: float
-    n: int
+    std: float  # standard deviation of the population
+    min: float  # smallest
+    max: float  # largest
+    n: int  # how many
 
     @staticmethod
     def of(errors: ArrayLike) -> Statistics | None:
@@ -71,28 +63,19 @@ class Statistics:
 
 @dataclass(frozen=True, eq=False)
 class PoseErrors:
-    """Errors of an estimated trajectory.
+    """Errors of an estimated trajectory."""
 
-    Attributes:
-        status: "aligned", "not aligned" (none was asked for), or "degenerate: ..." with the
-            reason; then every figure is None.
-        translation: scene units of the reference.
-        translation_share: the same, divided by ``extent``; None also when the extent is 0.
-        rotation_deg: degrees.
-        scale: reference units per unit of the estimate; 1 when it was not fitted.
-        extent: twice the largest distance of a reference centre from their mean, scene units.
-        translation_errors: (N,) float64 of each pose or pair; empty without figures.
-        rotation_errors_deg: (N,) float64, likewise.
-    """
-
+    # "aligned", "not aligned" (none was asked for), or "degenerate: ..." with the reason; then
+    # every figure is None.
     status: str
-    translation: Statistics | None
+    translation: Statistics | None  # scene units of the reference
+    # The same, divided by ``extent``; None also when the extent is 0.
     translation_share: Statistics | None
-    rotation_deg: Statistics | None
-    scale: float | None
-    extent: float
-    translation_errors: Float64
-    rotation_errors_deg: Float64
+    rotation_deg: Statistics | None  # degrees
+    scale: float | None  # reference units per unit of the estimate; 1 when it was not fitted
+    extent: float  # twice the largest distance of a reference centre from their mean, scene units
+    translation_errors: Float64  # (N,) float64 of each pose or pair; empty without figures
+    rotation_errors_deg: Float64  # (N,) float64, likewise
 
     @property
     def ok(self) -> bool:
@@ -202,22 +185,16 @@ class PoseAuc:
 
     An error of a pair is the larger of two angles: between the relative rotations, and between the
     directions of the relative translations.
-
-    Attributes:
-        status: "measured", or "degenerate: ..." with the reason; then the figures are None.
-        auc: by threshold in degrees, the area under the share of pairs below the error, in [0, 1].
-        pairs: how many.
-        median_rotation_deg: median angle between relative rotations.
-        median_direction_deg: median angle between directions of translation.
-        still: pairs whose reference centres coincide, up to rounding: they have no direction, and
-            count by their rotation alone.
     """
 
-    status: str
+    status: str  # "measured", or "degenerate: ..." with the reason; then the figures are None
+    # By threshold in degrees, the area under the share of pairs below the error, in [0, 1].
     auc: dict[float, float | None]
-    pairs: int
-    median_rotation_deg: float | None
-    median_direction_deg: float | None
+    pairs: int  # how many
+    median_rotation_deg: float | None  # median angle between relative rotations
+    median_direction_deg: float | None  # median angle between directions of translation
+    # Pairs whose reference centres coincide, up to rounding: they have no direction, and count by
+    # their rotation alone.
     still: int
 
 
@@ -365,3 +342,90 @@ def _figures(
 def _none(status: str, extent: float) -> PoseErrors:
     empty = np.zeros(0)
     return PoseErrors(status, None, None, None, None, extent, empty, empty)
+
+
+Rows = NDArray[np.int64]
+
+# Time stamps of one event, recorded by two clocks, may differ by this, seconds.
+MAX_DIFFERENCE = 0.01
+
+
+def by_time(
+    reference: ArrayLike,
+    estimate: ArrayLike,
+    *,
+    max_difference: float = MAX_DIFFERENCE,
+    offset: float = 0.0,
+) -> tuple[Rows, Rows]:
+    """Pairs of nearest time stamps, as evo associates TUM and EuRoC trajectories.
+
+    Each pose of the shorter trajectory takes the nearest of the longer one.
+
+    Args:
+        reference: (N,) seconds, in any order.
+        estimate: (M,) seconds.
+        max_difference: seconds; farther pairs are none.
+        offset: seconds, added to the estimate's stamps.
+
+    Returns:
+        Rows of the reference and of the estimate, (K,) each, in the order of the shorter one.
+    """
+    first, second = np.asarray(reference, np.float64), np.asarray(estimate, np.float64) + offset
+    for name, stamps in (("reference", first), ("estimate", second)):
+        if stamps.ndim != 1 or not np.isfinite(stamps).all():
+            raise ShapeError(f"{name} stamps {stamps.shape}; expected (N,) finite seconds")
+    if not (first.size and second.size):
+        raise DegenerateError("association by time: a trajectory without poses")
+    swapped = len(second) < len(first)
+    short, long = (second, first) if swapped else (first, second)
+    order = np.argsort(long, kind="stable")
+    right = np.clip(np.searchsorted(long[order], short), 1, max(len(long) - 1, 1))
+    left = right - 1
+    right = np.minimum(right, len(long) - 1)
+    nearer = np.abs(long[order[left]] - short) <= np.abs(long[order[right]] - short)
+    match = order[np.where(nearer, left, right)]
+    kept = np.flatnonzero(np.abs(long[match] - short) <= max_difference)
+    if not len(kept):
+        gap = np.abs(long[match] - short).min()
+        raise DegenerateError(
+            f"association by time: no pair within {max_difference:g} s, the nearest are {gap:.3g} "
+            "s apart; give a greater largest difference, or an offset"
+        )
+    return (match[kept], kept) if swapped else (kept, match[kept])
+
+
+def by_name(reference: Sequence[str], estimate: Sequence[str]) -> tuple[Rows, Rows]:
+    """Pairs of equal names; where no name is equal, of equal file names without folder and suffix.
+
+    Returns:
+        Rows of the reference and of the estimate, in the reference's order.
+    """
+    for form in (str, lambda name: PurePosixPath(name.replace("\\", "/")).stem.split(".")[0]):
+        first, second = [form(name) for name in reference], [form(name) for name in estimate]
+        row = {name: i for i, name in enumerate(second)}
+        pairs = [(i, row[name]) for i, name in enumerate(first) if name in row]
+        if not pairs:
+            continue
+        if len(row) < len(second) or len(set(first)) < len(first):
+            raise DegenerateError("association by name: a name occurs twice in one trajectory")
+        rows = np.array(pairs, np.int64)
+        return rows[:, 0], rows[:, 1]
+    raise DegenerateError(
+        f"association by name: none of {len(reference)} and {len(estimate)} names is equal (such "
+        f"as {next(iter(reference), '')!r} and {next(iter(estimate), '')!r})"
+    )
+
+
+def by_index(reference: int, estimate: int) -> tuple[Rows, Rows]:
+    """Row by row.
+
+    Args:
+        reference: number of its poses.
+        estimate: likewise.
+    """
+    if reference != estimate or not reference:
+        raise DegenerateError(
+            f"association by index: {reference} and {estimate} poses; expected as many"
+        )
+    rows = np.arange(reference)
+    return rows, rows

@@ -85,7 +85,7 @@ def associate(
         max_difference: seconds, of an association by time.
         offset: seconds, added to the estimate's times.
     """
-    from gvtools.evaluation.association import by_index, by_name, by_time
+    from gvtools.evaluation.trajectories import by_index, by_name, by_time
 
     if how not in ASSOCIATIONS:
         raise OptionError(f"association {how!r}; expected one of {', '.join(ASSOCIATIONS)}")

@@ -10,7 +10,7 @@ import numpy as np
 
 from gvtools.cameras import rigid_transform
 from gvtools.errors import GvError, printable
-from gvtools.evaluation.view_figures import FIGURES
+from gvtools.evaluation.images import FIGURES
 from gvtools.runs.layout import METRICS
 from gvtools.untrusted import read_json
 from pipelines.report.nested import nested

@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gvtools.errors import OptionError, ProjectError
+from gvtools.evaluation.images import FIGURES
 from gvtools.evaluation.intervals import LEVEL, RESAMPLES, mean_interval
-from gvtools.evaluation.protocol import protocol_split
 from gvtools.evaluation.published import Benchmark, benchmark_names, load_benchmark
 from gvtools.evaluation.ranking import Setting, comparison_table, side_by_side
-from gvtools.evaluation.view_figures import FIGURES
+from gvtools.evaluation.splits import protocol_split
 from gvtools.files import write_json
 from gvtools.runs.identity import versions
 from gvtools.runs.layout import RECORD

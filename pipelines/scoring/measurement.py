@@ -16,14 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.errors import DegenerateError
+from gvtools.evaluation.images import FIGURES, view_figures
 from gvtools.evaluation.intervals import mean_interval
 from gvtools.evaluation.posed_picture import PosedPicture
-from gvtools.evaluation.view_figures import FIGURES, view_figures
 
 if TYPE_CHECKING:
     from gvtools.evaluation.lpips_distance import Lpips
-    from gvtools.evaluation.pose_probe.located import Located
-    from gvtools.evaluation.pose_probe.probe import PoseProbe
+    from gvtools.evaluation.pose_probe import Located, PoseProbe
     from gvtools.evaluation.trajectories import PoseAuc, PoseErrors, Statistics
     from gvtools.features import FeatureMatcher
     from gvtools.memory.spatial_memory import SpatialMemory
@@ -215,9 +214,9 @@ class Measurement:
 
         ``surfaces`` are the same with the depth by which features are carried.
         """
-        from gvtools.evaluation.consistency.depth_reprojection import depth_reprojection_of_views
-        from gvtools.evaluation.consistency.feature_consistency import feature_consistency
-        from gvtools.evaluation.consistency.geometric_verification import verify_geometry
+        from gvtools.evaluation.depth_reprojection import depth_reprojection_of_views
+        from gvtools.evaluation.feature_consistency import feature_consistency
+        from gvtools.evaluation.geometric_verification import verify_geometry
 
         depth = asdict(depth_reprojection_of_views(pictures))
         pairs = self.console.track(list(pairwise(surfaces)), f"{label}: pairs")
@@ -254,7 +253,7 @@ class Measurement:
     @cached_property
     def _probe(self) -> PoseProbe | str:
         """The probe, or why there is none."""
-        from gvtools.evaluation.pose_probe.probe import PoseProbe
+        from gvtools.evaluation.pose_probe import PoseProbe
 
         try:
             return PoseProbe(self._context, matcher=self.matcher, seed=self.seed)
@@ -296,7 +295,7 @@ def evenly(count: int, most: int) -> list[int]:
 
 
 def _met3r(pictures: Sequence[PosedPicture], seed: int) -> dict[str, Any]:
-    from gvtools.evaluation.consistency.feature_consistency import load_met3r, met3r_score
+    from gvtools.evaluation.feature_consistency import load_met3r, met3r_score
 
     metric, status = load_met3r()
     scores = []
@@ -344,7 +343,7 @@ def _probed_figures(
     located: Sequence[Located], pictures: Sequence[PosedPicture] | None
 ) -> dict[str, Any]:
     """The probe's summary, and where the pictures' own poses are given, ATE, RPE and AUC."""
-    from gvtools.evaluation.pose_probe.located import summarise
+    from gvtools.evaluation.pose_probe import summarise
     from gvtools.evaluation.trajectories import (
         AUC_THRESHOLDS,
         absolute_errors,

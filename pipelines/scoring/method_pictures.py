@@ -16,9 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.errors import OptionError, ProjectError
-from gvtools.evaluation.picture_matching import Matching, match_pictures
-from gvtools.evaluation.picture_sets.open_pictures import open_pictures
-from gvtools.evaluation.picture_sets.pictures import Picture, PictureSet
+from gvtools.evaluation.picture_sets import (
+    Matching,
+    Picture,
+    PictureSet,
+    match_pictures,
+    open_pictures,
+)
 from gvtools.evaluation.posed_picture import PosedPicture
 from gvtools.runs.layout import RECORD
 from gvtools.runs.memory_file import load_memory

@@ -8,10 +8,10 @@ from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from gvtools.evaluation.images import FIGURES
 from gvtools.evaluation.intervals import mean_interval
 from gvtools.evaluation.ranking import MeasuredRow, Setting
 from gvtools.evaluation.tables import Cell, Column, Table, Value, markdown, render
-from gvtools.evaluation.view_figures import FIGURES
 from gvtools.files import write_text
 from pipelines.report.nested import nested
 from pipelines.scoring.measurement import JUDGED

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from gvtools.errors import OptionError
-from gvtools.evaluation.picture_matching import match_pictures
+from gvtools.evaluation.picture_sets import match_pictures
 
 VIEWS = tuple(f"frame-{i:06d}.color.jpg" for i in (10, 30, 50))
 

@@ -10,8 +10,7 @@ import pytest
 from PIL import Image
 
 from gvtools.errors import ProjectError
-from gvtools.evaluation.picture_sets.open_pictures import open_pictures
-from gvtools.evaluation.picture_sets.pictures import Picture
+from gvtools.evaluation.picture_sets import Picture, open_pictures
 
 NAMES = ("cam/2.jpg", "cam/10.jpg", "cam/30.jpg")
 

@@ -10,10 +10,12 @@ from scipy.spatial.transform import Rotation
 from walks import disturbed, line, moved, path
 
 from gvtools.errors import DegenerateError, OptionError, ShapeError
-from gvtools.evaluation.association import by_index, by_name, by_time
 from gvtools.evaluation.trajectories import (
     absolute_errors,
     area_under_recall,
+    by_index,
+    by_name,
+    by_time,
     pose_auc,
     relative_errors,
 )

@@ -17,9 +17,14 @@ from walls import (
 )
 
 from gvtools.errors import ShapeError
-from gvtools.evaluation.pose_probe import Located, summarise
-from gvtools.evaluation.pose_probe.absolute_pose import absolute_pose, angle_deg, center_distance
-from gvtools.evaluation.pose_probe.lifting import lift_keypoints
+from gvtools.evaluation.pose_probe import (
+    Located,
+    absolute_pose,
+    angle_deg,
+    center_distance,
+    lift_keypoints,
+    summarise,
+)
 from gvtools.evaluation.posed_picture import PosedPicture
 from gvtools.features import Features, SiftMatcher, mutual_nearest
 

@@ -8,7 +8,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from gvtools.errors import OptionError
-from gvtools.evaluation.protocol import protocol_split
+from gvtools.evaluation.splits import protocol_split
 from gvtools.scenes.selection import select
 
 NAMES = tuple(f"frame-{i:06d}" for i in range(100))

@@ -6,10 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gvtools.cameras import Cameras
-from gvtools.evaluation.consistency.depth_reprojection import (
+from gvtools.evaluation.depth_reprojection import (
     depth_reprojection,
 )
-from gvtools.evaluation.consistency.feature_consistency import feature_consistency
+from gvtools.evaluation.feature_consistency import feature_consistency
 from gvtools.evaluation.posed_picture import PosedPicture
 
 pytestmark = pytest.mark.filterwarnings("error")

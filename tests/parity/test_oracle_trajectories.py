@@ -9,8 +9,13 @@ import numpy as np
 import pytest
 from oracle import ABSENT, ORACLE, arrays, expected_values
 
-from gvtools.evaluation.association import by_index, by_time
-from gvtools.evaluation.trajectories import Statistics, absolute_errors, relative_errors
+from gvtools.evaluation.trajectories import (
+    Statistics,
+    absolute_errors,
+    by_index,
+    by_time,
+    relative_errors,
+)
 from gvtools.trajectory_files import read_poses
 
 RELATIVE = 1e-6

@@ -9,12 +9,11 @@ import pytest
 from consistency_scene import HALF, SLANT, SQUARE, WALL, camera, moved, picture
 
 from gvtools.errors import OptionError, ShapeError
-from gvtools.evaluation.consistency.correspondence import Seen, correspond
-from gvtools.evaluation.consistency.depth_reprojection import (
+from gvtools.evaluation.depth_reprojection import (
     depth_reprojection,
     depth_reprojection_of_views,
 )
-from gvtools.evaluation.posed_picture import PosedPicture
+from gvtools.evaluation.posed_picture import PosedPicture, Seen, correspond
 from gvtools.scenes.project import open_project
 
 FIGURES = (

@@ -13,8 +13,8 @@ import torch
 from consistency_scene import blurred, camera, moved, noisy, picture
 
 from gvtools.errors import OptionError, ShapeError
-from gvtools.evaluation.consistency.dense_gradient import DenseGradient
-from gvtools.evaluation.consistency.feature_consistency import (
+from gvtools.evaluation.feature_consistency import (
+    DenseGradient,
     feature_consistency,
     load_met3r,
     met3r_score,

@@ -10,7 +10,7 @@ from consistency_scene import HALF, SLANT, SQUARE, WALL, blurred, camera, moved,
 
 from gvtools.cameras import Cameras
 from gvtools.errors import ProjectError, ShapeError
-from gvtools.evaluation.consistency.geometric_verification import (
+from gvtools.evaluation.geometric_verification import (
     GeometricVerification,
     epipolar_distances,
     verify_geometry,

@@ -10,8 +10,7 @@ import pytest
 from command_line import refused
 from tiny_scan import write_scan
 
-from gvtools.evaluation.images import psnr
-from gvtools.evaluation.view_figures import FIGURES
+from gvtools.evaluation.images import FIGURES, psnr
 from gvtools.runs.run import load_run
 from gvtools.scenes.project import open_project
 from pipelines.cli import main

@@ -20,14 +20,93 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
+from scipy.ndimage import gaussian_filter
 
 from gvtools.cameras import Float64
 from gvtools.errors import ShapeError
-from gvtools.evaluation.consistency.correspondence import Seen, correspond
-from gvtools.evaluation.consistency.dense_gradient import DenseGradient
-from gvtools.evaluation.posed_picture import PosedPicture
+from gvtools.evaluation.posed_picture import PosedPicture, Seen, correspond
 
 Float32 = NDArray[np.float32]
+
+CELL = 4  # pixels
+ORIENTATIONS = 8
+REACH = 2  # cells between the middles of neighbouring histograms
+SMOOTHING = 1.0  # pixels before the gradient, and cells after the histogram
+# Descriptor length, in luminance (0 to 1) per pixel, at which structure weighs as much as noise:
+# below it the gradients fade instead of being blown up to full length.
+NOISE = 0.02
+COLOR_WEIGHT = 1.0
+# A constant component: two places without any structure are alike.
+FLATNESS = 0.3
+
+
+class DenseGradient:
+    """The feature network that needs no weights; see the module's text."""
+
+    name = "dense-gradient"
+
+    def features(self, rgb: NDArray[np.uint8]) -> Float32:
+        """Features of a picture.
+
+        Args:
+            rgb: (H, W, 3) uint8.
+
+        Returns:
+            (76, ceil(H / 4), ceil(W / 4)) float32: 9 x 8 gradient components whose common length is
+            at most 1 and whose mean is 0; luminance about mid-grey, red-green and yellow-blue; and
+            the constant.
+        """
+        height, width = rgb.shape[:2]
+        shape = -(-height // CELL), -(-width // CELL)
+        image = gaussian_filter(rgb.astype(np.float32) / 255, (SMOOTHING, SMOOTHING, 0))
+        cells = _means(_oriented_gradients(image.mean(-1)), shape)
+        layout = _neighbours(gaussian_filter(cells, (0, SMOOTHING, SMOOTHING)))
+        layout -= layout.mean(0)
+        layout /= np.sqrt((layout**2).sum(0) + NOISE**2)
+        red, green, blue = gaussian_filter(
+            _means(np.moveaxis(image, -1, 0), shape), (0, SMOOTHING, SMOOTHING)
+        )
+        color = COLOR_WEIGHT * np.stack(
+            [(red + green + blue) / 3 - 0.5, red - green, (red + green) / 2 - blue]
+        )
+        constant = np.full((1, *shape), FLATNESS)
+        return np.concatenate([layout, color, constant]).astype(np.float32)
+
+
+def _oriented_gradients(luminance: Float32) -> Float32:
+    """(8, H, W): gradient length, shared linearly between the two nearest signed orientations."""
+    along_y, along_x = (
+        np.gradient(luminance, axis=axis) if luminance.shape[axis] > 1 else np.zeros_like(luminance)
+        for axis in (0, 1)
+    )
+    length = np.hypot(along_x, along_y)
+    turn = np.arctan2(along_y, along_x) * (ORIENTATIONS / (2 * np.pi)) % ORIENTATIONS
+    out = np.zeros((ORIENTATIONS, *luminance.shape), np.float32)
+    for orientation in range(ORIENTATIONS):
+        gap = np.abs(turn - orientation)
+        out[orientation] = length * np.clip(1 - np.minimum(gap, ORIENTATIONS - gap), 0, None)
+    return out
+
+
+def _means(channels: Float32, shape: tuple[int, int]) -> Float32:
+    """(C, H, W) averaged over a grid of h x w cells that covers it evenly."""
+    height, width = channels.shape[1:]
+    top = np.arange(shape[0]) * height // shape[0]
+    left = np.arange(shape[1]) * width // shape[1]
+    total = np.add.reduceat(np.add.reduceat(channels, top, axis=1), left, axis=2)
+    area = np.diff(np.append(top, height))[:, None] * np.diff(np.append(left, width))
+    return (total / area).astype(np.float32)
+
+
+def _neighbours(cells: Float32) -> Float32:
+    """(C, h, w) to (9 C, h, w): each cell with those ``REACH`` cells away, edges repeated."""
+    height, width = cells.shape[1:]
+    padded = np.pad(cells, ((0, 0), (REACH, REACH), (REACH, REACH)), mode="edge")
+    steps = (0, REACH, 2 * REACH)
+    return np.concatenate(
+        [padded[:, dy : dy + height, dx : dx + width] for dy in steps for dx in steps]
+    )
+
 
 # Where unrelated content scores less, the features tell nothing apart and neither does the score.
 LEAST_SCALE = 0.02
@@ -53,30 +132,20 @@ class FeatureNetwork(Protocol):
 
 @dataclass(frozen=True)
 class FeatureConsistency:
-    """Agreement of the features of two views. Figures that no place stands behind are None.
+    """Agreement of the features of two views. Figures that no place stands behind are None."""
 
-    Attributes:
-        first: name of the view whose places were compared.
-        second: name of the view whose features were carried there.
-        network: name of the feature network.
-        status: "measured", "empty: ..." where nothing could be compared, or "degenerate: ..." where
-            the network tells no content from any other.
-        score: mean of 1 - cosine over the compared places: 0 is equal, lower is better.
-        overlap: share of the first view's places (cells of its feature map) that were compared.
-        places: how many.
-        undefined: co-visible places left out because both features are zero there.
-        unrelated: the score with second's features rolled by half the picture to the right and half
-            downwards: the same colours and structures in the wrong places.
-    """
-
-    first: str
-    second: str
-    network: str
+    first: str  # name of the view whose places were compared
+    second: str  # name of the view whose features were carried there
+    network: str  # name of the feature network
+    # "measured", "empty: ..." where nothing could be compared, or "degenerate: ..." where the
+    # network tells no content from any other.
     status: str
-    score: float | None
-    overlap: float
-    places: int
-    undefined: int
+    score: float | None  # mean of 1 - cosine over the compared places: 0 is equal, lower is better
+    overlap: float  # share of the first view's places (cells of its feature map) that were compared
+    places: int  # how many
+    undefined: int  # co-visible places left out because both features are zero there
+    # The score with second's features rolled by half the picture to the right and half downwards:
+    # the same colours and structures in the wrong places.
     unrelated: float | None
 
     @property
@@ -87,21 +156,13 @@ class FeatureConsistency:
 
 @dataclass(frozen=True)
 class Met3rScore:
-    """What the original MEt3R says of two pictures.
+    """What the original MEt3R says of two pictures."""
 
-    Attributes:
-        first: name of a view.
-        second: name of the other.
-        status: "measured", or "empty: ..." where MEt3R finds no overlap.
-        score: MEt3R, lower is better; None unless measured.
-        overlap: share of the first picture that MEt3R compares.
-    """
-
-    first: str
-    second: str
-    status: str
-    score: float | None
-    overlap: float
+    first: str  # name of a view
+    second: str  # name of the other
+    status: str  # "measured", or "empty: ..." where MEt3R finds no overlap
+    score: float | None  # MEt3R, lower is better; None unless measured
+    overlap: float  # share of the first picture that MEt3R compares
 
 
 def feature_consistency(

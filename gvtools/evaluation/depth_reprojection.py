@@ -23,13 +23,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import Float64
-from gvtools.evaluation.consistency.correspondence import (
+from gvtools.evaluation.posed_picture import (
     Correspondence,
+    PosedPicture,
     Seen,
     correspond,
     known_depth,
 )
-from gvtools.evaluation.posed_picture import PosedPicture
 
 # What a pair's distribution is kept as, to pool the medians of many pairs.
 QUANTILES = 200
@@ -37,31 +37,20 @@ QUANTILES = 200
 
 @dataclass(frozen=True, kw_only=True)
 class _Figures:
-    """Agreement of depth. Figures that no pixel stands behind are None.
+    """Agreement of depth. Figures that no pixel stands behind are None."""
 
-    Attributes:
-        status: "measured", or "empty: ..." with the reason why no pixel is co-visible.
-        covisible: pixels that fall inside the second picture, on the surface that second sees.
-        mean_pixels: forward-backward distance over the co-visible pixels, pixels of the first view.
-        median_pixels: likewise.
-        mean_relative_depth: |z − d₂| / d₂ over the co-visible pixels (0.01 = 1 %).
-        median_relative_depth: likewise.
-        covisible_share: of the pixels inside.
-        occluded_share: of the pixels inside: behind second's surface.
-        contradicting_share: of the pixels inside: in front of it, in space that second saw free.
-        unknown_share: of the pixels inside: where second has no depth.
-    """
-
-    status: str
-    covisible: int
+    status: str  # "measured", or "empty: ..." with the reason why no pixel is co-visible
+    covisible: int  # pixels that fall inside the second picture, on the surface that second sees
+    # Forward-backward distance over the co-visible pixels, pixels of the first view.
     mean_pixels: float | None
-    median_pixels: float | None
-    mean_relative_depth: float | None
-    median_relative_depth: float | None
-    covisible_share: float | None
-    occluded_share: float | None
+    median_pixels: float | None  # likewise
+    mean_relative_depth: float | None  # |z − d₂| / d₂ over the co-visible pixels (0.01 = 1 %)
+    median_relative_depth: float | None  # likewise
+    covisible_share: float | None  # of the pixels inside
+    occluded_share: float | None  # of the pixels inside: behind second's surface
+    # Of the pixels inside: in front of it, in space that second saw free.
     contradicting_share: float | None
-    unknown_share: float | None
+    unknown_share: float | None  # of the pixels inside: where second has no depth
 
     @property
     def ok(self) -> bool:
@@ -71,19 +60,12 @@ class _Figures:
 
 @dataclass(frozen=True, kw_only=True)
 class DepthReprojection(_Figures):
-    """Agreement of the depth of two views.
+    """Agreement of the depth of two views."""
 
-    Attributes:
-        first: name of the view whose pixels were reprojected.
-        second: name of the view they were reprojected into.
-        known: first's pixels with depth, inside its mask.
-        inside: those that fall inside the second picture.
-    """
-
-    first: str
-    second: str
-    known: int
-    inside: int
+    first: str  # name of the view whose pixels were reprojected
+    second: str  # name of the view they were reprojected into
+    known: int  # first's pixels with depth, inside its mask
+    inside: int  # those that fall inside the second picture
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,13 +73,11 @@ class DepthReprojectionOfViews(_Figures):
     """Agreement over many pairs of views, each pair weighing as many pixels as it has.
 
     The medians' ranks are right to half a percent of the pixels.
-
-    Attributes:
-        pairs: every pair that was compared, those without overlap included.
-        without_overlap: (first, second) names of the pairs that have no co-visible pixel.
     """
 
+    # Every pair that was compared, those without overlap included.
     pairs: tuple[DepthReprojection, ...]
+    # (first, second) names of the pairs that have no co-visible pixel.
     without_overlap: tuple[tuple[str, str], ...]
 
 

@@ -1,8 +1,9 @@
-"""Geometric verification: do the pictures match one another, and do they fit the requested poses?
+"""Geometric verification: matches of pictures with one another, and their fit to requested poses.
 
 COLMAP's own steps, on the CPU: SIFT features, exhaustive matching, verification of each pair by a
 two-view geometry that is estimated from the matches alone, and triangulation with the requested
-poses and intrinsics held fixed. Needs no depth. Three readings, to be taken together:
+poses and intrinsics held fixed; one thread, fixed seeds, no depth. Three readings, to be taken
+together:
 
 - how many matches were verified: whether the pictures show one rigid scene at all;
 - their epipolar distance under the requested poses: whether it was seen from there. Nothing is
@@ -30,21 +31,179 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
 
 from gvtools.cameras import Cameras, Float64, concatenate, invert_rigid
 from gvtools.errors import ProjectError, ShapeError
-from gvtools.evaluation.consistency.colmap_matching import (
-    MIN_MATCHES,
-    Matched,
-    match_pictures,
-    observed_points,
-    triangulate,
-)
 from gvtools.evaluation.posed_picture import PosedPicture
 from gvtools.features import quiet_colmap
 
 if TYPE_CHECKING:
     import pycolmap
+
+# COLMAP's default: fewer inliers do not make a pair.
+MIN_MATCHES = 15
+# Degrees between rays. COLMAP's 1.5 would leave out near pairs, whose matches still tell.
+MIN_TRIANGULATION_ANGLE = 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class VerifiedMatches:
+    """Matches between two pictures that a two-view geometry estimated from them agrees with."""
+
+    i: int  # number of a picture
+    j: int  # number of the other, above i
+    rows: NDArray[np.uint32]  # (M, 2) uint32, the features' numbers in picture i and in picture j
+
+
+@dataclass(frozen=True, eq=False)
+class Matched:
+    """Features and matches of a set of pictures."""
+
+    keypoints: tuple[Float64, ...]  # per picture (N, 2) float64, places of its features, pixels
+    # Those with at least ``MIN_MATCHES`` verified matches, in order.
+    pairs: tuple[VerifiedMatches, ...] = ()
+
+
+def match_pictures(pictures: Sequence[PosedPicture], folder: Path, *, seed: int) -> Matched:
+    """Extract features and match every pair; the poses play no part.
+
+    Args:
+        pictures: the views; features where a mask is False are left out.
+        folder: empty; receives the pictures, masks and ``database.db``.
+        seed: of the random sampling.
+    """
+    import pycolmap
+
+    masked = any(picture.mask is not None for picture in pictures)
+    _write_pictures(pictures, folder, with_masks=masked)
+    database = folder / "database.db"
+    reader = pycolmap.ImageReaderOptions(camera_model="PINHOLE")
+    if masked:
+        reader.mask_path = folder / "masks"
+    pycolmap.extract_features(
+        database,
+        folder / "images",
+        image_names=[_file(number) for number in range(len(pictures))],
+        camera_mode=pycolmap.CameraMode.PER_IMAGE,
+        reader_options=reader,
+        extraction_options=pycolmap.FeatureExtractionOptions(use_gpu=False, num_threads=1),
+        device=pycolmap.Device.cpu,
+    )
+    with pycolmap.Database.open(database) as opened:
+        for image in opened.read_all_images():
+            K = pictures[_number(image)].camera.K[0]
+            camera = opened.read_camera(image.camera_id)
+            camera.params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
+            camera.has_prior_focal_length = True
+            opened.update_camera(camera)
+    verification = pycolmap.TwoViewGeometryOptions(min_num_inliers=MIN_MATCHES)
+    verification.ransac.random_seed = seed
+    pycolmap.set_random_seed(seed)
+    pycolmap.match_exhaustive(
+        database,
+        matching_options=pycolmap.FeatureMatchingOptions(use_gpu=False, num_threads=1),
+        verification_options=verification,
+        device=pycolmap.Device.cpu,
+    )
+    return _read_matches(database, len(pictures))
+
+
+def triangulate(
+    pictures: Sequence[PosedPicture], matched: Matched, folder: Path, *, limit: float, seed: int
+) -> pycolmap.Reconstruction:
+    """Triangulate the verified matches; poses and intrinsics stay as they are.
+
+    Args:
+        pictures: those that were matched.
+        matched: what `match_pictures` made of them, with at least one pair.
+        folder: where it did so; receives the model.
+        limit: largest reprojection error of an observation, pixels.
+        seed: of the random sampling.
+    """
+    import pycolmap
+
+    model = pycolmap.Reconstruction()
+    with pycolmap.Database.open(folder / "database.db") as opened:
+        for image in opened.read_all_images():
+            number = _number(image)
+            model.add_camera_with_trivial_rig(opened.read_camera(image.camera_id))
+            posed = pycolmap.Image(
+                name=image.name,
+                keypoints=matched.keypoints[number],
+                camera_id=image.camera_id,
+                image_id=image.image_id,
+            )
+            pose = pictures[number].camera.cam_from_world[0, :3]
+            model.add_image_with_trivial_frame(posed, pycolmap.Rigid3d(pose))
+    focal = min(float(picture.camera.K[0, 0, 0]) for picture in pictures)
+    angle = float(np.degrees(np.arctan(limit / focal)))
+    options = pycolmap.IncrementalPipelineOptions(
+        num_threads=1, random_seed=seed, min_num_matches=MIN_MATCHES, extract_colors=False
+    )
+    options.mapper.filter_max_reproj_error = limit
+    options.mapper.filter_min_tri_angle = MIN_TRIANGULATION_ANGLE
+    options.triangulation.ignore_two_view_tracks = False
+    options.triangulation.min_angle = MIN_TRIANGULATION_ANGLE
+    options.triangulation.create_max_angle_error = angle
+    options.triangulation.continue_max_angle_error = angle
+    options.triangulation.merge_max_reproj_error = limit
+    options.triangulation.complete_max_reproj_error = limit
+    options.triangulation.random_seed = seed
+    return pycolmap.triangulate_points(
+        model, folder / "database.db", folder / "images", folder / "model", options=options
+    )
+
+
+def observed_points(
+    model: pycolmap.Reconstruction | None, matched: Matched
+) -> list[NDArray[np.int64]]:
+    """Per picture, for each of its features the point that it observes, -1 for none."""
+    observed = [np.full(len(places), -1) for places in matched.keypoints]
+    for image in model.images.values() if model else ():
+        for row in image.get_observation_point2D_idxs():
+            observed[_number(image)][row] = image.points2D[row].point3D_id
+    return observed
+
+
+def _file(number: int) -> str:
+    return f"{number:06d}.png"
+
+
+def _number(image: pycolmap.Image) -> int:
+    return int(Path(image.name).stem)
+
+
+def _write_pictures(pictures: Sequence[PosedPicture], folder: Path, *, with_masks: bool) -> None:
+    for name in ("images", "masks", "model"):
+        (folder / name).mkdir()
+    for number, picture in enumerate(pictures):
+        Image.fromarray(picture.rgb).save(folder / "images" / _file(number), compress_level=1)
+        if with_masks:  # COLMAP then wants one for every picture
+            mask = np.ones(picture.rgb.shape[:2], bool) if picture.mask is None else picture.mask
+            bright = Image.fromarray(mask.astype(np.uint8) * 255)
+            bright.save(folder / "masks" / f"{_file(number)}.png")
+
+
+def _read_matches(database: Path, count: int) -> Matched:
+    import pycolmap
+
+    keypoints = [np.zeros((0, 2)) for _ in range(count)]
+    pairs = []
+    with pycolmap.Database.open(database) as opened:
+        number = {image.image_id: _number(image) for image in opened.read_all_images()}
+        for image, row in number.items():
+            keypoints[row] = opened.read_keypoints(image)[:, :2].astype(np.float64)
+        for pair, geometry in zip(*opened.read_two_view_geometries(), strict=True):
+            i, j = (number[image] for image in pycolmap.pair_id_to_image_pair(pair))
+            rows = np.asarray(geometry.inlier_matches)
+            if len(rows) >= MIN_MATCHES:
+                pairs.append(
+                    VerifiedMatches(i, j, rows) if i < j else VerifiedMatches(j, i, rows[:, ::-1])
+                )
+    return Matched(tuple(keypoints), tuple(sorted(pairs, key=lambda pair: (pair.i, pair.j))))
+
 
 # Largest reprojection error of a triangulated observation, as a share of the longest picture side:
 # 32 of 640 pixels, 3 to 4 degrees of an ordinary lens.
@@ -59,62 +218,40 @@ ROUNDING = 1e-12
 
 @dataclass(frozen=True)
 class PairVerification:
-    """Two pictures with verified matches.
+    """Two pictures with verified matches."""
 
-    Attributes:
-        first: name of a view.
-        second: name of the other.
-        verified: matches that a two-view geometry of their own agrees with.
-        triangulated: of these, those whose two ends observe one triangulated point.
-        epipolar: median symmetric epipolar distance of the verified matches under the requested
-            poses, pixels; None where both cameras have one centre.
-    """
-
-    first: str
-    second: str
-    verified: int
-    triangulated: int
+    first: str  # name of a view
+    second: str  # name of the other
+    verified: int  # matches that a two-view geometry of their own agrees with
+    triangulated: int  # of these, those whose two ends observe one triangulated point
+    # Median symmetric epipolar distance of the verified matches under the requested poses, pixels;
+    # None where both cameras have one centre.
     epipolar: float | None
 
 
 @dataclass(frozen=True)
 class GeometricVerification:
-    """What COLMAP makes of the pictures at the requested poses. None stands for no figure.
+    """What COLMAP makes of the pictures at the requested poses. None stands for no figure."""
 
-    Attributes:
-        status: "triangulated", or "empty: ..." with the reason why there is no point.
-        images: pictures given.
-        pairs: those with verified matches.
-        mean_features: SIFT features per picture.
-        mean_verified: verified matches per pair, over all pairs, matched or not.
-        verified_share: of the pictures, those in a pair with at least 15 verified matches.
-        epipolar: median symmetric epipolar distance of all verified matches under the requested
-            poses, pixels. A single wrong view moves it little: read the pairs.
-        epipolar_inlier_share: of the verified matches, those within 4 pixels of that distance.
-        triangulated_share: of the verified matches.
-        registered_share: of the pictures, those that observe triangulated points.
-        unregistered: names of the other pictures.
-        points: triangulated points.
-        mean_track_length: observations per point.
-        mean_reprojection: of the triangulated points at the requested poses, pixels.
-        reprojection_limit: observations beyond it were left out of the triangulation, pixels.
-    """
-
-    status: str
-    images: int
-    pairs: tuple[PairVerification, ...]
-    mean_features: float | None
-    mean_verified: float | None
+    status: str  # "triangulated", or "empty: ..." with the reason why there is no point
+    images: int  # pictures given
+    pairs: tuple[PairVerification, ...]  # those with verified matches
+    mean_features: float | None  # SIFT features per picture
+    mean_verified: float | None  # verified matches per pair, over all pairs, matched or not
+    # Of the pictures, those in a pair with at least 15 verified matches.
     verified_share: float | None
+    # Median symmetric epipolar distance of all verified matches under the requested poses, pixels.
+    # A single wrong view moves it little: read the pairs.
     epipolar: float | None
+    # Of the verified matches, those within 4 pixels of that distance.
     epipolar_inlier_share: float | None
-    triangulated_share: float | None
-    registered_share: float | None
-    unregistered: tuple[str, ...]
-    points: int
-    mean_track_length: float | None
-    mean_reprojection: float | None
-    reprojection_limit: float
+    triangulated_share: float | None  # of the verified matches
+    registered_share: float | None  # of the pictures, those that observe triangulated points
+    unregistered: tuple[str, ...]  # names of the other pictures
+    points: int  # triangulated points
+    mean_track_length: float | None  # observations per point
+    mean_reprojection: float | None  # of the triangulated points at the requested poses, pixels
+    reprojection_limit: float  # observations beyond it were left out of the triangulation, pixels
 
     @property
     def ok(self) -> bool:

@@ -1,1 +1,0 @@
-"""How far views agree with one another, without a reference picture: depth, matches, features."""

@@ -1,0 +1,531 @@
+"""Pictures that any method made: read from the folders that its tools write, matched with views.
+
+nerfstudio: ``ns-render dataset`` writes ``OUT/SPLIT/OUTPUT/NAME`` for the outputs rgb, gt-rgb and
+more, NAME being the photograph's path below the folder that all photographs have in common
+(nerfstudio/scripts/render.py, DatasetRender). ``ns-eval --render-output-path`` writes
+``NNNNNN-img.jpg``, the truth on the left and the render on the right
+(VanillaPipeline.get_average_image_metrics). NNNNNN counts the views of the split as the data set
+has them: nerfstudio's own format in alphabetical order of the photographs' paths, which is taken
+here, COLMAP's in the order of the images' numbers. The truths beside the renders tell where it
+differs. Pictures of ``ns-render`` along a path (``00000.jpg``) are a plain folder.
+
+gsplat: ``RESULT/renders/val_stepSTEP_NNNN.png`` of its example trainers, truth and render side by
+side, colours cut to 8 bits. NNNN counts the validation views in alphabetical order of their names
+(examples/simple_trainer.py, Runner.eval). Of several steps the last one is taken.
+
+NerfBaselines: a folder or ``predictions-STEP.tar.gz`` with ``info.json``, ``color/NAME.png`` and
+``gt-color/NAME.png``, NAME being the photograph's path below the data set's image folder
+(nerfbaselines/io.py, _save_predictions_iterate). Transparent pixels lie before black, as in its own
+evaluation. Its depth is not read: the files do not say whether it is along the ray.
+
+Names are compared in lower case, without the file extension, without folders where that finds more
+partners, and without a prefix or suffix that most pictures share (``generated_NAME.png``,
+``NAME.rgb.png``). By order, both are sorted naturally by name (2 before 10).
+"""
+
+from __future__ import annotations
+
+import gzip
+import io
+import re
+import tarfile
+import zlib
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path, PurePosixPath
+from typing import IO, TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.errors import OptionError, ProjectError
+from gvtools.scenes.images import read_depth
+from gvtools.scenes.scene import Frame, natural_key
+from gvtools.untrusted import UNPACKED_BYTES, UNPACKED_RATIO, LimitedReader, open_picture, regular
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+RULES = ("auto", "name", "order")
+IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".ppm")
+
+
+@dataclass(frozen=True)
+class Matching:
+    """Pictures and the views that they stand for."""
+
+    rule: str  # "name" or "order"
+    # For each view the index of its picture; None where there is none.
+    picture_of: tuple[int | None, ...]
+    missing: tuple[str, ...]  # names of the views without a picture
+    left_over: tuple[str, ...]  # names of the pictures that stand for none of the views
+
+
+def match_pictures(
+    pictures: Sequence[str],
+    views: Sequence[str],
+    *,
+    rule: str = "auto",
+    alphabetical: bool = False,
+    what: str = "pictures",
+) -> Matching:
+    """Match pictures with views.
+
+    Args:
+        pictures: names, folders included.
+        views: names of the views that are to be judged.
+        rule: "name", "order", or "auto": by name where any name matches, by order where none does
+            and there are as many pictures as views.
+        alphabetical: whether numbers in the pictures' names count the views in alphabetical order
+            (img10 before img2); "auto" is "order" then.
+        what: the pictures, as error messages call them.
+
+    >>> match_pictures(["r_2.png", "r_10.png"], ["2.jpg", "10.jpg"])
+    Matching(rule='name', picture_of=(0, 1), missing=(), left_over=())
+    >>> match_pictures(["00001.png", "00000.png"], ["a.jpg", "b.jpg"]).picture_of
+    (1, 0)
+    """
+    if rule not in RULES:
+        raise OptionError(f"--match {rule!r}; expected one of {', '.join(RULES)}")
+    if not pictures:
+        raise OptionError(f"{what}: no picture; expected one for each of {len(views)} views")
+    # Pictures that are numbered alphabetically must not be taken for views whose names are numbers.
+    by_name = rule == "name" or (rule == "auto" and not alphabetical)
+    named = _by_name(pictures, views, what) if by_name else None
+    found = 0 if named is None else sum(number is not None for number in named)
+    if rule == "name" and not found:
+        raise OptionError(
+            f"{what}: none of {len(pictures)} pictures (first {pictures[0]!r}) is named like one "
+            f"of {len(views)} views (first {views[0]!r}); rename them, or give --match order"
+        )
+    partial = 0 < found < min(len(pictures), len(views))
+    if rule == "auto" and partial and len(pictures) == len(views):
+        raise OptionError(
+            f"{what}: {found} of {len(pictures)} pictures are named like views, the others are "
+            "not, and the order would give other partners; say --match name or --match order"
+        )
+    if named is not None and found:
+        return _matching("name", named, pictures=pictures, views=views)
+    if len(pictures) != len(views):
+        raise OptionError(
+            f"{what}: {len(pictures)} pictures (first {pictures[0]!r}) for {len(views)} views "
+            f"(first {views[0]!r}); expected names like the views', or as many pictures as views"
+        )
+    partners: list[int | None] = [None] * len(views)
+    in_order = sorted(range(len(views)), key=views.__getitem__) if alphabetical else None
+    for view, picture in zip(
+        in_order or _natural_order(views), _natural_order(pictures), strict=True
+    ):
+        partners[view] = picture
+    return _matching("order", partners, pictures=pictures, views=views)
+
+
+def _matching(
+    rule: str,
+    partners: Sequence[int | None],
+    *,
+    pictures: Sequence[str],
+    views: Sequence[str],
+) -> Matching:
+    used = {number for number in partners if number is not None}
+    return Matching(
+        rule,
+        tuple(partners),
+        tuple(view for view, number in zip(views, partners, strict=True) if number is None),
+        tuple(name for number, name in enumerate(pictures) if number not in used),
+    )
+
+
+def _natural_order(names: Sequence[str]) -> list[int]:
+    return sorted(range(len(names)), key=lambda number: natural_key(names[number]))
+
+
+def _by_name(pictures: Sequence[str], views: Sequence[str], what: str) -> list[int | None]:
+    """For each view the index of the picture with its name; None where there is none.
+
+    Names are compared with and without folders; what finds most partners is taken.
+    """
+    tried: list[list[list[int]]] = [[[] for _ in views]]
+    for view_keys in (_paths(views), _last_parts(views)):
+        if len(set(view_keys)) == len(view_keys):
+            for picture_keys in (_paths(pictures), _last_parts(pictures)):
+                tried.append(_partners(picture_keys, view_keys))
+    best = max(tried, key=lambda lists: sum(bool(numbers) for numbers in lists))
+    for view, numbers in zip(views, best, strict=True):
+        if len(numbers) > 1:
+            listed = ", ".join(repr(pictures[number]) for number in numbers[:2])
+            raise OptionError(
+                f"{what}: {len(numbers)} pictures of the view {view!r} ({listed}); expected one; "
+                "give a folder with one picture a view"
+            )
+    return [numbers[0] if numbers else None for numbers in best]
+
+
+def _partners(pictures: Sequence[str], views: Sequence[str]) -> list[list[int]]:
+    """For each view the indices of the pictures that have its name between a prefix and a suffix.
+
+    Prefix and suffix are those that most pictures have, none if possible. No view has a picture
+    where several pairs of them are equally frequent.
+    """
+    index = {view: number for number, view in enumerate(views)}
+    pattern, affixes = _any_of(views), Counter[tuple[str, str]]()
+    for picture in pictures:
+        affixes.update(
+            {(picture[: m.start(1)], picture[m.end(1) :]) for m in pattern.finditer(picture)}
+        )
+    out: list[list[int]] = [[] for _ in views]
+    most = max(affixes.values(), default=0)
+    commonest = [pair for pair, count in affixes.items() if count == most]
+    if len(commonest) != 1 and ("", "") not in commonest:
+        return out
+    before, behind = ("", "") if ("", "") in commonest else commonest[0]
+    for number, picture in enumerate(pictures):
+        inner = picture[len(before) : len(picture) - len(behind)]
+        if before + inner + behind == picture and inner in index:
+            out[index[inner]].append(number)
+    return out
+
+
+def _any_of(views: Sequence[str]) -> re.Pattern[str]:
+    """Matches any view's name as a whole word, the longest first; group 1 is the name."""
+    names = "|".join(re.escape(view) for view in sorted(views, key=len, reverse=True))
+    return re.compile(rf"(?=(?<![a-z0-9])({names})(?![a-z0-9]))")
+
+
+def _paths(names: Sequence[str]) -> list[str]:
+    return [_without_ending(name.replace("\\", "/")).lower() for name in names]
+
+
+def _last_parts(names: Sequence[str]) -> list[str]:
+    return [_without_ending(PurePosixPath(name.replace("\\", "/")).name).lower() for name in names]
+
+
+def _without_ending(name: str) -> str:
+    path = PurePosixPath(name)
+    return str(path.with_suffix("")) if path.suffix.lower() in IMAGE_ENDINGS else name
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """One picture."""
+
+    name: str  # by which it is matched: its path below the folder of the pictures
+    # Reads its pixels, and its depth where the method left any; raises ProjectError.
+    load: Callable[[], Frame]
+    # (H, W, 3) uint8, what the method's tool took for the truth, by which the order is checked;
+    # None where the tool keeps none.
+    load_truth: Callable[[], NDArray[np.uint8]] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class PictureSet:
+    """The pictures of one method."""
+
+    path: Path  # what was given
+    layout: str  # whose layout it has
+    pictures: tuple[Picture, ...]  # in natural order of their names
+    # Whether numbers in the names count the views in alphabetical order of their names instead of
+    # natural order.
+    alphabetical: bool = False
+    notes: tuple[str, ...] = ()  # what was chosen or left out on reading
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the pictures."""
+        return tuple(picture.name for picture in self.pictures)
+
+
+def image_files(folder: Path) -> list[Path]:
+    """The pictures in a folder and below it, in natural order; hidden ones are left out."""
+    found = [
+        path
+        for path in folder.rglob("*")
+        if path.suffix.lower() in IMAGE_ENDINGS
+        and not any(part.startswith(".") for part in path.relative_to(folder).parts)
+        and path.is_file()
+    ]
+    return in_natural_order(found, folder)
+
+
+def in_natural_order(paths: Iterable[Path], folder: Path) -> list[Path]:
+    """Paths in the natural order of what they are called below the folder."""
+    return sorted(paths, key=lambda path: natural_key(path.relative_to(folder).as_posix()))
+
+
+def plain_picture(path: Path, folder: Path) -> Picture:
+    """A picture that is a file of its own, named by its path below ``folder``."""
+    return Picture(path.relative_to(folder).as_posix(), lambda: Frame(read_rgb(path)))
+
+
+def read_rgb(source: Path | IO[bytes], *, name: str = "") -> NDArray[np.uint8]:
+    """(H, W, 3) uint8; what is transparent lies before black. EXIF orientation is not applied.
+
+    Args:
+        source: a file, or its bytes.
+        name: of messages, for bytes.
+    """
+    from gvtools.scenes.images import UNREADABLE, read_header, read_image
+
+    if isinstance(source, Path) and not read_header(source).has_alpha:
+        return read_image(source).rgb
+    try:
+        with open_picture(source if isinstance(source, Path) else source.read()) as image:
+            return _on_black(image)
+    except UNREADABLE as error:
+        raise ProjectError(
+            f"{name or source}: no readable picture ({error}); expected PNG or JPEG"
+        ) from None
+
+
+def _on_black(image: Image) -> NDArray[np.uint8]:
+    rgba: NDArray[Any] = np.asarray(image.convert("RGBA")).astype(np.float64)
+    return np.rint(rgba[..., :3] * (rgba[..., 3:] / 255)).astype(np.uint8)
+
+
+def right_half(canvas: NDArray[np.uint8], name: str) -> NDArray[np.uint8]:
+    """The right one of two pictures of one size side by side."""
+    return _half(canvas, name)[1]
+
+
+def left_half(canvas: NDArray[np.uint8], name: str) -> NDArray[np.uint8]:
+    """The left one of two pictures of one size side by side."""
+    return _half(canvas, name)[0]
+
+
+def _half(canvas: NDArray[np.uint8], name: str) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    width = canvas.shape[1]
+    if width % 2:
+        raise ProjectError(
+            f"{name}: {width} pixels wide; expected truth and render of one width side by side"
+        )
+    return (
+        np.ascontiguousarray(canvas[:, : width // 2]),
+        np.ascontiguousarray(canvas[:, width // 2 :]),
+    )
+
+
+SPLITS = ("test", "val", "train")
+_CANVAS = re.compile(r"(\d{6})-img\.(jpg|png)", re.IGNORECASE)
+
+
+def nerfstudio_dataset(path: Path) -> PictureSet | None:
+    """The pictures of ``ns-render dataset``; None where the folder is none.
+
+    Args:
+        path: the folder of all splits, or of one.
+    """
+    splits = {split: path / split for split in SPLITS if (path / split / "rgb").is_dir()}
+    folder = next(iter(splits.values()), path)
+    if not (folder / "rgb").is_dir():
+        return None
+    notes = []
+    if len(splits) > 1:
+        notes.append(f"split {folder.name} taken; also there: {', '.join(list(splits)[1:])}")
+    return PictureSet(
+        path,
+        "nerfstudio, ns-render dataset",
+        tuple(_render(file, folder) for file in image_files(folder / "rgb")),
+        notes=tuple(notes),
+    )
+
+
+def nerfstudio_evaluation(path: Path) -> PictureSet | None:
+    """The pictures of ``ns-eval --render-output-path``; None where the folder is none."""
+    canvases = [file for file in path.iterdir() if _CANVAS.fullmatch(file.name)]
+    if not canvases:
+        return None
+    return PictureSet(
+        path,
+        "nerfstudio, ns-eval",
+        tuple(canvas_picture(file, path) for file in in_natural_order(canvases, path)),
+        alphabetical=True,
+        notes=("renders are the right halves of the pictures, which are JPEG",),
+    )
+
+
+def canvas_picture(file: Path, folder: Path) -> Picture:
+    """A picture whose left half is the truth and whose right half is the render."""
+    name = file.relative_to(folder).as_posix()
+    return Picture(name, partial(_right, file), partial(_left, file))
+
+
+def _right(file: Path) -> Frame:
+    return Frame(right_half(read_rgb(file), str(file)))
+
+
+def _left(file: Path) -> NDArray[np.uint8]:
+    return left_half(read_rgb(file), str(file))
+
+
+def _render(file: Path, folder: Path) -> Picture:
+    name = file.relative_to(folder / "rgb")
+    truth = folder / "gt-rgb" / name
+    return Picture(
+        name.as_posix(),
+        lambda: Frame(read_rgb(file)),
+        partial(read_rgb, truth) if truth.is_file() else None,
+    )
+
+
+_RENDER = re.compile(r"(val|compress)_step(\d+)_(\d{4,})\.png")
+
+
+def gsplat_renders(path: Path) -> PictureSet | None:
+    """The validation pictures of a run; None where the folder holds none.
+
+    Args:
+        path: the run's folder, or its folder ``renders``.
+    """
+    folder = path / "renders" if (path / "renders").is_dir() else path
+    found: dict[tuple[str, int], list[Path]] = defaultdict(list)
+    for file in folder.iterdir():
+        if match := _RENDER.fullmatch(file.name):
+            found[match[1], int(match[2])].append(file)
+    if not found:
+        return None
+    # What the trainer's last evaluation gave; pictures of the compressed model only by themselves.
+    stage, step = max(found, key=lambda key: (key[0] == "val", key[1]))
+    notes = ["renders are the right halves of the pictures"]
+    others = sorted(
+        f"{name}_step{number}" for name, number in found if (name, number) != (stage, step)
+    )
+    if others:
+        notes.append(f"{stage}_step{step} taken; also there: {', '.join(others)}")
+    files = in_natural_order(found[stage, step], folder)
+    return PictureSet(
+        path,
+        "gsplat",
+        tuple(canvas_picture(file, folder) for file in files),
+        alphabetical=True,
+        notes=tuple(notes),
+    )
+
+
+COLOR, TRUTH = "color/", "gt-color/"
+LAYOUT = "NerfBaselines"
+_ARCHIVE = re.compile(r"predictions-(\d+)\.tar\.gz")
+
+
+def nerfbaselines_predictions(path: Path) -> PictureSet | None:
+    """The pictures of a folder or archive of predictions; None where it is none.
+
+    Args:
+        path: the folder, the archive, or the folder of a training with its archives.
+    """
+    if path.name.endswith(".tar.gz"):
+        return _archive(path, path)
+    if (path / "info.json").is_file() and (path / COLOR).is_dir():
+        files = image_files(path / COLOR)
+        return PictureSet(path, LAYOUT, tuple(_picture(file, path) for file in files))
+    archives = {int(m[1]): file for file in path.iterdir() if (m := _ARCHIVE.fullmatch(file.name))}
+    if not archives:
+        return None
+    last = max(archives)
+    return _archive(archives[last], path, others=len(archives) - 1)
+
+
+def _picture(file: Path, folder: Path) -> Picture:
+    name = file.relative_to(folder / COLOR)
+    truth = folder / TRUTH / name
+    return Picture(
+        name.as_posix(),
+        lambda: Frame(read_rgb(file)),
+        partial(read_rgb, truth) if truth.is_file() else None,
+    )
+
+
+def _archive(file: Path, path: Path, *, others: int = 0) -> PictureSet:
+    stored: dict[str, bytes] = {}
+    try:
+        most = UNPACKED_RATIO * regular(file).stat().st_size + UNPACKED_BYTES
+        with gzip.open(file) as packed, _tar(LimitedReader(packed, most)) as tar:
+            for member in tar:
+                name = member.name.removeprefix("./")
+                picture = Path(name).suffix.lower() in IMAGE_ENDINGS
+                if member.isfile() and picture and name.startswith((COLOR, TRUTH)):
+                    content = tar.extractfile(member)
+                    stored[name] = content.read() if content else b""
+    except (OSError, EOFError, ValueError, zlib.error, tarfile.TarError) as error:
+        raise ProjectError(
+            f"{file}: no readable archive ({error}); expected predictions of NerfBaselines"
+        ) from None
+    names = sorted((name for name in stored if name.startswith(COLOR)), key=natural_key)
+    if not names:
+        raise ProjectError(
+            f"{file}: no pictures under {COLOR}; expected predictions of NerfBaselines"
+        )
+    notes = (f"{file.name} taken, the last of {others + 1}",) if others else ()
+    return PictureSet(
+        path, LAYOUT, tuple(_stored(name, stored, file) for name in names), notes=notes
+    )
+
+
+def _tar(stream: LimitedReader) -> tarfile.TarFile:
+    # As a stream, of which nothing is skipped unread.
+    return tarfile.open(fileobj=stream, mode="r|")  # type: ignore[call-overload, no-any-return]
+
+
+def _stored(name: str, stored: dict[str, bytes], file: Path) -> Picture:
+    short = name.removeprefix(COLOR)
+
+    def read(key: str) -> NDArray[np.uint8]:
+        return read_rgb(io.BytesIO(stored[key]), name=f"{file}: {key}")
+
+    return Picture(
+        short,
+        lambda: Frame(read(name)),
+        partial(read, TRUTH + short) if TRUTH + short in stored else None,
+    )
+
+
+# Recognised in this order, by what no other layout has.
+READERS = (nerfbaselines_predictions, gsplat_renders, nerfstudio_dataset, nerfstudio_evaluation)
+RENDERED = ".rgb.png"
+
+
+def open_pictures(path: Path) -> PictureSet:
+    """The pictures at ``path``, in the layout of nerfstudio, gsplat, NerfBaselines, or a plain one.
+
+    A plain folder holds the pictures, perhaps in folders of its own. Beside ``NAME.rgb.png`` a
+    ``NAME.depth.npz`` (z-depth, scene units, key ``depth``) is read, as ``gvtools render`` writes
+    them; a picture ``NAME.png`` may have a ``NAME.depth.npz`` as well.
+
+    Args:
+        path: a folder, or a .tar.gz of NerfBaselines.
+    """
+    if not path.exists():
+        raise ProjectError(f"{path}: no such folder; expected a folder of pictures")
+    if path.is_file() and not path.name.endswith(".tar.gz"):
+        raise ProjectError(
+            f"{path}: is a file; expected a folder of pictures, or predictions.tar.gz of "
+            "NerfBaselines"
+        )
+    for reader in READERS:
+        if found := reader(path):
+            return found
+    files = image_files(path)
+    rendered = [file for file in files if file.name.endswith(RENDERED)]
+    if rendered:
+        pictures = tuple(_rendered(file, path, RENDERED) for file in rendered)
+        return PictureSet(path, "gvtools render", pictures)
+    if not files:
+        raise ProjectError(f"{path}: no pictures; expected PNG or JPEG files")
+    return PictureSet(path, "plain folder", tuple(_plain(file, path) for file in files))
+
+
+def _plain(file: Path, folder: Path) -> Picture:
+    if file.with_suffix(".depth.npz").is_file():
+        return _rendered(file, folder, file.suffix)
+    return plain_picture(file, folder)
+
+
+def _rendered(file: Path, folder: Path, ending: str) -> Picture:
+    """A picture with its depth beside it, if there is any; named without ``ending``."""
+    stem = file.name.removesuffix(ending)
+    depth = file.with_name(f"{stem}.depth.npz")
+    return Picture(
+        file.relative_to(folder).with_name(stem + file.suffix).as_posix(),
+        lambda: Frame(read_rgb(file), read_depth(depth) if depth.is_file() else None),
+    )

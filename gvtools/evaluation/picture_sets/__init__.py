@@ -1,1 +1,0 @@
-"""Pictures that any method made, read from the folders that its tools write."""

@@ -1,0 +1,556 @@
+"""The pose probe: match a picture with the context, and solve for where it looks from.
+
+The claim under test, the picture's requested pose, is used for nothing but the errors at the end:
+the context views to match are chosen by the picture's own features.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from gvtools.cameras import Cameras, Float64, concatenate
+from gvtools.errors import DegenerateError, OptionError
+from gvtools.evaluation.posed_picture import PosedPicture
+from gvtools.evaluation.trajectories import AUC_THRESHOLDS, Statistics, area_under_recall
+from gvtools.features import FeatureMatcher, Features, SiftMatcher, mutual_nearest
+from gvtools.settings import Settings
+
+LEAST = 4  # matches: three leave up to four poses
+# Matches within this many times the error of a pose are near to it: their own pose is no rival.
+NEAR = 3.0
+# A pose contradicts another beyond this rotation, or this share of the depth of what it sees.
+# Recorded poses of one real scene that do not quite agree give rivals up to 4 degrees and 9 % off.
+ROTATION_DEG = 10.0
+DEPTH_SHARE = 0.25
+RIVALS = 3  # looked at: near ones may come first
+
+
+@dataclass(frozen=True, eq=False)
+class AbsolutePose:
+    """A pose, and the matches that support it."""
+
+    cam_from_world: Float64  # (4, 4) float64, rigid, scene units
+    inliers: NDArray[np.bool_]  # (M,) bool, matches within the error of this very pose
+    rms: float  # root mean square of the inliers' reprojection errors, pixels
+
+
+def absolute_pose(
+    xy: Float64,
+    points: Float64,
+    K: Float64,
+    *,
+    max_error: float,
+    seed: int = 0,
+    min_inlier_share: float = 0.1,
+) -> AbsolutePose | None:
+    """Estimate by LO-RANSAC over P3P, refine over all inliers, and count those of the result.
+
+    Args:
+        xy: (M, 2), pixels; the first pixel's centre is (0.5, 0.5).
+        points: (M, 3), world frame, scene units.
+        K: (3, 3), pixels.
+        max_error: reprojection error of an inlier, pixels.
+        seed: of the sampling.
+        min_inlier_share: samples are drawn until a pose of this share would have been met; below
+            0.1 there are at most 10,000.
+
+    Returns:
+        The pose; None when no four matches agree on one.
+    """
+    import pycolmap
+
+    if len(xy) < LEAST:
+        return None
+    # COLMAP's pinhole has no skew, and coordinates near 0 keep their digits.
+    pinhole = np.column_stack([xy[:, 0] - K[0, 1] * (xy[:, 1] - K[1, 2]) / K[1, 1], xy[:, 1]])
+    origin = points.mean(axis=0)
+    # The picture's size plays no part.
+    camera = pycolmap.Camera(
+        model="PINHOLE", width=1, height=1, params=[K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
+    )
+    estimation = pycolmap.AbsolutePoseEstimationOptions()
+    estimation.ransac.max_error = max_error
+    estimation.ransac.random_seed = seed
+    estimation.ransac.min_inlier_ratio = min_inlier_share
+    found = pycolmap.estimate_and_refine_absolute_pose(pinhole, points - origin, camera, estimation)
+    if found is None:
+        return None
+    cam_from_world = np.eye(4)
+    cam_from_world[:3] = found["cam_from_world"].matrix()
+    errors = _reprojection_errors(cam_from_world, xy, points - origin, K=K)
+    inliers = errors <= max_error
+    if inliers.sum() < LEAST:
+        return None
+    cam_from_world[:3, 3] -= cam_from_world[:3, :3] @ origin
+    return AbsolutePose(cam_from_world, inliers, float(np.sqrt(np.mean(errors[inliers] ** 2))))
+
+
+def rival_pose(
+    xy: Float64,
+    points: Float64,
+    K: Float64,
+    *,
+    pose: AbsolutePose,
+    max_error: float,
+    share: float,
+    seed: int = 0,
+) -> AbsolutePose | None:
+    """The best pose that contradicts ``pose``, if about ``share`` of its inliers support one.
+
+    Repeated and symmetric things give such poses: a rug that looks the same from both ends, two
+    chairs of one kind, pictures put together from pieces.
+
+    Args:
+        xy: (M, 2), pixels.
+        points: (M, 3), world frame, scene units.
+        K: (3, 3), pixels.
+        pose: of these matches.
+        max_error: reprojection error of an inlier, pixels.
+        share: of the inliers of ``pose``; rivals with far fewer are not looked for.
+        seed: of the sampling.
+
+    Returns:
+        The rival, its inliers as (M,) bool; None when there is none.
+    """
+    wanted = share * int(pose.inliers.sum())
+    depth = float(np.median((points[pose.inliers] @ pose.cam_from_world[:3, :3].T)[:, 2]))
+    depth += pose.cam_from_world[2, 3]
+    known, rest = pose, np.ones(len(xy), np.bool_)
+    for _ in range(RIVALS):
+        rest &= _reprojection_errors(known.cam_from_world, xy, points, K=K) > NEAR * max_error
+        if rest.sum() < max(wanted, LEAST):
+            return None
+        # Half of the wanted share: matches are counted here, not the places they come from.
+        found = absolute_pose(
+            xy[rest],
+            points[rest],
+            K,
+            max_error=max_error,
+            seed=seed,
+            min_inlier_share=min(0.5 * wanted / int(rest.sum()), 0.9),
+        )
+        if found is None:
+            return None
+        inliers = np.zeros(len(xy), np.bool_)
+        inliers[rest] = found.inliers
+        known = AbsolutePose(found.cam_from_world, inliers, found.rms)
+        if _contradicts(known.cam_from_world, pose.cam_from_world, depth):
+            return known
+    return None
+
+
+def angle_deg(first: Float64, second: Float64) -> float:
+    """Angle between two (3, 3) orientations; |A − B| = 2 √2 sin(angle / 2), exact near 0."""
+    chord = np.linalg.norm(first - second) / (2 * np.sqrt(2))
+    return float(np.degrees(2 * np.arcsin(min(1.0, float(chord)))))
+
+
+def center_distance(first: Float64, second: Float64) -> float:
+    """Distance between the centres of two (4, 4) cam_from_world, scene units."""
+    centers = [-pose[:3, :3].T @ pose[:3, 3] for pose in (first, second)]
+    return float(np.linalg.norm(centers[0] - centers[1]))
+
+
+def _contradicts(first: Float64, second: Float64, depth: float) -> bool:
+    turned = angle_deg(first[:3, :3], second[:3, :3]) > ROTATION_DEG
+    return turned or center_distance(first, second) > DEPTH_SHARE * depth
+
+
+def _reprojection_errors(pose: Float64, xy: Float64, points: Float64, *, K: Float64) -> Float64:
+    """(M,) pixels; infinite behind the camera."""
+    local = points @ pose[:3, :3].T + pose[:3, 3]
+    ahead = local[:, 2] > 0
+    z = np.where(ahead, local[:, 2], 1)
+    projected = (local @ K.T)[:, :2] / z[:, None]
+    return np.where(ahead, np.linalg.norm(projected - xy, axis=1), np.inf)
+
+
+def lift_keypoints(
+    xy: Float64, depth: NDArray[np.float32], camera: Cameras, *, edge: float
+) -> tuple[Float64, NDArray[np.bool_]]:
+    """Keypoints lifted by the depth between the four pixel centres around each.
+
+    Depth is interpolated as its inverse, which on a plane is linear in the picture. A keypoint
+    needs all four depths, and they may not spread over more than ``edge``: across a silhouette
+    the interpolated depth would lie on neither surface.
+
+    Args:
+        xy: (N, 2), pixels; the first pixel's centre is (0.5, 0.5).
+        depth: (H, W) z-depth, scene units; 0, NaN and inf mean none.
+        camera: a batch of one, of the same size.
+        edge: largest spread of the four depths, as a share of the depth.
+
+    Returns:
+        (N, 3) float64, world frame, scene units, and (N,) bool, which of them hold.
+    """
+    height, width = depth.shape
+    corner = np.clip(np.floor(xy - 0.5), 0, np.maximum([width - 2, height - 2], 0)).astype(np.int64)
+    # Outside the outermost centres the nearest depth holds.
+    along = np.clip(xy - 0.5 - corner, 0, 1)
+    x, y = corner.T
+    known = np.isfinite(depth) & (depth > 0)
+    inverse = np.divide(1, depth, out=np.full(depth.shape, np.nan), where=known)
+    right, below = np.minimum(x + 1, width - 1), np.minimum(y + 1, height - 1)
+    four = np.stack([inverse[y, x], inverse[y, right], inverse[below, x], inverse[below, right]])
+    u, v = along.T
+    weight = np.stack([(1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v])
+    z = 1 / (four * weight).sum(axis=0)
+    ok = (four.max(axis=0) - four.min(axis=0)) * z <= edge
+    rays = np.column_stack([xy, np.ones(len(xy))]) @ np.linalg.inv(camera.K[0]).T
+    points = rays * z[:, None] @ camera.world_from_cam[0, :3, :3].T + camera.centers[0]
+    return points, ok
+
+
+LOCATED = "located"
+
+
+@dataclass(frozen=True, eq=False)
+class Located:
+    """Where one picture looks from, and how far that is from where it was meant to."""
+
+    name: str  # the picture's
+    status: str  # "located", or "failed: ..." with the reason; then pose and errors are None
+    cam_from_world: Float64 | None  # (4, 4) float64, rigid, scene units
+    keypoints: int  # found in the picture (within its mask)
+    # Places in the picture that match a context keypoint with a 3D point. A place counts once,
+    # however many context views it matches.
+    matches: int
+    inliers: int  # those that the best pose explains; reported of failed pictures as well
+    # How many of the picture's cells hold an inlier; a cell's side is 1/16 of the longer side of
+    # the picture.
+    cells: int
+    # Places that agree on another pose, which contradicts the best one; 0 when no pose with a
+    # comparable number was met.
+    rival: int
+    residual: float | None  # root mean square of the inliers' reprojection errors, pixels
+    views: tuple[str, ...]  # names of the context views that were matched, the most promising first
+    rotation_error_deg: float | None  # angle between the found and the requested orientation
+    center_error: float | None  # distance of the found from the requested centre, scene units
+    # That, divided by the extent of the context's centres; None also when the extent is 0.
+    center_error_share: float | None
+
+    @property
+    def ok(self) -> bool:
+        """Whether the picture was located."""
+        return self.status == LOCATED
+
+    @property
+    def inlier_share(self) -> float | None:
+        """Inliers per match; None without matches."""
+        return self.inliers / self.matches if self.matches else None
+
+
+@dataclass(frozen=True)
+class PoseSummary:
+    """The probe's findings over a set of pictures.
+
+    Statistics are over the located pictures alone and say how many those are; they flatter a set
+    whose hard pictures fail, and are to be read beside ``success_share``. ``rotation_auc`` counts
+    failures as wrong.
+    """
+
+    pictures: int  # how many were probed
+    located: int  # how many of them were located
+    success_share: float | None  # located per picture; None without pictures
+    failures: tuple[tuple[str, str], ...]  # name and status of every picture that was not
+    rotation_error_deg: Statistics | None  # over the located; None when there are none
+    center_error: Statistics | None  # likewise, scene units
+    # Likewise, divided by the extent of the context's centres.
+    center_error_share: Statistics | None
+    # By threshold in degrees, the area under the share of *all* pictures that are located with a
+    # rotation error below x, for x up to the threshold; None without pictures.
+    rotation_auc: dict[float, float | None]
+    inliers: Statistics | None  # over the located, places of a picture that agree with its pose
+    inlier_share: Statistics | None  # over the located, those per match
+
+
+def summarise(found: Sequence[Located]) -> PoseSummary:
+    """The findings of all probed pictures; leave none out, failures least of all."""
+    ok = [one for one in found if one.ok]
+    angles = [np.inf if one.rotation_error_deg is None else one.rotation_error_deg for one in found]
+    return PoseSummary(
+        pictures=len(found),
+        located=len(ok),
+        success_share=len(ok) / len(found) if found else None,
+        failures=tuple((one.name, one.status) for one in found if not one.ok),
+        rotation_error_deg=_statistics([one.rotation_error_deg for one in ok]),
+        center_error=_statistics([one.center_error for one in ok]),
+        center_error_share=_statistics([one.center_error_share for one in ok]),
+        rotation_auc={
+            threshold: area_under_recall(angles, threshold) if found else None
+            for threshold in AUC_THRESHOLDS
+        },
+        inliers=_statistics([one.inliers for one in ok]),
+        inlier_share=_statistics([one.inlier_share for one in ok]),
+    )
+
+
+def _statistics(values: Sequence[float | None]) -> Statistics | None:
+    return Statistics.of([value for value in values if value is not None])
+
+
+# Cells along the longer side of a picture, in which the spread of the inliers is counted.
+CELLS = 16
+
+
+class PoseProbeOptions(Settings):
+    """How a picture is located, and when it counts as located.
+
+    The thresholds on inliers and cells were set on a real room of 5 to 50 context views at 640x480.
+    Photographs of other places, noise and negatives reach 7 inliers in 5 cells; mirrored
+    photographs of the room, where things are symmetric, 20; photographs cut into 8x8 pieces and
+    shuffled, 66 in 8 cells, which are those of one piece. Held-out photographs have 51 and more, in
+    27 cells and more. COLMAP's mapper asks for 30.
+    """
+
+    section = "pose_probe"
+
+    views: int = Field(10, ge=1)
+    """Context views to match; all are when there are no more."""
+    prominent: int = Field(500, ge=1)
+    """Keypoints of a picture by which those views are chosen."""
+    edge: float = Field(0.05, gt=0)
+    """A keypoint is lifted where the depths around it spread over less than this share."""
+    max_error: float | None = Field(None, gt=0)
+    """Reprojection error of an inlier; none means 1/160 of the picture's longer side (4 pixels at
+    640, 12 at 1920), at least 2. [px]"""
+    min_inliers: int = Field(25, ge=4)
+    """Fewer do not locate a picture."""
+    min_cells: int = Field(10, ge=1)
+    """Nor do inliers in fewer cells of the picture; its longer side has 16."""
+    max_rival: float = Field(0.5, gt=0, le=1)
+    """Nor does a pose while another, which contradicts it, has this share of its inliers."""
+
+
+@dataclass(frozen=True, eq=False)
+class _ContextView:
+    """A context view's keypoints that have a 3D point: features (N), points (N, 3)."""
+
+    name: str
+    features: Features
+    points: Float64
+
+
+@dataclass(frozen=True)
+class _Counts:
+    """Of one picture, as in ``Located``."""
+
+    keypoints: int
+    matches: int
+    inliers: int
+    cells: int
+    rival: int
+
+
+class PoseProbe:
+    """Locates pictures against posed context views with depth.
+
+    Attributes:
+        options: see PoseProbeOptions.
+        extent: twice the largest distance of a context centre from their mean, scene units.
+
+    Args:
+        context: views with depth from any source (measured, or the memory's projection); those
+            without depth give no points.
+        matcher: finds and matches keypoints.
+        options: see PoseProbeOptions.
+        seed: of the robust estimate; the same seed gives the same answer.
+    """
+
+    def __init__(
+        self,
+        context: Sequence[PosedPicture],
+        *,
+        matcher: FeatureMatcher | None = None,
+        options: PoseProbeOptions | None = None,
+        seed: int = 0,
+    ) -> None:
+        self.options = options or PoseProbeOptions()
+        self.seed = seed
+        self._matcher = matcher or SiftMatcher()
+        self._context = tuple(context)
+        if len({picture.name for picture in self._context}) != len(self._context):
+            raise OptionError("pose probe: two context views have one name; names must differ")
+        self._views = [self._lifted(picture) for picture in self._context]
+        if not any(len(view.points) for view in self._views):
+            raise DegenerateError(
+                f"pose probe: none of {len(self._context)} context views has keypoints with depth; "
+                "give views with texture and depth"
+            )
+        self.extent = _extent([picture.camera for picture in self._context])
+
+    def locate(self, picture: PosedPicture, *, leave_out: Collection[str] = ()) -> Located:
+        """Where ``picture`` looks from, by its pixels alone.
+
+        Args:
+            picture: its mask limits the keypoints; its camera's pose is only compared with.
+            leave_out: names of context views not to match; other names mean nothing.
+        """
+        features = self._matcher.extract(picture.rgb)
+        features = features[_inside(features.xy, picture.mask)]
+        views = self._promising(features, leave_out)
+        keypoint, points = self._correspondences(features, views)
+        pose, counts = self._solved(features, keypoint, points, K=picture.camera.K[0])
+        reason = self._reason(counts)
+        return self._located(
+            picture,
+            None if reason else pose,
+            status=f"failed: {reason}" if reason else LOCATED,
+            counts=counts,
+            views=tuple(view.name for view in views),
+        )
+
+    def leave_one_out(self, count: int | None = None) -> list[Located]:
+        """Context views located by the others: the error that the probe has on real pictures.
+
+        What a generated picture is off by means little below it.
+
+        Args:
+            count: how many, evenly spread over the context; None takes all.
+        """
+        total = len(self._context)
+        chosen = np.unique(np.linspace(0, total - 1, min(count or total, total)).round())
+        pictures = [self._context[int(i)] for i in chosen]
+        return [self.locate(picture, leave_out=(picture.name,)) for picture in pictures]
+
+    def _lifted(self, picture: PosedPicture) -> _ContextView:
+        features = self._matcher.extract(picture.rgb)
+        features = features[_inside(features.xy, picture.mask)]
+        if picture.depth is None:
+            return _ContextView(picture.name, features[:0], np.zeros((0, 3)))
+        edge = self.options.edge
+        points, ok = lift_keypoints(features.xy, picture.depth, picture.camera, edge=edge)
+        return _ContextView(picture.name, features[ok], points[ok])
+
+    def _promising(self, features: Features, leave_out: Collection[str]) -> list[_ContextView]:
+        """The views whose most prominent keypoints match those of the picture most often."""
+        views = [view for view in self._views if view.name not in leave_out and len(view.points)]
+        if len(views) <= self.options.views:
+            return views
+        most = self.options.prominent
+        votes = [
+            len(mutual_nearest(features.descriptors[:most], view.features.descriptors[:most]))
+            for view in views
+        ]
+        order = np.argsort(-np.asarray(votes), kind="stable")[: self.options.views]
+        return [views[i] for i in order]
+
+    def _correspondences(
+        self, features: Features, views: Sequence[_ContextView]
+    ) -> tuple[NDArray[np.int64], Float64]:
+        """Keypoint numbers (M,) and their 3D partners (M, 3), over all views."""
+        keypoints, points = [np.zeros(0, np.int64)], [np.zeros((0, 3))]
+        for view in views:
+            pairs = self._matcher.match(features, view.features)
+            keypoints.append(pairs[:, 0])
+            points.append(view.points[pairs[:, 1]])
+        return np.concatenate(keypoints), np.concatenate(points)
+
+    def _solved(
+        self, features: Features, keypoint: NDArray[np.int64], points: Float64, *, K: Float64
+    ) -> tuple[AbsolutePose | None, _Counts]:
+        """The best pose, and what speaks for and against it."""
+        xy = features.xy[keypoint]
+        # A keypoint may have several orientations: places are counted, not keypoints.
+        places, place = np.unique(xy, axis=0, return_inverse=True)
+        place = place.reshape(-1)
+        size = {"width": features.width, "height": features.height}
+        error = self.options.max_error or max(2.0, max(size.values()) / 160)
+        pose = absolute_pose(xy, points, K, max_error=error, seed=self.seed)
+        if pose is None:
+            return None, _Counts(len(features), len(places), 0, 0, 0)
+        agreed = np.unique(place[pose.inliers])
+        rival = rival_pose(
+            xy,
+            points,
+            K,
+            pose=pose,
+            max_error=error,
+            share=self.options.max_rival,
+            seed=self.seed,
+        )
+        return pose, _Counts(
+            keypoints=len(features),
+            matches=len(places),
+            inliers=len(agreed),
+            cells=_cells(places[agreed], **size),
+            rival=0 if rival is None else len(np.unique(place[rival.inliers])),
+        )
+
+    def _reason(self, counts: _Counts) -> str:
+        """Why a picture does not count as located; empty when it does."""
+        options = self.options
+        if counts.matches < options.min_inliers:
+            return (
+                f"{counts.matches} matches of {counts.keypoints} keypoints, at least "
+                f"{options.min_inliers} are needed"
+            )
+        if counts.inliers < options.min_inliers:
+            return (
+                f"{counts.inliers} inliers of {counts.matches} matches, at least "
+                f"{options.min_inliers} are needed"
+            )
+        if counts.cells < options.min_cells:
+            return (
+                f"{counts.inliers} inliers in {counts.cells} cells of the picture, at least "
+                f"{options.min_cells} are needed"
+            )
+        if counts.rival >= options.max_rival * counts.inliers:
+            return (
+                f"ambiguous, {counts.inliers} matches agree on one pose and {counts.rival} on "
+                "another that contradicts it"
+            )
+        return ""
+
+    def _located(
+        self,
+        picture: PosedPicture,
+        pose: AbsolutePose | None,
+        *,
+        status: str,
+        counts: _Counts,
+        views: tuple[str, ...],
+    ) -> Located:
+        requested = picture.camera.cam_from_world[0]
+        found = None if pose is None else pose.cam_from_world
+        distance = None if found is None else center_distance(found, requested)
+        angle = None if found is None else angle_deg(found[:3, :3], requested[:3, :3])
+        return Located(
+            name=picture.name,
+            status=status,
+            cam_from_world=found,
+            residual=None if pose is None else pose.rms,
+            views=views,
+            rotation_error_deg=angle,
+            center_error=distance,
+            center_error_share=None if distance is None else _share(distance, self.extent),
+            **asdict(counts),
+        )
+
+
+def _share(part: float, whole: float) -> float | None:
+    return part / whole if whole > 0 else None
+
+
+def _inside(xy: Float64, mask: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
+    """(N,) bool: whether the pixel that a keypoint lies in is to be used."""
+    if mask is None:
+        return np.ones(len(xy), np.bool_)
+    height, width = mask.shape
+    x, y = np.clip(np.floor(xy).astype(np.int64), 0, [width - 1, height - 1]).T
+    return mask[y, x]
+
+
+def _cells(xy: Float64, *, width: int, height: int) -> int:
+    """How many cells of the picture hold one of the places."""
+    return len(np.unique(np.floor(xy / (max(width, height) / CELLS)), axis=0))
+
+
+def _extent(cameras: Sequence[Cameras]) -> float:
+    centers = concatenate(cameras).centers
+    return float(2 * np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
