@@ -49,8 +49,15 @@ class _Parser(argparse.ArgumentParser):
         self.exit(2, f"gvtools: {message}; see '{self.prog} --help'\n")
 
 
-def build_parser(modules: Mapping[str, str] = COMMANDS) -> argparse.ArgumentParser:
-    """The parser of all commands, given as name and module."""
+def build_parser(
+    modules: Mapping[str, str] = COMMANDS, *, only: str | None = None
+) -> argparse.ArgumentParser:
+    """The parser of all commands, given as name and module.
+
+    Args:
+        modules: the commands.
+        only: name of the one whose options are added, which may take a second; None adds all.
+    """
     parser = _Parser(
         prog="gvtools",
         description="Grow a coloured point-cloud memory from posed photographs or RGB-D, project "
@@ -69,7 +76,8 @@ def build_parser(modules: Mapping[str, str] = COMMANDS) -> argparse.ArgumentPars
             formatter_class=argparse.RawDescriptionHelpFormatter,
             allow_abbrev=False,
         )
-        module.add_arguments(command)
+        if only in (None, name):
+            module.add_arguments(command)
         command.add_argument("--quiet", action="store_true", help="print nothing but warnings")
         command.add_argument("--debug", action="store_true", help="show tracebacks of errors")
         command.set_defaults(module=module)
@@ -85,7 +93,8 @@ def main(argv: Sequence[str] | None = None, *, modules: Mapping[str, str] = COMM
     """
     # Waiting threads that spin would take the cores that other programs need, and with them ours.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    parser = build_parser(modules)
+    words = sys.argv[1:] if argv is None else argv
+    parser = build_parser(modules, only=next((w for w in words if not w.startswith("-")), ""))
     args = argparse.Namespace(debug=False)
     try:
         args = parser.parse_args(argv)

@@ -30,9 +30,9 @@ class FitOptions(Settings):
     section = "refine"
 
     seconds: float | None = Field(None, ge=0)
-    """How long they are fitted at most, with the depth that the fit begins with; none: 120, or by
-    ``steps``. It ends before, when photographs that are left out gain next to nothing; 0 leaves the
-    memory's own colours. [s]"""
+    """How long Gaussians are fitted at most, the depth that they begin with included; none: 120, or
+    by ``steps``. It ends before, when photographs that are left out gain next to nothing; 0 leaves
+    the memory's own colours. [s]"""
     steps: int | None = Field(None, ge=0)
     """How many steps, where no time is given: the same result every time; 0 leaves the memory's own
     colours."""

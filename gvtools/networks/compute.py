@@ -15,15 +15,12 @@ import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from functools import cache
-from typing import Any, Literal
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
-
-Precision = Literal["auto", "float32", "bfloat16", "float16"]
-TrainingPrecision = Literal["auto", "float32", "bfloat16"]
 
 # From this compute capability on, CUDA cards multiply bfloat16 themselves.
 BFLOAT16_CAPABILITY = (8, 0)

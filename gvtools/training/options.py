@@ -12,7 +12,7 @@ from gvtools.completers.geoverse.config import GeoVerseConfig, named, read
 from gvtools.completers.geoverse.flow import check_bounds
 from gvtools.completers.geoverse.objective import LossWeights
 from gvtools.errors import OptionError
-from gvtools.networks.compute import TrainingPrecision
+from gvtools.networks import TrainingPrecision
 from gvtools.settings import Settings, with_file
 from gvtools.training.corruption import GENTLE, CorruptionOptions
 

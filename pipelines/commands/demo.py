@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from gvtools.runs.folder import RunDirectory
 from pipelines.commands.reconstruct import add_run_arguments, config_from, copy_figures
 from pipelines.console import Console
 
@@ -40,6 +39,8 @@ def run(args: argparse.Namespace, console: Console) -> None:
     default = Path("runs") / f"demo-{args.sample}"
     # Absolute, since the sample's folder is named after it, and "." has no name.
     out = args.out.absolute() if args.out else free_folder(default, resume=args.resume)
+    from gvtools.runs.folder import RunDirectory
+
     RunDirectory(out).refuse_foreign()
     sample = out.with_name(f"{out.name}-sample")
     from gvtools.procedural.room_sample import KERNELS

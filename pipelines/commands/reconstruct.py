@@ -22,6 +22,23 @@ EXAMPLES = (
     "gvtools reconstruct photographs/ --cloud survey.laz --out runs/survey",
 )
 
+# Options and the settings that they give; their help is the settings'.
+OPTIONS = {
+    name: name
+    for name in (
+        "context", "targets", "views_per_round", "rounds", "depth", "max_side", "completer",
+        "profile", "protocol", "voxel", "device", "seed", "allow_overlap",
+    )
+} | {
+    "refine": "refine.seconds", "tune": "tune.minutes", "cloud": "scan.file",
+    "cloud_placement": "scan.placement",
+}  # fmt: skip
+METAVARS = {
+    "context": "SPEC", "targets": "SPEC|FILE", "depth": "SOURCE", "max_side": "PIXELS",
+    "completer": "NAME", "profile": "NAME", "protocol": "NAME", "voxel": "EDGE",
+    "refine": "SECONDS", "tune": "MINUTES", "cloud": "FILE", "cloud_placement": "MATRIX",
+}  # fmt: skip
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``reconstruct``."""
@@ -45,63 +62,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def add_run_arguments(parser: argparse.ArgumentParser, *, out_required: bool) -> None:
     """What ``reconstruct`` and ``demo`` share."""
     from pipelines.commands.arguments import add_scene_arguments
+    from pipelines.commands.options import add_settings
+    from pipelines.reconstruction.settings import RunSettings
 
     parser.add_argument("--out", type=Path, required=out_required, help="the run's folder")
-    parser.add_argument("--context", metavar="SPEC", help="views that are given (default all)")
-    parser.add_argument(
-        "--targets",
-        metavar="SPEC|FILE",
-        help="cameras to complete: a selection, interpolate:N, orbit:N, spiral:N, a trajectory "
-        "file or another project (default interpolate:12)",
-    )
-    parser.add_argument("--views-per-round", type=int, metavar="N", help="at most (default 6)")
-    parser.add_argument("--rounds", type=int, metavar="N", help="default: as the targets need")
-    parser.add_argument("--depth", metavar="SOURCE", help="auto, sensor, colmap, plane-sweep, da3")
-    parser.add_argument(
-        "--max-side", metavar="PIXELS", help="reduce larger pictures to it, or none (default 1600)"
-    )
-    parser.add_argument("--completer", metavar="NAME", help="default inpaint")
-    parser.add_argument("--profile", metavar="NAME", help="fast, balanced, accurate or finest")
-    parser.add_argument(
-        "--protocol", metavar="NAME", help="gvtools, or paper: GeoVerse as it was published"
-    )
-    parser.add_argument(
-        "--refine",
-        type=float,
-        metavar="SECONDS",
-        help="fit Gaussians to the photographs at most so long; 0: not at all (default: as long as "
-        "photographs that are left out gain by it, at most 120)",
-    )
-    parser.add_argument(
-        "--tune",
-        type=float,
-        metavar="MINUTES",
-        help="train the generative core (--completer geoverse) so long to predict the context from "
-        "itself, before the first targets (default 0: not at all)",
-    )
-    parser.add_argument(
-        "--cloud", metavar="FILE", help="start memory from a scan: PLY, LAS, LAZ, E57 or PCD"
-    )
-    parser.add_argument(
-        "--cloud-placement",
-        metavar="MATRIX",
-        help="similarity from the scan's frame to the photographs': estimate (default), identity, "
-        "a text file with a 4x4 matrix, or its numbers row by row with commas between",
-    )
-    parser.add_argument("--voxel", metavar="EDGE", help="auto, or scene units")
-    parser.add_argument(
-        "--device", metavar="NAME", help="cpu, cuda (the torch back end), or auto: cpu"
-    )
-    parser.add_argument("--seed", type=int, metavar="N", help="of everything random (default 0)")
+    add_settings(parser, RunSettings(), OPTIONS, metavars=METAVARS)
     parser.add_argument("--config", type=Path, metavar="FILE", help="settings as JSON")
     parser.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", help="one setting; repeatable"
     )
     parser.add_argument(
         "--help-settings", action=HelpSettings, settings=_settings, help="list all settings"
-    )
-    parser.add_argument(
-        "--allow-overlap", action="store_true", help="let views be context and target"
     )
     parser.add_argument("--resume", action="store_true", help="continue after the last whole round")
     parser.add_argument("--dry-run", action="store_true", help="say what would be done, and stop")
@@ -153,6 +124,7 @@ def config_from(args: argparse.Namespace) -> RunSettings:
     ``--set profile=NAME`` stands for ``--profile NAME``.
     """
     from gvtools.settings import with_file, with_texts, with_values
+    from pipelines.commands.options import given_settings
     from pipelines.reconstruction.settings import RunSettings
 
     config, texts = RunSettings(), []
@@ -167,18 +139,11 @@ def config_from(args: argparse.Namespace) -> RunSettings:
         config = with_file(config, args.config, presets=presets)
     else:
         config = with_values(config, presets)
-    names = ("context", "targets", "views_per_round", "rounds", "max_side", "depth", "completer",
-             "voxel", "device", "seed")  # fmt: skip
-    given = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
-    if args.refine is not None:
-        given["refine.seconds"] = args.refine
-    if args.tune is not None:
-        given["tune.minutes"] = args.tune
-    if args.cloud is not None:
-        given["scan.file"] = str(Path(args.cloud).resolve())
-    if args.cloud_placement is not None:
-        text = args.cloud_placement
-        given["scan.placement"] = str(Path(text).resolve()) if Path(text).is_file() else text
-    if args.allow_overlap:
-        given["allow_overlap"] = True
+    given = {
+        key: value for key, value in given_settings(args, OPTIONS).items() if key not in presets
+    }
+    # A run's record names files wherever it is resumed from.
+    for key in ("scan.file", "scan.placement"):
+        if key in given and (key == "scan.file" or Path(given[key]).is_file()):
+            given[key] = str(Path(given[key]).resolve())
     return with_texts(with_values(config, given), texts)

@@ -52,10 +52,12 @@ def test_every_help_starts_with_two_examples(command, capsys):
             build_parser().parse_args(line.split()[1:])
 
 
-def test_the_commands_start_without_heavy_imports():
+@pytest.mark.parametrize(("only", "more"), [("None", ""), ("''", "'numba', 'cv2', 'numpy',")])
+def test_the_commands_start_without_heavy_imports(only, more):
+    heavy = f"({more}'torch', 'open3d', 'pycolmap', 'matplotlib')"
     code = (
-        "import sys, pipelines.cli as c; c.build_parser();"
-        "print([m for m in ('torch', 'open3d', 'pycolmap', 'matplotlib') if m in sys.modules])"
+        f"import sys, pipelines.cli as c; c.build_parser(only={only});"
+        f"print([m for m in {heavy} if m in sys.modules])"
     )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert out.stdout.strip() == "[]"

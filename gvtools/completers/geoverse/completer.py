@@ -40,7 +40,8 @@ from gvtools.completers.push_pull import Filled
 from gvtools.completers.settings import CompleterSettings
 from gvtools.errors import OptionError
 from gvtools.guidance import Guidance
-from gvtools.networks.compute import Precision, autocast, inference_type
+from gvtools.networks import Precision
+from gvtools.networks.compute import autocast, inference_type
 
 
 class GeoVerseSettings(CompleterSettings):

@@ -251,13 +251,21 @@ def _wide(x: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class LossWeights:
-    """Coefficients of the terms; the paper gives none."""
+    """Coefficients of the terms; the paper gives none.
 
-    level1: float = 1.0  # of L_FM^1
-    level0: float = 1.0  # of L_FM^0
-    rgb: float = 1.0  # of L_rgb
-    hf: float = 1.0  # of L_hf
-    depth: float = 1.0  # of L_depth
+    Attributes:
+        level1: of L_FM^1.
+        level0: of L_FM^0.
+        rgb: of L_rgb.
+        hf: of L_hf.
+        depth: of L_depth.
+    """
+
+    level1: float = 1.0
+    level0: float = 1.0
+    rgb: float = 1.0
+    hf: float = 1.0
+    depth: float = 1.0
 
     def __post_init__(self) -> None:
         for item in fields(self):

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from gvtools.networks.compute import Precision
+from gvtools.networks import Precision
 from gvtools.settings import Settings
 
 
