@@ -158,7 +158,7 @@ def data_page() -> str:
 
 def data_sets_page() -> str:
     """The public data sets, from their specs: a table, then all that is known of each."""
-    from pipelines.data_sets.listing import COLUMNS, all_specs, as_yaml, table_rows
+    from pipelines.data_sets.downloads import COLUMNS, all_specs, as_yaml, table_rows
 
     folder = ROOT / "data_specs" / "data_sets"
     text = [(folder / "README.md").read_text(encoding="utf-8"), "## All of them", ""]

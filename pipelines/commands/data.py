@@ -38,19 +38,19 @@ def _download_options(option: AddOption) -> None:
 
 
 def _list(args: argparse.Namespace, console: Console) -> None:
-    from pipelines.data_sets.listing import list_data_sets
+    from pipelines.data_sets.downloads import list_data_sets
 
     list_data_sets(args, console)
 
 
 def _check(args: argparse.Namespace, console: Console) -> None:
-    from pipelines.data_sets.checking import check_data_set
+    from pipelines.data_sets.downloads import check_data_set
 
     check_data_set(args, console)
 
 
 def _stats(args: argparse.Namespace, console: Console) -> None:
-    from pipelines.data_sets.statistics import statistics_of_data_set
+    from pipelines.data_sets.downloads import statistics_of_data_set
 
     statistics_of_data_set(args, console)
 

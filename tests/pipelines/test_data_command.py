@@ -19,7 +19,7 @@ from tiny_scan import FOCAL, WIDTH, render, world_from_cam, write_scan
 from gvtools.scenes.data_sets.catalogue import DataSetSpec, load_spec, read_scene, spec_names
 from gvtools.scenes.scene import Scene
 from pipelines.cli import main
-from pipelines.data_sets import checking
+from pipelines.data_sets import downloads
 from pipelines.data_sets.log_histogram import LogHistogram
 
 FIRST, SECOND = "wall/seq-01", "wall/seq-02"
@@ -83,7 +83,7 @@ def test_each_scene_of_a_download_has_its_line(
     scenes = report(tmp_path / "check.json")["scenes"]
     assert [scene["scene"] for scene in scenes] == [FIRST, SECOND]
     assert [scene["views"] for scene in scenes] == [6, 12]
-    assert scenes[1]["views_opened"] == checking.PROBES
+    assert scenes[1]["views_opened"] == downloads.PROBES
     assert scenes[1]["depth"]["views"] == 11
 
 
@@ -205,8 +205,7 @@ def test_one_scene_is_held_at_a_time(root: Path, monkeypatch: pytest.MonkeyPatch
         seen.append(weakref.ref(opened))
         return opened
 
-    monkeypatch.setattr(checking, "read_scene", read)
-    monkeypatch.setattr("pipelines.data_sets.statistics.read_scene", read)
+    monkeypatch.setattr("pipelines.data_sets.downloads.read_scene", read)
     write_scan(root / "wall" / "seq-03")
     assert data("check", "7-Scenes", root) == 0
     assert data("stats", "7-Scenes", root) == 0

@@ -1,0 +1,336 @@
+"""``gvtools data list``, ``check`` and ``stats``: data sets, and what of a download can be read."""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from gvtools.errors import GvError, OptionError, ProjectError
+from gvtools.files import json_list_written, write_json
+from gvtools.scenes.data_sets.catalogue import (
+    DataSetSpec,
+    chosen_scenes,
+    load_spec,
+    read_scene,
+    spec_names,
+)
+from gvtools.scenes.inspection import SceneReport, inspect, spread
+from pipelines.data_sets.log_histogram import LogHistogram
+
+if TYPE_CHECKING:
+    from gvtools.scenes.scene import Scene
+    from pipelines.console import Console
+
+COLUMNS = ("data set", "kind", "scenes", "images", "weight", "roles", "layout")
+# Views of a scene whose pixels are decoded, evenly spread.
+PROBES = 8
+# Levels of findings, and what one line calls them.
+NOUNS = {"error": "errors", "warning": "warnings", "info": "notes"}
+PERCENTILES = (5, 25, 50, 75, 95)
+
+
+# --- list -------------------------------------------------------------------------------------
+
+
+def list_data_sets(args: argparse.Namespace, console: Console) -> None:
+    """Print a table of the data sets, or everything about one."""
+    names = spec_names() if args.name is None else (args.name,)
+    specs = [load_spec(name) for name in names]
+    if args.json is not None:
+        write_json(args.json, {"data_sets": [known_of(spec) for spec in specs]})
+        console.line(f"{len(specs)} data sets written to {args.json}")
+    elif args.name is None:
+        console.table(COLUMNS, table_rows())
+        console.line("weight: share in a mixture of all training sets, by the root of their images")
+    else:
+        console.line(as_yaml(specs[0]).rstrip())
+        if share_of(specs[0]) is not None:
+            console.line(f"# {share_of(specs[0]):.1%} of a mixture of all training sets")
+
+
+def all_specs() -> list[DataSetSpec]:
+    """Training sets first, then by name."""
+    specs = [load_spec(name) for name in spec_names()]
+    return sorted(specs, key=lambda spec: ("training" not in spec.roles, spec.name.casefold()))
+
+
+def share_of(spec: DataSetSpec) -> float | None:
+    """Its weight in a mixture of all training sets, of 1; None for other data sets."""
+    if "training" not in spec.roles:
+        return None
+    return spec.weight / sum(x.weight for x in all_specs() if "training" in x.roles)
+
+
+def table_rows() -> list[tuple[str | None, ...]]:
+    """A row a data set, as COLUMNS names them."""
+    rows: list[tuple[str | None, ...]] = []
+    for spec in all_specs():
+        share = share_of(spec)
+        rows.append(
+            (
+                spec.name,
+                spec.kind,
+                _count(spec.counts.scenes),
+                _count(spec.counts.images),
+                None if share is None else f"{share:.1%}",
+                ", ".join(spec.roles),
+                spec.layout,
+            )
+        )
+    return rows
+
+
+def known_of(spec: DataSetSpec) -> dict[str, Any]:
+    """A spec as JSON-ready values, with its weight and its share in a mixture."""
+    return {**spec.model_dump(mode="json"), "weight": spec.weight, "share": share_of(spec)}
+
+
+def as_yaml(spec: DataSetSpec) -> str:
+    """What is known of a data set, in the words of its file."""
+    import yaml
+
+    known = spec.model_dump(mode="json", exclude_none=True)
+    return str(yaml.safe_dump(known, sort_keys=False, allow_unicode=True, width=96))
+
+
+def _count(number: int | None) -> str | None:
+    return None if number is None else f"{number:,}"
+
+
+# --- check ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class SceneCheck:
+    """A scene of a download."""
+
+    scene: str
+    report: SceneReport | None  # None where nothing of it could be read
+    problem: str | None = None  # the first thing that keeps it from being used
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-ready values."""
+        if self.report is None:
+            return {"scene": self.scene, "ok": False, "problem": self.problem}
+        return {"scene": self.scene, **self.report.to_dict(), "problem": self.problem}
+
+
+def check_data_set(args: argparse.Namespace, console: Console) -> None:
+    """Report on each scene as soon as it is read."""
+    spec = load_spec(args.name)
+    names = chosen_scenes(args.name, args.root, args.scene)
+    counted: Counter[str] = Counter()
+    said: set[tuple[str, str]] = set()
+    bad: list[str] = []
+    with ExitStack() as stack:
+        written = None
+        if args.json is not None:
+            head = {"data_set": spec.name, "root": str(args.root)}
+            written = stack.enter_context(json_list_written(args.json, head, "scenes"))
+        for check in checks(spec, args.root, names):
+            _print_check(check, console, said)
+            if written is not None:
+                written.add(check.to_dict())
+            if check.report is not None:
+                counted["views"] += check.report.views
+                counted["depth"] += check.report.depth.views if check.report.depth else 0
+            if check.problem is not None:
+                counted["bad"] += 1
+                bad = bad or [f"{check.scene}: {check.problem}"]
+    published = (spec.counts.scenes, "scenes"), (spec.counts.images, "images")
+    known = ", ".join(f"{number:,} {noun}" for number, noun in published if number is not None)
+    console.line(
+        f"{args.root}: {len(names):,} scenes, {counted['views']:,} views, {counted['depth']:,} "
+        f"with depth (all of {spec.name}: {known or 'counts not known'})"
+    )
+    if bad:
+        raise ProjectError(
+            f"{args.root}: {counted['bad']} of {len(names)} scenes cannot be used, first {bad[0]}"
+        )
+
+
+def checks(spec: DataSetSpec, root: Path, scenes: Iterable[str]) -> Iterator[SceneCheck]:
+    """Read scenes one after the other; none is kept."""
+    for scene in scenes:
+        try:
+            report = inspect(read_scene(spec, scene, root), probes=PROBES)
+        except OptionError:
+            raise
+        except GvError as error:
+            yield SceneCheck(scene, None, str(error))
+        else:
+            errors = (item.message for item in report.findings if item.level == "error")
+            yield SceneCheck(scene, report, next(errors, None))
+
+
+def _print_check(check: SceneCheck, console: Console, said: set[tuple[str, str]]) -> None:
+    """A line for the scene, and one for each finding that no scene before had."""
+    report = check.report
+    if report is None:
+        console.line(f"{check.scene}: cannot be read")
+        console.line(f"  error: {check.problem}")
+        return
+    sizes = ", ".join(report.sizes)
+    line = [f"{check.scene}: {report.views:,} views of {sizes}"]
+    depth = report.depth
+    if depth is not None:
+        line.append(f"{depth.views:,} with depth")
+    if depth is not None and depth.median is not None:
+        unit = "m" if report.metric else "scene units"
+        low, middle, high = depth.minimum, depth.median, depth.maximum
+        line.append(f"{low:.4g} to {high:.4g} {unit}, median {middle:.4g}")
+    levels = Counter(item.level for item in report.findings)
+    line += [f"{levels[level]} {NOUNS[level]}" for level in NOUNS if levels[level]]
+    console.line("; ".join(line))
+    for level in NOUNS:
+        for item in report.findings:
+            if item.level == level and (level, item.message) not in said:
+                said.add((level, item.message))
+                console.line(f"  {level}: {item.message}")
+
+
+# --- stats ------------------------------------------------------------------------------------
+
+
+@dataclass
+class Statistics:
+    """Figures of scenes that were seen one after the other."""
+
+    scenes: int = 0  # that were read
+    skipped: int = 0  # that could not be
+    views: int = 0
+    with_depth: int = 0  # of the views
+    sampled: int = 0  # views whose pixels were decoded
+    unreadable: int = 0  # of the views that were to be
+    metric: int = 0  # scenes whose units are metres
+    sizes: Counter[str] = field(default_factory=Counter)  # "WIDTHxHEIGHT", numbers of views
+    views_per_scene: LogHistogram = field(default_factory=LogHistogram)
+    baseline: LogHistogram = field(default_factory=LogHistogram)  # scene units
+    turn: LogHistogram = field(default_factory=LogHistogram)  # to the next view, degrees
+    focal: LogHistogram = field(default_factory=LogHistogram)  # pixels
+    field_of_view: LogHistogram = field(default_factory=LogHistogram)  # across, degrees
+    depth: LogHistogram = field(default_factory=LogHistogram)  # of sampled views, scene units
+    coverage: LogHistogram = field(default_factory=LogHistogram)  # pixels with depth, per cent
+
+    @property
+    def unit(self) -> str:
+        """Of baselines and depth."""
+        if self.metric == self.scenes:
+            return "m"
+        return "scene units" if not self.metric else "mixed units"
+
+    @property
+    def distributions(self) -> dict[str, tuple[str, LogHistogram]]:
+        """By name, what is measured and its values."""
+        labels = {
+            "views_per_scene": "views per scene",
+            "baseline": f"baseline to the next view, {self.unit}",
+            "turn": "turn to the next view, degrees",
+            "focal": "focal length, pixels",
+            "field_of_view": "field of view, degrees",
+            "depth": f"depth, {self.unit}",
+            "coverage": "pixels with depth, %",
+        }
+        return {name: (label, getattr(self, name)) for name, label in labels.items()}
+
+    def add(self, scene: Scene) -> None:
+        """See a scene; a few of its views are decoded."""
+        self.scenes += 1
+        self.metric += scene.metric
+        self.views += len(scene)
+        self.views_per_scene.add(len(scene))
+        self.with_depth += sum(view.has_depth for view in scene)
+        if not scene.views:
+            return
+        cameras = scene.cameras
+        self.sizes.update(f"{w}x{h}" for w, h in zip(cameras.width, cameras.height, strict=True))
+        self.focal.add(cameras.K[:, (0, 1), (0, 1)].mean(axis=1))
+        half = cameras.width / 2 / cameras.K[:, 0, 0]
+        self.field_of_view.add(np.degrees(2 * np.arctan(half)))
+        self.baseline.add(np.linalg.norm(np.diff(cameras.centers, axis=0), axis=1))
+        R = cameras.cam_from_world[:, :3, :3]
+        # The Frobenius distance of two rotations that differ by the angle t is sqrt(8) sin(t / 2).
+        sine = np.linalg.norm(R[1:] - R[:-1], axis=(1, 2)) / np.sqrt(8)
+        self.turn.add(np.degrees(2 * np.arcsin(np.minimum(sine, 1))))
+        for number in spread(len(scene), PROBES):
+            self._decode(scene, number)
+
+    def _decode(self, scene: Scene, number: int) -> None:
+        try:
+            frame = scene.views[number].load()
+        except OptionError:
+            raise
+        except GvError:
+            self.unreadable += 1
+            return
+        self.sampled += 1
+        if frame.depth is not None:
+            known = frame.depth[frame.depth > 0]
+            self.depth.add(known)
+            self.coverage.add(100 * known.size / frame.depth.size)
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-ready values."""
+        counts = ("scenes", "skipped", "views", "with_depth", "sampled", "unreadable")
+        spreads = {name: _spread(values) for name, (_, values) in self.distributions.items()}
+        sizes = {"unit": self.unit, "sizes": dict(self.sizes)}
+        return {**{name: getattr(self, name) for name in counts}, **sizes, **spreads}
+
+
+def statistics_of_data_set(args: argparse.Namespace, console: Console) -> None:
+    """Print figures of all scenes of a download together."""
+    spec = load_spec(args.name)
+    names = chosen_scenes(args.name, args.root, args.scene)
+    total = Statistics()
+    first = ""
+    for name in console.track(names, "scenes"):
+        try:
+            total.add(read_scene(spec, name, args.root))
+        except OptionError:
+            raise
+        except GvError as error:
+            total.skipped += 1
+            first = first or f"{name}: {error}"
+    if not total.scenes:
+        raise ProjectError(f"{args.root}: none of {len(names)} scenes can be read, first {first}")
+    if total.skipped:
+        console.warn(f"{total.skipped} of {len(names)} scenes cannot be read, first {first}")
+    if total.unreadable:
+        console.warn(f"{total.unreadable} sampled views cannot be read; see gvtools data check")
+    if args.json is not None:
+        head = {"data_set": spec.name, "root": str(args.root)}
+        write_json(args.json, {**head, **total.to_dict()})
+        console.line(f"figures written to {args.json}")
+    else:
+        _print_statistics(total, console)
+
+
+def _print_statistics(total: Statistics, console: Console) -> None:
+    console.line(
+        f"{total.scenes:,} scenes, {total.views:,} views, {total.with_depth:,} with depth; depth "
+        f"of {total.sampled:,} sampled views"
+    )
+    sizes = ", ".join(f"{size} ({count:,})" for size, count in total.sizes.most_common(5))
+    more = f" and {len(total.sizes) - 5} more sizes" if len(total.sizes) > 5 else ""
+    console.line(f"pixels (views): {sizes}{more}")
+    rows = []
+    for label, values in total.distributions.values():
+        if values.count:
+            numbers = [values.percentile(percent) for percent in PERCENTILES]
+            rows.append((label, f"{values.count:,}", values.minimum, *numbers, values.maximum))
+    columns = ("", "count", "min", *(f"{percent} %" for percent in PERCENTILES), "max")
+    console.table(columns, rows)
+
+
+def _spread(values: LogHistogram) -> dict[str, float] | None:
+    if not values.count:
+        return None
+    percentiles = {f"p{percent}": values.percentile(percent) for percent in PERCENTILES}
+    return {"count": values.count, "min": values.minimum, **percentiles, "max": values.maximum}
