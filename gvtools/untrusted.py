@@ -10,6 +10,7 @@ from __future__ import annotations
 import codecs
 import io
 import json
+import math
 import os
 import stat
 import struct
@@ -24,7 +25,6 @@ from typing import IO, TYPE_CHECKING, Any, Protocol
 from gvtools.errors import ProjectError
 
 if TYPE_CHECKING:
-    import numpy as np
     from numpy.typing import NDArray
     from PIL import Image
 
@@ -283,34 +283,25 @@ def read_array(stream: IO[bytes], size: int) -> NDArray[Any]:
     """
     import numpy as np
 
+    form: Any = np.lib.format
     try:
-        version = np.lib.format.read_magic(stream)  # type: ignore[arg-type]
-        read_head = {
-            (1, 0): np.lib.format.read_array_header_1_0,
-            (2, 0): np.lib.format.read_array_header_2_0,
-        }.get(version)
-        if read_head is None:
-            raise ValueError(f"an array of NumPy's format {version}")
-        shape, fortran, dtype = read_head(stream)  # type: ignore[arg-type]
+        version = form.read_magic(stream)
+        heads = {(1, 0): form.read_array_header_1_0, (2, 0): form.read_array_header_2_0}
+        shape, _, dtype = heads[version](stream)
     except Exception as error:
         # What its parser of the head, which is Python's own, stumbles upon, it raises as it comes.
         raise ValueError(f"an array with a damaged head ({type(error).__name__})") from None
     if dtype.hasobject:
         raise ValueError("an array of objects, which may hold code")
-    count = 1
-    for length in shape:
-        if length < 0:
-            raise ValueError(f"an array of shape {shape}")
-        count *= int(length)
-    if count * dtype.itemsize > size:
+    if min(shape, default=0) < 0 or math.prod(map(int, shape)) * dtype.itemsize > size:
         raise ValueError(f"an array of shape {shape} and type {dtype} in {size} bytes")
-    data = stream.read(count * dtype.itemsize)
-    if len(data) != count * dtype.itemsize:
-        raise ValueError(f"an array that ends early, of shape {shape} and type {dtype}")
-    if dtype.kind == "U" and (np.frombuffer(data, f"{dtype.byteorder}u4") > sys.maxunicode).any():
-        raise ValueError("an array of texts whose signs are none")
-    flat: np.ndarray[Any, Any] = np.frombuffer(bytearray(data), dtype, count)
-    return flat.reshape(shape[::-1]).T if fortran else flat.reshape(shape)
+    stream.seek(0)
+    array: NDArray[Any] = form.read_array(stream, allow_pickle=False)
+    if dtype.kind == "U" and array.size:
+        signs = np.ascontiguousarray(array).reshape(-1).view(f"{dtype.byteorder}u4")
+        if (signs > sys.maxunicode).any():
+            raise ValueError("an array of texts whose signs are none")
+    return array
 
 
 def open_picture(source: Path | bytes) -> Image.Image:

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from gvtools.cameras import Cameras
 from gvtools.memory.spatial_memory import FuseReport, SpatialMemory
 from gvtools.memory.store.points import PointSet
-from gvtools.scans.placement import Placement
 from gvtools.scans.points import Scan
+from gvtools.scans.registration import Placement
 
 # Density around a point is computed from so many nearest neighbours.
 NEIGHBOURS = 8

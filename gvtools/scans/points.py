@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -68,13 +68,13 @@ class ScanFile:
         path: the file.
         count: number of points, including unusable ones.
         stations: at least one.
-        chunks: reads all points, in the order of the file.
+        chunks: all points, in the order of the file, read as they are asked for.
     """
 
     path: Path
     count: int
     stations: tuple[Station, ...]
-    chunks: Callable[[], Iterator[Chunk]]
+    chunks: Iterator[Chunk]
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.errors import GvError, MemoryFileError, OptionError
+from gvtools.scans.lidar import open_lidar
 from gvtools.scans.points import Chunk, Scan, ScanFile
+from gvtools.scans.tables import open_pcd, open_ply
 
 SUFFIXES = (".ply", ".las", ".laz", ".e57", ".pcd")
 # Points that are kept at once, 36 bytes each and as much again for work; more are thinned.
@@ -24,7 +25,6 @@ CELLS = 1 << 14
 DARK, BRIGHT, GREY = 0.01, 0.99, 128
 # Beyond it no unit is meant.
 FARTHEST = 1e15
-WRONG = (KeyboardInterrupt, SystemExit, GeneratorExit)
 
 
 def open_scan(path: Path, *, generated: bool = False) -> ScanFile:
@@ -41,16 +41,11 @@ def open_scan(path: Path, *, generated: bool = False) -> ScanFile:
         raise MemoryFileError(f"{path}: no such file; expected a scan")
     with _one_line(path):
         if suffix == ".ply":
-            from gvtools.scans.ply import open_ply as open_
+            file = open_ply(path)
         elif suffix == ".pcd":
-            from gvtools.scans.pcd import open_pcd as open_
-        elif suffix == ".e57":
-            from gvtools.scans.e57 import open_e57 as open_
+            file = open_pcd(path)
         else:
-            from gvtools.scans.las import open_las
-
-            open_ = partial(open_las, generated=generated)
-        file = open_(path)
+            file = open_lidar(path, generated=generated)
     if not file.count:
         raise MemoryFileError(f"{path}: no points in it; expected a scan")
     return file
@@ -67,7 +62,7 @@ def read_scan(path: Path, *, most: int = MOST_POINTS, generated: bool = False) -
     file = open_scan(path, generated=generated)
     reading = _Reading(most)
     with _one_line(path):
-        for chunk in file.chunks():
+        for chunk in file.chunks:
             reading.add(chunk)
     held = reading.whole()
     if held is None:
@@ -81,38 +76,22 @@ def read_scan(path: Path, *, most: int = MOST_POINTS, generated: bool = False) -
 
 @contextmanager
 def _one_line(path: Path) -> Iterator[None]:
-    """What any reader complains of, in one line."""
+    """What any reader complains of, in one line; the words of a format's library tell nothing."""
     try:
         yield
-    except (GvError, *WRONG):
+    except GvError:
         raise
-    except ImportError as error:
-        raise OptionError(_absent(path, str(error))) from None
     except MemoryError:
         raise MemoryFileError(
             f"{path}: asks for more memory than there is; the file is damaged, or too large for "
             "this machine; save it again"
         ) from None
-    except BaseException as error:  # readers in Rust raise panics, which are no Exceptions
-        # laspy has an error of its own where no decompressor is installed.
-        if "No LazBackend" in str(error):
-            raise OptionError(_absent(path, "no decompressor")) from None
-        reason = getattr(error, "strerror", None)
-        if reason is None:
-            # The words of a format's library and its places in C++ tell users nothing.
-            failed = "checksum" in str(error).lower()
-            reason = "a checksum does not match" if failed else "its parts contradict each other"
+    except Exception as error:
+        reason = getattr(error, "strerror", None) or "its parts contradict each other"
         raise MemoryFileError(
             f"{path}: cannot be read ({reason}); expected a whole {path.suffix.upper()[1:]} point "
             "cloud; the file is damaged, or of a kind that is not known; save it again"
         ) from error
-
-
-def _absent(path: Path, reason: str) -> str:
-    return (
-        f"{path}: a package that reads {path.suffix.upper()[1:]} is not installed ({reason}); run "
-        "'pip install \"gvtools[scan]\"'"
-    )
 
 
 class _Reading:

@@ -1,9 +1,10 @@
-"""Rows of numbers, binary or as text: what PLY and PCD files hold after their headers."""
+"""Points of PLY and PCD files: rows of numbers, binary or as text, that follow a header."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
@@ -11,7 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.errors import MemoryFileError
-from gvtools.scans.points import CHUNK
+from gvtools.kernels import compiled
+from gvtools.ply import point_vertices, read_header
+from gvtools.scans.points import CHUNK, GENERATED, Chunk, ScanFile, Station
 
 # A number and what parts it from the next one; what one takes at most.
 LEAST_TEXT, MOST_TEXT = 2, 64
@@ -19,60 +22,89 @@ LEAST_TEXT, MOST_TEXT = 2, 64
 CHUNK_BYTES = 1 << 26
 Columns = Mapping[str, NDArray[Any]]
 
+# Names that programs give to the colour, and to how much light came back, the usual first.
+COLORS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
+INTENSITIES = ("intensity", "scalar_Intensity", "scalar_intensity", "reflectance")
 
-def check_size(path: Path, needed: int, *, told: str) -> None:
-    """Refuse a file that is shorter than its header says."""
-    found = path.stat().st_size
-    if found < needed:
+MAX_HEADER = 1 << 13
+KEYS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS",
+        "DATA")  # fmt: skip
+KINDS = {"F": "f", "U": "u", "I": "i"}
+SIZES = ("1", "2", "4", "8")
+# What is read of a compressed file's fields, and how much they unpack to at most: LZF makes no more
+# than 88 bytes of one, and of points about two.
+READ = ("x", "y", "z", "rgb", "rgba", "intensity")
+MOST_RATIO, MOST_BYTES = 88, 1 << 31
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of a file: ``layout`` is "text", "rows" or "columns" (compressed, field by field)."""
+
+    dtype: np.dtype[np.void]
+    count: int
+    layout: str
+    offset: int  # of the first row, bytes
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """A name for each number of a row: fields of several are numbered."""
+        names = []
+        for name in self.dtype.names or ():
+            count = int(np.prod(self.dtype[name].shape))
+            names += [name] if count == 1 else [f"{name}[{k}]" for k in range(count)]
+        return tuple(names)
+
+    def check(self, path: Path) -> None:
+        """Refuse a file that is shorter than its header says."""
+        text = self.layout == "text"
+        least = LEAST_TEXT * len(self.names) if text else self.dtype.itemsize
+        needed = self.offset + self.count * least - text
+        found = path.stat().st_size
+        if found < needed:
+            raise MemoryFileError(
+                f"{path}: {found} bytes, but its header says {self.count} points, at least "
+                f"{needed}; the file is truncated or damaged; save it again"
+            )
+
+    def chunks(self, path: Path) -> Iterator[Columns]:
+        """Its columns, so many rows at a time that memory does not grow with them."""
+        width = 8 * len(self.names) if self.layout == "text" else self.dtype.itemsize
+        step = min(CHUNK, max(1, CHUNK_BYTES // width))
+        parts = [(first, min(step, self.count - first)) for first in range(0, self.count, step)]
+        if self.layout == "columns":
+            unpacked = _unpacked(path, self)
+            for first, rows in parts:
+                yield {name: column[first : first + rows] for name, column in unpacked.items()}
+        elif self.layout == "rows":
+            for first, rows in parts:
+                offset = self.offset + first * self.dtype.itemsize
+                table = np.fromfile(path, self.dtype, rows, offset=offset)
+                yield {name: table[name] for name in self.dtype.names or ()}
+        else:
+            with path.open("rb") as file:
+                file.seek(self.offset)
+                for _, rows in parts:
+                    yield dict(zip(self.names, _numbers(path, file, self.names, rows), strict=True))
+
+
+def _numbers(path: Path, file: IO[bytes], names: tuple[str, ...], rows: int) -> NDArray[np.float64]:
+    """(columns, rows) of the next lines of a text."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            lines = _lines(file, rows, MOST_TEXT * len(names))
+            table = np.loadtxt(lines, ndmin=2, comments=None)
+    except ValueError as error:
         raise MemoryFileError(
-            f"{path}: {found} bytes, but its header says {told}, at least {needed}; the file is "
+            f"{path}: a point is not {len(names)} numbers ({error}); save it again"
+        ) from None
+    if table.shape != (rows, len(names)):
+        raise MemoryFileError(
+            f"{path}: {table.shape} numbers; expected {rows} lines of {len(names)}; the file is "
             "truncated or damaged; save it again"
         )
-
-
-def rows_at_once(dtype: np.dtype[np.void]) -> int:
-    """How many rows are read at once."""
-    return min(CHUNK, max(1, CHUNK_BYTES // dtype.itemsize))
-
-
-def binary_rows(
-    path: Path, dtype: np.dtype[np.void], count: int, *, offset: int
-) -> Iterator[Columns]:
-    """Chunks of ``count`` packed rows from a byte on."""
-    told = f"{count} points of {dtype.itemsize} bytes"
-    check_size(path, offset + count * dtype.itemsize, told=told)
-    step = rows_at_once(dtype)
-    for first in range(0, count, step):
-        rows = min(step, count - first)
-        table = np.fromfile(path, dtype, rows, offset=offset + first * dtype.itemsize)
-        yield {name: table[name] for name in dtype.names or ()}
-
-
-def text_rows(path: Path, names: tuple[str, ...], count: int, *, offset: int) -> Iterator[Columns]:
-    """Chunks of ``count`` lines of numbers from a byte on, as float64."""
-    told = f"{count} lines of {len(names)} numbers"
-    check_size(path, offset + LEAST_TEXT * count * len(names) - 1, told=told)
-    with path.open("rb") as file:
-        file.seek(offset)
-        step = min(CHUNK, max(1, CHUNK_BYTES // (8 * len(names))))
-        for first in range(0, count, step):
-            rows = min(step, count - first)
-            try:
-                with warnings.catch_warnings():
-                    warnings.simplefilter("ignore")
-                    table = np.loadtxt(
-                        _lines(file, rows, MOST_TEXT * len(names)), ndmin=2, comments=None
-                    )
-            except ValueError as error:
-                raise MemoryFileError(
-                    f"{path}: a point is not {len(names)} numbers ({error}); save it again"
-                ) from None
-            if table.shape != (rows, len(names)):
-                raise MemoryFileError(
-                    f"{path}: {table.shape} numbers; expected {told}; the file is truncated or "
-                    "damaged; save it again"
-                )
-            yield dict(zip(names, table.T, strict=True))
+    return table.T
 
 
 def _lines(file: IO[bytes], count: int, most: int) -> Iterator[bytes]:
@@ -84,3 +116,183 @@ def _lines(file: IO[bytes], count: int, most: int) -> Iterator[bytes]:
         if not line:
             return
         yield line
+
+
+def open_ply(path: Path) -> ScanFile:
+    """A PLY, its header read: of either byte order or as text, with or without faces behind."""
+    header = read_header(path)
+    vertices = point_vertices(path, header)
+    layout = "rows" if header.order else "text"
+    table = Table(header.dtype(vertices), vertices.count, layout, header.offset)
+    table.check(path)
+    kinds = {name: np.dtype(kind) for name, kind in vertices.columns}
+    chunks = (_ply_chunk(columns, kinds) for columns in table.chunks(path))
+    return ScanFile(path, table.count, (Station(path.stem),), chunks)
+
+
+def _ply_chunk(columns: Columns, kinds: Mapping[str, np.dtype[Any]]) -> Chunk:
+    colors = None
+    for names in COLORS:
+        if colors is None and set(names) <= set(columns):
+            # Integers by the range of their type, others from 0 to 1.
+            kind = kinds[names[0]]
+            top = float(np.iinfo(kind).max) if kind.kind in "ui" else 1.0
+            rgb = np.stack([columns[name].astype(np.float32) for name in names], axis=1)
+            scaled = np.clip(np.nan_to_num(rgb) * (255 / top), 0, 255)
+            colors = np.rint(scaled).astype(np.uint8)
+    intensity = next((columns[n].astype(np.float32) for n in INTENSITIES if n in columns), None)
+    chunk = Chunk(_positions(columns), colors, intensity)
+    return chunk.without(columns[GENERATED] != 0, GENERATED) if GENERATED in columns else chunk
+
+
+def _positions(columns: Columns) -> NDArray[np.float64]:
+    return np.stack([columns[axis].astype(np.float64) for axis in "xyz"], axis=1)
+
+
+def open_pcd(path: Path) -> ScanFile:
+    """A PCD, its header read: as text, binary or compressed."""
+    table = _pcd_header(path)
+    if table.layout == "columns":
+        _check_compressed(path, table)
+    else:
+        table.check(path)
+    chunks = (_pcd_chunk(columns, table.dtype) for columns in table.chunks(path))
+    return ScanFile(path, table.count, (Station(path.stem),), chunks)
+
+
+def _pcd_chunk(columns: Columns, dtype: np.dtype[np.void]) -> Chunk:
+    colors = None
+    name = next((name for name in ("rgb", "rgba") if name in columns), None)
+    if name is not None:
+        # One number each, 0xRRGGBB; as float, its bits are meant.
+        if dtype[name].kind == "f":
+            bits = columns[name].astype(np.float32).view(np.uint32)
+        else:
+            bits = columns[name].astype(np.int64).astype(np.uint32)
+        rgb = np.stack([(bits >> shift) & 255 for shift in (16, 8, 0)], axis=1)
+        colors = rgb.astype(np.uint8)
+    intensity = columns["intensity"].astype(np.float32) if "intensity" in columns else None
+    return Chunk(_positions(columns), colors, intensity)
+
+
+def _pcd_header(path: Path) -> Table:
+    with path.open("rb") as file:
+        head = file.read(MAX_HEADER)
+    given: dict[str, list[str]] = {}
+    offset = 0
+    while "DATA" not in given:
+        end = head.find(b"\n", offset)
+        words = head[offset:end].decode("ascii", "replace").split()
+        if end < 0 or (words and not words[0].startswith("#") and words[0] not in KEYS):
+            raise MemoryFileError(f"{path}: no PCD header; expected a PCD point cloud")
+        offset = end + 1
+        if words and not words[0].startswith("#"):
+            if words[0] in given:
+                raise MemoryFileError(f"{path}: PCD header with two lines {words[0]}")
+            given[words[0]] = words[1:]
+    try:
+        return _pcd_table(given, offset)
+    except (KeyError, ValueError, IndexError, TypeError) as error:
+        raise MemoryFileError(
+            f"{path}: PCD header that does not describe points x, y, z ({error!r}); expected "
+            "FIELDS, SIZE, TYPE, WIDTH, HEIGHT, POINTS and DATA that fit together"
+        ) from None
+
+
+def _pcd_table(given: Mapping[str, list[str]], offset: int) -> Table:
+    """The table of a header's lines, by key."""
+    names = given["FIELDS"]
+    counts = [int(count) for count in given.get("COUNT", ["1"] * len(names))]
+    columns: list[tuple[Any, ...]] = []
+    for name, kind, size, count in zip(names, given["TYPE"], given["SIZE"], counts, strict=True):
+        if not 1 <= count <= 4096 or size not in SIZES:
+            raise ValueError(f"COUNT {count}, SIZE {size[:9]}")
+        # Gaps between fields have the name _, perhaps several times.
+        label = f"gap {len(columns)}" if name == "_" else name
+        shape = (label, KINDS[kind] + size)
+        columns.append(shape if count == 1 else (*shape, (count,)))
+    dtype = np.dtype(columns)
+    if not {"x", "y", "z"} <= set(names):
+        raise ValueError("no x, y, z")
+    several = [name for name in READ if name in names and dtype[name].shape]
+    if several:
+        raise ValueError(f"{several[0]} of several numbers")
+    count = int(given["POINTS"][0])
+    if count < 0 or count != int(given["WIDTH"][0]) * int(given["HEIGHT"][0]):
+        raise ValueError(f"{count} points")
+    layouts = {"ascii": "text", "binary": "rows", "binary_compressed": "columns"}
+    return Table(dtype, count, layouts[given["DATA"][0]], offset)
+
+
+def _check_compressed(path: Path, table: Table) -> None:
+    """Refuse sizes that the points or the file contradict, before anything is unpacked."""
+    sizes = np.fromfile(path, "<u4", 2, offset=table.offset).tolist()
+    packed, whole = sizes if len(sizes) == 2 else (0, 0)
+    expected, there = table.count * table.dtype.itemsize, path.stat().st_size - table.offset - 8
+    if packed > max(there, 0) or whole != expected or whole > MOST_RATIO * packed:
+        raise MemoryFileError(
+            f"{path}: {packed} compressed bytes of {whole}, but its header says {table.count} "
+            f"points, that is {expected}; the file is truncated or damaged; save it again"
+        )
+    if whole > MOST_BYTES:
+        raise MemoryFileError(
+            f"{path}: {whole} bytes when unpacked; expected at most {MOST_BYTES}; save it as "
+            "binary PCD or LAZ"
+        )
+
+
+def _unpacked(path: Path, table: Table) -> dict[str, NDArray[Any]]:
+    """The columns of compressed points."""
+    packed, whole = np.fromfile(path, "<u4", 2, offset=table.offset).tolist()
+    data = np.fromfile(path, np.uint8, packed, offset=table.offset + 8)
+    out = np.empty(whole, np.uint8)
+    if unpack_lzf(data, out) != whole:
+        raise MemoryFileError(
+            f"{path}: its compressed points do not unpack to {whole} bytes; the file is damaged; "
+            "save it again"
+        )
+    columns = {}
+    for name in READ:
+        if name in (table.dtype.names or ()):
+            kind, start = table.dtype.fields[name][:2]  # type: ignore[index]
+            columns[name] = np.frombuffer(out, kind, table.count, offset=table.count * start)
+    return columns
+
+
+@compiled()
+def unpack_lzf(packed: Any, out: Any) -> int:
+    """Unpack LZF; how many bytes these are, or -1 where it is damaged or ``out`` is too small.
+
+    A control byte below 32 is followed by that many bytes and one more. Any other begins a copy of
+    what was unpacked before: its upper three bits are the length less 2 (7: a further byte is
+    added), its lower five and the last byte how far back it begins, less 1.
+    """
+    at, end, count, room = 0, 0, len(packed), len(out)
+    while at < count:
+        control = int(packed[at])
+        at += 1
+        if control < 32:
+            length = control + 1
+            if at + length > count or end + length > room:
+                return -1
+            for k in range(length):
+                out[end + k] = packed[at + k]
+            at += length
+        else:
+            length = control >> 5
+            if length == 7:
+                if at >= count:
+                    return -1
+                length += int(packed[at])
+                at += 1
+            if at >= count:
+                return -1
+            source = end - ((control & 31) << 8) - int(packed[at]) - 1
+            at += 1
+            length += 2
+            if source < 0 or end + length > room:
+                return -1
+            for k in range(length):
+                out[end + k] = out[source + k]
+        end += length
+    return end

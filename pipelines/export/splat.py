@@ -21,7 +21,7 @@ from gvtools.appearance.splat.project_kernels import (
     VALUES,
 )
 from gvtools.errors import MemoryFileError
-from gvtools.memory.io.ply import read_ply, write_ply
+from gvtools.ply import read_ply, write_ply
 from pipelines.export.source import ExportOptions, Source
 from pipelines.export.splats import Splats, splats_of
 

@@ -29,8 +29,8 @@ from pipelines.console import Console
 if TYPE_CHECKING:
     from gvtools.depth.source import DepthSource
     from gvtools.memory.spatial_memory import FuseReport, SpatialMemory
-    from gvtools.scans.placement import Placement
     from gvtools.scans.points import Scan
+    from gvtools.scans.registration import Placement
     from pipelines.reconstruction.settings import RunSettings
 
 # Two pictures are one shot when their centres are this near (a share of the context's extent) and

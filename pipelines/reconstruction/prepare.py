@@ -30,9 +30,8 @@ if TYPE_CHECKING:
     from gvtools.depth.source import DepthSource
     from gvtools.runs.depth_cache import DepthCache
     from gvtools.runs.folder import RunDirectory
-    from gvtools.scans.placement import Placement
     from gvtools.scans.points import Scan
-    from gvtools.scans.surface import Surface
+    from gvtools.scans.registration import Placement, Surface
     from pipelines.reconstruction.settings import RunSettings, ScanOptions
 
 # A fit whose length is not given takes at most so long if no photographs can be left out to tell
@@ -292,8 +291,8 @@ VIEWS, PIXELS = 40, 5000
 
 def check_scan(options: ScanOptions) -> None:
     """Refuse a scan that cannot be read or placed before anything is computed."""
-    from gvtools.scans.placement import given_placement
     from gvtools.scans.read import open_scan
+    from gvtools.scans.registration import given_placement
 
     if options.file is None:
         if options.placement != "estimate":
@@ -305,9 +304,8 @@ def check_scan(options: ScanOptions) -> None:
 
 def placed_scan(plan: Plan, console: Console) -> PlacedScan | None:
     """The run's scan, placed with the plan's cameras; None where there is none."""
-    from gvtools.scans.placement import given_placement
     from gvtools.scans.read import read_scan
-    from gvtools.scans.registration import register
+    from gvtools.scans.registration import given_placement, register
 
     options = plan.config.scan
     if options.file is None:
@@ -355,7 +353,7 @@ def _told(scan: Scan) -> str:
 
 
 def _surface(scan: Scan) -> Surface:
-    from gvtools.scans.surface import Surface
+    from gvtools.scans.registration import Surface
 
     centers = [station.center for station in scan.stations]
     if any(center is None for center in centers):
@@ -365,7 +363,7 @@ def _surface(scan: Scan) -> Surface:
 
 def photographed(plan: Plan) -> Surface:
     """What the context is known to show: recorded depth, else the project's sparse points."""
-    from gvtools.scans.surface import Surface
+    from gvtools.scans.registration import Surface
 
     scene, positions, seen_from = plan.scene, list[NDArray[Any]](), list[NDArray[Any]]()
     rng = np.random.default_rng(plan.config.seed)

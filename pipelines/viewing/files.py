@@ -13,12 +13,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.errors import GvError, MemoryFileError, OptionError
+from gvtools.errors import GvError, MemoryFileError
 from gvtools.memory.spatial_memory import SpatialMemory
+from gvtools.optional import require
+from gvtools.ply import read_header
 from pipelines.export import splat, spz
 from pipelines.export.splats import Splats
 from pipelines.viewing.gaussians import shown_gaussians
-from pipelines.viewing.meshes import HEADER, load_mesh
+from pipelines.viewing.meshes import load_mesh
 from pipelines.viewing.usd_points import GREY, read_usd
 from viz.run_view.gaussians import Surface
 from viz.run_view.view import MESH, POINTS, RENDERED, SPLATS, RunView
@@ -34,11 +36,6 @@ def open_file(path: Path) -> RunView | None:
         return None
     try:
         return OPENERS[suffix](path)
-    except ImportError as error:
-        raise OptionError(
-            f"{path}: {suffix} needs {error.name}, not installed here; run 'pip install "
-            '"gvtools[export]"\''
-        ) from None
     except GvError:
         raise
     except Exception as error:  # Readers of other packages raise what they please.
@@ -49,14 +46,11 @@ def open_file(path: Path) -> RunView | None:
 
 
 def _open_ply(path: Path) -> RunView | None:
-    with path.open("rb") as file:
-        words = [line.split() for line in file.read(HEADER).split(b"end_header")[0].splitlines()]
-    if any(line[:2] == [b"element", b"face"] and line[2:] != [b"0"] for line in words):
+    header = read_header(path)
+    if header.holds("face"):
         return _open_mesh(path)
-    names = {line[-1].decode("ascii", "replace") for line in words if line[:1] == [b"property"]}
-    if not splat.is_splat(names):
-        return None
-    return _splat_view(path, splat.read(path))
+    names = {name for element in header.elements for name, _ in element.columns}
+    return _splat_view(path, splat.read(path)) if splat.is_splat(names) else None
 
 
 def _open_spz(path: Path) -> RunView:
@@ -64,6 +58,7 @@ def _open_spz(path: Path) -> RunView:
 
 
 def _open_mesh(path: Path) -> RunView:
+    require("trimesh", extra="export", purpose=f"{path}: {path.suffix}")
     import trimesh
 
     loaded = load_mesh(path)
@@ -87,9 +82,9 @@ def _vertex_colors(mesh: trimesh.Trimesh) -> NDArray[np.uint8]:
 
 
 def _open_las(path: Path) -> RunView:
-    import laspy  # noqa: F401 (so that what is absent is named as of an export)
-
     from gvtools.scans.read import read_scan
+
+    require("laspy", extra="export", purpose=f"{path}: {path.suffix}")
 
     scan = read_scan(path, generated=True)
     return _points_view(path, scan.positions + scan.origin, scan.colors)

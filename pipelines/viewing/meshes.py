@@ -15,13 +15,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gvtools.errors import MemoryFileError
+from gvtools.ply import read_header
 from gvtools.untrusted import PIXEL_BYTES, PIXEL_RATIO, parse_json, read_bytes
 
 if TYPE_CHECKING:
     import trimesh
 
-# As much of a PLY as tells what it holds.
-HEADER = 1 << 16
 GLB, JSON = b"glTF", b"JSON"
 # What a vertex of a GLB takes in RAM, and how much there may be beside twice the file.
 VERTEX_BYTES, SPARE_BYTES = 128, 96 << 20
@@ -33,7 +32,7 @@ def load_mesh(path: Path) -> trimesh.Trimesh | trimesh.PointCloud:
 
     data = read_bytes(path)
     if data.startswith(b"ply"):
-        _check_ply(path, data)
+        read_header(path)
     elif data.startswith(GLB):
         _check_glb(path, data)
     del data
@@ -85,19 +84,6 @@ def _most_pixels(size: int) -> int:
     """Half of the pixels that a file of so many bytes may hold: Pillow refuses twice as many."""
     # A pixel takes up to four bytes.
     return (PIXEL_BYTES + PIXEL_RATIO * size) // 8
-
-
-def _check_ply(path: Path, data: bytes) -> None:
-    """Refuse more elements than a file has bytes."""
-    for line in data[:HEADER].split(b"end_header")[0].splitlines():
-        words = line.split()
-        if words[:1] == [b"element"]:
-            number = words[2] if len(words) == 3 else b""
-            if not number.isdigit() or len(number) > 18 or int(number) > len(data):
-                raise MemoryFileError(
-                    f"{path}: {len(data)} bytes, but its header says {line[:60]!r}; the file is "
-                    "truncated or damaged; save it again"
-                )
 
 
 def _check_glb(path: Path, data: bytes) -> None:

@@ -14,10 +14,11 @@ from reference_splat import reference_project
 
 from gvtools.errors import MemoryFileError, OptionError
 from gvtools.memory.back_projection import back_project
-from gvtools.memory.io.ply import export_memory_ply, read_ply, write_ply
+from gvtools.memory.io.ply import export_memory_ply
 from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory
 from gvtools.memory.splat.api import SplatOptions
 from gvtools.memory.splat.cpu_kernels import FAINTEST
+from gvtools.ply import read_ply, write_ply
 
 BACKENDS = ("cpu", "torch", "nearest")
 LARGEST = float(np.finfo(np.float32).max)

@@ -5,8 +5,9 @@ import pytest
 from memory_scenes import camera, points, random_memory
 
 from gvtools.errors import MemoryFileError
-from gvtools.memory.io.ply import export_memory_ply, read_ply, write_ply
+from gvtools.memory.io.ply import export_memory_ply
 from gvtools.memory.spatial_memory import SpatialMemory
+from gvtools.ply import read_ply, write_ply
 
 COLUMNS = (
     "x", "y", "z", "red", "green", "blue", "confidence", "spacing", "round", "view", "generated",

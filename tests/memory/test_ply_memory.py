@@ -5,8 +5,8 @@ import pytest
 
 from gvtools.cameras import Cameras
 from gvtools.errors import MemoryFileError
-from gvtools.memory.io.ply import write_ply
 from gvtools.memory.spatial_memory import SpatialMemory
+from gvtools.ply import write_ply
 
 COLOR = [("red", "u1"), ("green", "u1"), ("blue", "u1")]
 XYZ = [("x", "<f8"), ("y", "<f8"), ("z", "<f8")]

@@ -55,8 +55,9 @@ def test_what_once_failed_is_read_or_refused():
 
 
 @pytest.mark.slow
-def test_layouts_of_data_sets_that_once_failed_are_read_or_refused():
-    replayed([reader.name for reader in data_sets() if entries(reader.name)])
+def test_layouts_and_dear_samples_that_once_failed_are_read_or_refused():
+    dear = [reader for reader in READERS if reader.share < 0.1]
+    replayed([reader.name for reader in (*dear, *data_sets()) if entries(reader.name)])
 
 
 def test_the_corpus_belongs_to_readers_and_is_small():

@@ -8,8 +8,8 @@ from scan_files import FAR
 from gvtools.memory.io.ply import export_memory_ply
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.scans.fuse import fuse_scan, point_spacing
-from gvtools.scans.placement import Placement
 from gvtools.scans.points import Scan, Station
+from gvtools.scans.registration import Placement
 
 
 def wall(step: float, *, z: float = 2.0, width: float = 2.0):

@@ -7,9 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from gvtools.errors import DegenerateError, OptionError
 from gvtools.scans import registration
-from gvtools.scans.placement import given_placement
-from gvtools.scans.registration import register
-from gvtools.scans.surface import Surface
+from gvtools.scans.registration import Surface, given_placement, register
 
 SEEN_FROM = np.array([2.0, 2.0, 1.5])
 

@@ -19,7 +19,7 @@ from memory_scenes import camera
 from PIL import Image
 from web_page import PATIENCE, choose, close_notes, steady, wait
 
-from gvtools.memory.io.ply import write_ply
+from gvtools.ply import write_ply
 from pipelines.viewing.source import ViewSource
 from viz.run_view.render import RunRenderer, picture_of
 from viz.run_view.view import TARGET

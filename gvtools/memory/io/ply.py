@@ -1,14 +1,8 @@
-"""Point clouds as binary PLY: written for every viewer, read back strictly.
-
-Open3D's own PLY reader returns the header's number of points for a truncated file, the missing
-ones being whatever the heap held. Here the header's count times its stride must equal the file's
-size.
-"""
+"""Memories as binary PLY: written for every viewer, read back as point clouds."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from itertools import chain
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,106 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.errors import MemoryFileError, OptionError
-from gvtools.files import replaced_when_written
 from gvtools.memory.store.store import Store
 from gvtools.memory.thinning import thinned
-from gvtools.untrusted import regular
+from gvtools.ply import read_ply, write_ply
 
 if TYPE_CHECKING:
     import open3d as o3d
 
     from gvtools.memory.tiles.tile import Tile
-
-TYPES = {
-    "char": "i1", "uchar": "u1", "short": "<i2", "ushort": "<u2", "int": "<i4", "uint": "<u4",
-    "float": "<f4", "double": "<f8", "int8": "i1", "uint8": "u1", "int16": "<i2",
-    "uint16": "<u2", "int32": "<i4", "uint32": "<u4", "float32": "<f4", "float64": "<f8",
-}  # fmt: skip
-_NAMES = {"f4": "float", "f8": "double", "u1": "uchar", "i4": "int"}
-_MAX_HEADER = 1 << 16
-
-
-def write_ply(
-    path: Path,
-    vertices: NDArray[np.void],
-    *,
-    more: Iterable[NDArray[np.void]] = (),
-    count: int | None = None,
-    comments: tuple[str, ...] = (),
-) -> None:
-    """Write a structured array as the vertices of a little-endian binary PLY.
-
-    Args:
-        path: the PLY.
-        vertices: (N,) the first of them.
-        more: further ones, written as they come.
-        count: of all; None for N.
-        comments: of the header.
-    """
-    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {c}" for c in comments)]
-    lines.append(f"element vertex {len(vertices) if count is None else count}")
-    names = vertices.dtype.names or ()
-    lines += [f"property {_NAMES[vertices.dtype[name].str[1:]]} {name}" for name in names]
-    lines.append("end_header\n")
-    with replaced_when_written(path) as temporary, temporary.open("wb") as file:
-        file.write("\n".join(lines).encode("ascii"))
-        for part in chain([vertices], more):
-            part.tofile(file)
-
-
-def read_ply(path: Path) -> NDArray[np.void]:
-    """The vertices of a little-endian binary PLY as a structured array."""
-    try:
-        with regular(path).open("rb") as file:
-            head = file.read(_MAX_HEADER)
-    except OSError as error:
-        raise MemoryFileError(f"{path}: cannot be read ({error.strerror})") from None
-    end = head.find(b"end_header\n")
-    if not head.startswith(b"ply\n") or end < 0:
-        raise MemoryFileError(f"{path}: no PLY header; expected a binary PLY point cloud")
-    offset = end + len(b"end_header\n")
-    count, dtype = _parse_header(path, head[:end].decode("ascii", "replace"))
-    expected = offset + count * dtype.itemsize
-    found = path.stat().st_size
-    if expected != found:
-        raise MemoryFileError(
-            f"{path}: {found} bytes, but its header says {count} vertices of {dtype.itemsize} "
-            f"bytes, that is {expected}; the file is truncated or damaged"
-        )
-    return np.fromfile(path, dtype, count, offset=offset)
-
-
-def _parse_header(path: Path, text: str) -> tuple[int, np.dtype[np.void]]:
-    count = -1
-    columns: list[tuple[str, str]] = []
-    for line in text.splitlines()[1:]:
-        words = line.split()
-        if not words or words[0] in ("comment", "obj_info"):
-            continue
-        if words[0] == "format" and words[1:] == ["binary_little_endian", "1.0"]:
-            continue
-        if (
-            words[0] == "element"
-            and len(words) == 3
-            and words[2].isdecimal()
-            and len(words[2]) < 20
-        ):
-            if words[1] == "vertex" and count < 0:
-                count = int(words[2])
-                continue
-            if words[2] == "0":
-                continue
-        elif words[0] == "property" and len(words) == 3 and words[1] in TYPES and count >= 0:
-            columns.append((words[2], TYPES[words[1]]))
-            continue
-        raise MemoryFileError(
-            f"{path}: PLY header line {line!r}; expected one vertex element of scalar properties "
-            "in binary_little_endian 1.0"
-        )
-    names = [name for name, _ in columns]
-    if count < 0 or not {"x", "y", "z"} <= set(names) or len(set(names)) != len(names):
-        raise MemoryFileError(f"{path}: PLY header without distinct vertex properties x, y, z")
-    return count, np.dtype(columns)
 
 
 def read_point_cloud(path: Path) -> o3d.t.geometry.PointCloud:

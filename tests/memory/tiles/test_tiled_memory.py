@@ -12,12 +12,13 @@ from memory_scenes import random_camera, random_points
 
 from gvtools.errors import MemoryFileError, OptionError, ProjectError
 from gvtools.guidance import IMAGES
-from gvtools.memory.io.ply import export_memory_ply, read_ply
+from gvtools.memory.io.ply import export_memory_ply
 from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory
 from gvtools.memory.splat.api import SplatOptions
 from gvtools.memory.store.columns import ATTRIBUTES
 from gvtools.memory.tiled_memory import TiledMemory
 from gvtools.memory.tiles import array_file, gathering, tile_set
+from gvtools.ply import read_ply
 
 VOXEL, ORIGIN, VIEWS, BUDGET = 0.01, (1.0, 2.0, 3.0), 10, 1_000_000
 CAMERAS = [random_camera(np.random.default_rng(i), name=f"{i}") for i in range(3)]
