@@ -87,12 +87,11 @@ def pass_peaks(
     shift = model.config.flow.shift
     networks = [] if model.video is None else _networks(model.video)
     with LiveBytes([model, *networks]) as live, autocast(CPU, dtype):
-        peaks = StagePeaks(live)
+        peaks = model.clock = StagePeaks(live)
         model.generate(
             batch,
             bounds=interval_bounds(steps[0], shift=shift),
             cascade_bounds=interval_bounds(steps[1], shift=shift),
-            clock=peaks,
         )
     return peaks.rows
 

@@ -73,6 +73,7 @@ class TimedPass:
 
     def run(self, clock: StageClock | None = None) -> float:
         """One pass; the seconds it took."""
+        self.model.clock = clock or no_clock
         start = self.now()
         with self.precision():
             self.model.generate(
@@ -80,7 +81,6 @@ class TimedPass:
                 bounds=self.bounds,
                 cascade_bounds=self.cascade_bounds,
                 video=self.video,
-                clock=clock or no_clock,
             )
         return self.now() - start
 
