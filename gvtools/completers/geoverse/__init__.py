@@ -8,11 +8,7 @@ from __future__ import annotations
 
 from gvtools.completers.geoverse.config import GeoVerseConfig, named
 from gvtools.completers.geoverse.model import GeoVerse
-from gvtools.completers.geoverse.weights import (
-    check_folder,
-    from_pretrained,
-    save_pretrained,
-)
+from gvtools.completers.geoverse.weights import check_folder, from_pretrained, save_pretrained
 
 __all__ = [
     "GeoVerse",

@@ -21,11 +21,16 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from gvtools.networks.depth_anything.rays import rigid
+
 # (x, y) added to column and row. The half pixel to the left is an oddity of the published weights.
 GLD_PIXEL_OFFSET = (-0.5, 0.5)
 CENTRED = (0.5, 0.5)
 # Centres nearer to each other than this many roundings of their coordinates coincide.
 COINCIDENT = 8
+GROUP = 4
+# Half of the channels in groups of four, and two rotary quarters of pairs.
+HEAD_MULTIPLE = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +78,7 @@ def camera_condition(
     mask = mask.view(1, views, 1, 1, 1).expand(len(rays), views, 1, *size)
     rotation = world_from_cam[..., :3, :3].to(rebased.dtype).mT
     shift = -_product(rotation, world_from_cam[..., :3, 3:].to(rebased.dtype))[..., 0]
-    pose = _pose(rotation, shift * scale[:, None, None])
+    pose = rigid(rotation, shift * scale[:, None, None])
     map_ = torch.cat((mask, rays), dim=2)
     return CameraCondition(map_, pose, K.to(rays.dtype), (size[0], size[1]), scale, context)
 
@@ -93,7 +98,7 @@ def normalised_poses(world_from_cam: Tensor, *, reference: int = -1) -> tuple[Te
     apart = farthest > rounding
     scale = torch.where(apart, 1 / (farthest + 1e-8), torch.ones_like(farthest))
     offset = offset * (scale * apart)[:, None, None]
-    return _pose(_product(base, rotation), offset), scale
+    return rigid(_product(base, rotation), offset), scale
 
 
 def plucker_map(
@@ -120,12 +125,6 @@ def plucker_map(
     return torch.cat((direction, torch.linalg.cross(centre, direction, dim=2)), dim=2)
 
 
-def _pose(rotation: Tensor, translation: Tensor) -> Tensor:
-    top = torch.cat((rotation, translation[..., None]), dim=-1)
-    last = torch.eye(4, dtype=top.dtype, device=top.device)[3:].expand(*top.shape[:-2], 1, 4)
-    return torch.cat((top, last), dim=-2)
-
-
 def _product(a: Tensor, b: Tensor) -> Tensor:
     """The product a @ b in the operands' precision, whatever autocast would have."""
     with torch.autocast(a.device.type, enabled=False):
@@ -138,11 +137,6 @@ def _precise(tensor: Tensor) -> torch.dtype:
 
 def _identity(like: Tensor) -> Tensor:
     return torch.eye(like.shape[-1], dtype=like.dtype, device=like.device).expand_as(like)
-
-
-GROUP = 4
-# Half of the channels in groups of four, and two rotary quarters of pairs.
-HEAD_MULTIPLE = 8
 
 
 class Projective:
@@ -196,9 +190,7 @@ class Projective:
         """(B, heads, V*h*w, head_dim) keys, encoded."""
         return self._apply(k, self._key, 1)
 
-    def value(self, v: Tensor) -> Tensor:
-        """(B, heads, V*h*w, head_dim) values, encoded."""
-        return self._apply(v, self._key, 1)
+    value = key
 
     def output(self, o: Tensor) -> Tensor:
         """(B, heads, V*h*w, head_dim) results of attention, taken back to each token's frame."""

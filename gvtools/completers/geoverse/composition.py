@@ -36,6 +36,16 @@ MOST = 1.5
 CERTAIN = 0.08
 # The same factor while training: out of the way.
 FAR = 1e3
+# Confidence of a generated pixel at most: below what was observed.
+GENERATED = 0.9
+# Confidence of a corrected view whose decoded depth is far from the memory's.
+UNSCALED = 0.1
+# What remains of a fill's confidence where the model moves its depth, and in such a view.
+DOUBTED = 0.5
+# Confidence of a refined pixel whose depth is right for certain.
+REFINED = 0.5
+# A view's scale is taken from at least so many pixels, and from about so many at most.
+LEAST, LOOKED_AT = 50, 5_000
 
 
 def without_seams(values: Tensor, patch: int) -> Tensor:
@@ -118,18 +128,6 @@ def composed(batch: ViewBatch, made: Decoded, hint: Decoded | None) -> tuple[Ten
     return torch.where(mask, color, rgb), torch.where(mask[:, :, 0], length[:, :, 0], depth)
 
 
-# Confidence of a generated pixel at most: below what was observed.
-GENERATED = 0.9
-# Confidence of a corrected view whose decoded depth is far from the memory's.
-UNSCALED = 0.1
-# What remains of a fill's confidence where the model moves its depth, and in such a view.
-DOUBTED = 0.5
-# Confidence of a refined pixel whose depth is right for certain.
-REFINED = 0.5
-# A view's scale is taken from at least so many pixels, and from about so many at most.
-LEAST, LOOKED_AT = 50, 5_000
-
-
 @dataclass(frozen=True)
 class Completed:
     """A pass's result at the targets' size and in scene units."""
@@ -156,7 +154,7 @@ class Completed:
 
 
 def to_scene_scale(
-    generated: Generated,  # of the pass
+    generated: Generated,
     guidance: Guidance,  # its targets' projections
     cameras: Cameras,  # of all views, at the model's size
     *,
@@ -209,31 +207,19 @@ def corrected(
     """
     assert generated.hint is not None
     full = (guidance.depth.shape[1], guidance.depth.shape[2])
-    filled = torch.from_numpy(fill.rgb).permute(0, 3, 1, 2), torch.from_numpy(fill.depth)
-    both = [
-        (
-            resampled(found.rgb[0].float().cpu(), full),
-            resampled_depth(found.depth[0].float().cpu(), full)[:, None],
-        )
-        for found in (generated.decoded, generated.hint)
-    ]
+    color, length = torch.from_numpy(fill.rgb).permute(0, 3, 1, 2), torch.from_numpy(fill.depth)
+    decoded = (generated.decoded, generated.hint)
+    colors = [resampled(found.rgb[0].float().cpu(), full) for found in decoded]
+    depths = [resampled_depth(found.depth[0].float().cpu(), full)[:, None] for found in decoded]
     valid = torch.from_numpy(guidance.valid)[:, None]
-    rgb = corrected_color(filled[0], both[0][0], both[1][0], valid=valid)
-    rgb = rgb.clamp(0, 1).permute(0, 2, 3, 1)
-    depth = corrected_depth(filled[1][:, None], both[0][1], both[1][1], valid=valid)[:, 0]
-    use = (filled[1] > 0) & rgb.isfinite().all(-1) & depth.isfinite()
-    known = use.numpy()
-    scales = depth_ratios(guidance, both[0][1][:, 0].numpy())
+    rgb = corrected_color(color, *colors, valid=valid).clamp(0, 1).permute(0, 2, 3, 1)
+    depth = corrected_depth(length[:, None], *depths, valid=valid)[:, 0]
+    known = ((length > 0) & rgb.isfinite().all(-1) & depth.isfinite()).numpy()
+    scales = depth_ratios(guidance, depths[0][:, 0].numpy())
     if back is None:
-        nothing = np.zeros(known.shape, np.float32)
-        back = Completed(
-            np.zeros((*known.shape, 3), np.float32),
-            nothing,
-            nothing,
-            None,
-            scales,
-            tuple(ScaleAlignment(ScaleStatus.UNSUPPORTED, np.nan) for _ in scales),
-        )
+        nothing, picture = np.zeros(known.shape, np.float32), np.zeros_like(fill.rgb)
+        unknown = (ScaleAlignment(ScaleStatus.UNSUPPORTED, np.nan),) * len(scales)
+        back = Completed(picture, nothing, nothing, None, scales, unknown)
     if fill.confidence is None:
         certain = _certainty(generated.decoded.depth_confidence[0], full)
         certain[~np.isfinite(scales)] = UNSCALED

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -23,6 +24,8 @@ from gvtools.completers.push_pull import push_pull, push_pull_depth
 from gvtools.errors import ShapeError
 from gvtools.networks.config_json import check_choice, check_range
 from gvtools.networks.depth_anything.network import DepthAnything3, relative_cameras
+
+LOG_DEPTH_LIMIT = 6.0
 
 
 class LatentStatistics(nn.Module):
@@ -50,9 +53,6 @@ class LatentStatistics(nn.Module):
     def _shaped(self, like: Tensor) -> tuple[Tensor, Tensor]:
         std = (self.var + self.eps).sqrt()
         return self.mean.to(like.dtype)[:, None, None], std.to(like.dtype)[:, None, None]
-
-
-LOG_DEPTH_LIMIT = 6.0
 
 
 @dataclass(frozen=True)
@@ -113,20 +113,17 @@ class ViewBatch:
                 f"images {tuple(self.images.shape)} with {self.context} context view(s); expected "
                 "(B, V, 3, H, W) and 1 to V context views"
             )
-        batch, _, _, height, width = self.images.shape
-        for what, value, shape in (
-            ("depth", self.depth, (batch, views, 1, height, width)),
-            ("valid", self.valid, (batch, views, 1, height, width)),
-            ("cam_from_world", self.cam_from_world, (batch, views, 4, 4)),
-            ("K", self.K, (batch, views, 3, 3)),
+        batch, _, _, *size = self.images.shape
+        for what, shape in (
+            ("depth", (1, *size)),
+            ("valid", (1, *size)),
+            ("cam_from_world", (4, 4)),
+            ("K", (3, 3)),
+            ("evidence", (2, *size)),
         ):
-            if tuple(value.shape) != shape:
-                raise ShapeError(f"{what} {tuple(value.shape)}; expected {shape}")
-        if self.evidence is not None and self.evidence.shape != (batch, views, 2, height, width):
-            raise ShapeError(
-                f"evidence {tuple(self.evidence.shape)}; expected "
-                f"{(batch, views, 2, height, width)}"
-            )
+            value, expected = getattr(self, what), (batch, views, *shape)
+            if value is not None and tuple(value.shape) != expected:
+                raise ShapeError(f"{what} {tuple(value.shape)}; expected {expected}")
 
     @property
     def size(self) -> tuple[int, int]:
@@ -142,10 +139,9 @@ class ViewBatch:
         return self._each(lambda tensor: tensor[index])
 
     def _each(self, change: Callable[[Tensor], Tensor]) -> ViewBatch:
-        tensors = (self.images, self.depth, self.valid, self.cam_from_world, self.K)
-        images, depth, valid, pose, K = (change(tensor) for tensor in tensors)
-        evidence = None if self.evidence is None else change(self.evidence)
-        return ViewBatch(images, depth, valid, pose, K, self.context, evidence)
+        tensors = {name: value for name, value in vars(self).items() if isinstance(value, Tensor)}
+        changed: dict[str, Any] = {name: change(value) for name, value in tensors.items()}
+        return replace(self, **changed)
 
 
 @dataclass(frozen=True)
@@ -192,12 +188,12 @@ def filled(batch: ViewBatch, config: HintConfig) -> ViewBatch:
 
 @torch.no_grad()
 def encode_hints(
-    network: DepthAnything3,  # the frozen encoder
-    level0: LatentStatistics,  # statistics of level 0
-    level1: LatentStatistics,  # statistics of level 1
+    network: DepthAnything3,
+    level0: LatentStatistics,
+    level1: LatentStatistics,
     *,
     batch: ViewBatch,  # its holes filled already where they should be (``filled``)
-    config: HintConfig,  # see ``HintConfig``
+    config: HintConfig,
 ) -> Hints:
     """Eq. 1 for every sample of a batch (see the module)."""
     grid, context = network.encoder.grid(*batch.size), batch.context
@@ -232,11 +228,11 @@ def encode_hints(
 
 
 def _encode_jointly(
-    network: DepthAnything3,  # the frozen encoder
+    network: DepthAnything3,
     batch: ViewBatch,  # all views
     informative: Tensor,  # which views are encoded; samples that agree in it share a pass
     *,
-    config: HintConfig,  # see ``HintConfig``
+    config: HintConfig,
     alone: Callable[[], list[Tensor]],  # the context's levels where nothing else is encoded
 ) -> list[Tensor]:
     """Raw levels 0 and 1, token 0 included, of the ``informative`` (B, V) views; else 0."""
@@ -258,12 +254,12 @@ def _encode_jointly(
 
 @torch.no_grad()
 def encode_latents(
-    network: DepthAnything3,  # the frozen encoder
-    level0: LatentStatistics,  # statistics of level 0
-    level1: LatentStatistics,  # statistics of level 1
+    network: DepthAnything3,
+    level0: LatentStatistics,
+    level1: LatentStatistics,
     *,
     batch: ViewBatch,  # true pictures on all views
-    config: HintConfig,  # see ``HintConfig``
+    config: HintConfig,
 ) -> tuple[Tensor, Tensor]:  # Two (B, V, C, h, w) tensors, normalised
     """Clean level-0 and level-1 latents of true pictures of all views, encoded jointly."""
     grid = network.encoder.grid(*batch.size)

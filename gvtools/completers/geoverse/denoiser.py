@@ -22,6 +22,10 @@ from torch import Tensor, nn
 from gvtools.completers.geoverse.camera_encoding import HEAD_MULTIPLE, CameraCondition, Projective
 from gvtools.errors import OptionError, ShapeError
 from gvtools.networks.compute import Recomputing, attend
+from gvtools.networks.depth_anything.encoder import PatchEmbed
+
+CAMERA_CHANNELS = 7
+DEPTH_CHANNELS = 2
 
 
 @dataclass(frozen=True)
@@ -40,18 +44,6 @@ class VideoKeys:
             return joint
         alone = attend(q, k, v)
         return alone + self.gate.to(v.dtype) * (joint - alone)
-
-
-class PixelEmbed(nn.Module):
-    """(B, C, H, W) to tokens (B, N, width) by patches."""
-
-    def __init__(self, channels: int, width: int, patch: int = 1) -> None:
-        super().__init__()
-        self.proj = nn.Conv2d(channels, width, kernel_size=patch, stride=patch)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Tokens, row-major."""
-        return self.proj(x).flatten(2).transpose(1, 2)
 
 
 class TimeEmbed(nn.Module):
@@ -95,12 +87,7 @@ class CameraAttention(nn.Module):
         self.qkv = nn.Linear(width, 3 * width)
         self.proj = nn.Linear(width, width)
 
-    def forward(
-        self,
-        x: Tensor,
-        positions: Projective,
-        video: VideoKeys | None = None,
-    ) -> Tensor:
+    def forward(self, x: Tensor, positions: Projective, video: VideoKeys | None = None) -> Tensor:
         """(B, T, width) to the same; ``video`` holds further keys and values (MoT variant)."""
         q, k, v = self.qkv(x).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
         q, k, v = positions.query(q), positions.key(k), positions.value(v)
@@ -151,10 +138,6 @@ class FinalLayer(nn.Module):
 def modulated(x: Tensor, shift: Tensor, scale: Tensor) -> Tensor:
     """``x`` (1 + scale) + shift."""
     return x * (1 + scale) + shift
-
-
-CAMERA_CHANNELS = 7
-DEPTH_CHANNELS = 2
 
 
 @dataclass(frozen=True)
@@ -220,10 +203,7 @@ class Positions:
                 head_dim=head_dim,
                 invert_K=config.invert_K,
             )
-            for head_dim in (
-                config.width // config.heads,
-                config.head_width // config.head_heads,
-            )
+            for head_dim in (config.width // config.heads, config.head_width // config.head_heads)
         )
 
 
@@ -236,10 +216,10 @@ class Denoiser(Recomputing):
         width, head_width, pair = config.width, config.head_width, 2 * config.channels
         for stream, out in (("x", head_width), ("s", width)):
             for suffix in ("_ref", "_tgt") if config.separate_embedders else ("",):
-                self.add_module(f"{stream}_embedder{suffix}", PixelEmbed(pair, out))
+                self.add_module(f"{stream}_embedder{suffix}", PatchEmbed(pair, out))
         self.s_projector = nn.Linear(width, head_width)
         self.t_embedder = TimeEmbed(width, config.frequencies)
-        self.camera_embedder = PixelEmbed(CAMERA_CHANNELS, width, config.camera_patch)
+        self.camera_embedder = PatchEmbed(CAMERA_CHANNELS, width, config.camera_patch)
         self.blocks = nn.ModuleList(
             DenoiserBlock(width, config.heads, config.mlp_ratio)
             if index < config.depth
@@ -248,7 +228,7 @@ class Denoiser(Recomputing):
         )
         self.final_layer = FinalLayer(head_width, config.channels)
         if config.depth_condition:
-            self.depth_embedder = PixelEmbed(DEPTH_CHANNELS, width, config.camera_patch)
+            self.depth_embedder = PatchEmbed(DEPTH_CHANNELS, width, config.camera_patch)
         self._initialise()
 
     def _initialise(self) -> None:

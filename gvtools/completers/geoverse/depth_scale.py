@@ -114,8 +114,9 @@ def scaled_depth(
     alignments = []
     views = list(zip(unscaled, hint, valid, strict=True))
     # One scale a pass: a view that contradicts it refutes it for the others too.
-    refuted = any(_contradicts(_deviation(view * whole.scale, h, v)) for view, h, v in views)
-    if refuted:
+    # No scale helps where scaled depth is far from the memory's.
+    far = (_deviation(view * whole.scale, h, v)[0] > np.log(MAX_FACTOR) for view, h, v in views)
+    if any(far):
         whole = replace(whole, scale=float("nan"), status=ScaleStatus.CONTRADICTED)
     for index, (view, known, where) in enumerate(views):
         scale[index], outcome = _view_scale(view, known, where, whole=whole, alignment=alignment)
@@ -149,23 +150,20 @@ def _view_scale(
         "hint": ("hint", "centres"),
         "field": ("field", "hint", "centres"),
     }[alignment]
+
+    def outcome(
+        status: ScaleStatus, scale: float, residual: float, *, overlap: int
+    ) -> ScaleAlignment:
+        support = (fit.inlier_share, whole.centres, whole.correlation)
+        return ScaleAlignment(status, scale, residual, overlap, *support)
+
     for scale, status in (candidates[name] for name in order):
         deviation, overlap = _deviation(depth * scale, hint, valid)
-        if np.isfinite(scale) and not _contradicts((deviation, overlap)):
-            residual = float(np.expm1(deviation))
-            return scale, ScaleAlignment(
-                status, 1.0, residual, overlap, fit.inlier_share, whole.centres, whole.correlation
-            )
+        if np.isfinite(scale) and not deviation > np.log(MAX_FACTOR):
+            return scale, outcome(status, 1.0, float(np.expm1(deviation)), overlap=overlap)
     contradicted = np.isfinite(fit.residual) or whole.status is ScaleStatus.CONTRADICTED
-    return np.nan, ScaleAlignment(
-        ScaleStatus.CONTRADICTED if contradicted else ScaleStatus.UNSUPPORTED,
-        np.nan,
-        fit.residual,
-        fit.support,
-        fit.inlier_share,
-        whole.centres,
-        whole.correlation,
-    )
+    status = ScaleStatus.CONTRADICTED if contradicted else ScaleStatus.UNSUPPORTED
+    return np.nan, outcome(status, np.nan, fit.residual, overlap=fit.support)
 
 
 def _fitted(
@@ -202,11 +200,6 @@ def both_known(
     with np.errstate(invalid="ignore"):
         positive = (hint > 0) & (depth > 0)
     return np.asarray(valid & positive & np.isfinite(hint) & np.isfinite(depth))
-
-
-def _contradicts(deviation: tuple[float, int]) -> bool:
-    """Whether scaled depth is far from the memory's where both are known: no scale then helps."""
-    return deviation[0] > np.log(MAX_FACTOR)
 
 
 def _field(

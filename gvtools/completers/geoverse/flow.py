@@ -192,14 +192,14 @@ def integrate(
 
 
 def sample(
-    velocity: Velocity,  # see ``integrate``
+    velocity: Velocity,
     noise: Tensor,  # (B, ...), the state at t = 1
     bounds: Sequence[float],  # K + 1 times, see ``check_bounds``; the last is 0 in GeoVerse
     *,
     # The network without the condition that ``cfg_scale`` is to strengthen.
     unconditional: Velocity | None = None,
     cfg_scale: float = 1.0,  # of classifier-free guidance, 1 = none, see ``guided``
-    callback: Callable[[int, Tensor, Tensor], None] | None = None,  # see ``integrate``
+    callback: Callable[[int, Tensor, Tensor], None] | None = None,
 ) -> Tensor:  # The state (B, ...) at the last bound
     """From noise to clean with one Euler step an interval."""
     step = guided(velocity, unconditional, cfg_scale)
@@ -216,8 +216,8 @@ def seeded_noise(
     shape: Sequence[int],  # (B, V, C, h, w); anything after B, V
     seeds: Sequence[Sequence[int]],  # B rows of V seeds, see ``view_seed``
     *,
-    device: torch.device | str | None = None,  # of the result
-    dtype: torch.dtype = torch.float32,  # of the result
+    device: torch.device | str | None = None,
+    dtype: torch.dtype = torch.float32,
 ) -> Tensor:
     """Standard normal noise, drawn view by view in float32 on the CPU."""
     views = [

@@ -284,14 +284,9 @@ class Prediction:
 
 
 @dataclass(frozen=True, eq=False)
-class Reference:
-    """What it should have given; shapes as in ``Prediction``."""
+class Reference(Prediction):
+    """The truth of each; lengths in scene units, depth that is not finite or not above 0 = none."""
 
-    level1: Tensor | None = None  # velocity target
-    level0: Tensor | None = None  # velocity target
-    image: Tensor | None = None  # in the normalisation of the prediction
-    depth: Tensor | None = None  # scene units; not finite or not above 0 = none
-    centers: Tensor | None = None  # scene units
     image_valid: Tensor | None = None  # (B, T, H, W) bool, None = all
     depth_valid: Tensor | None = None  # (B, T, H, W) bool, None = all
 

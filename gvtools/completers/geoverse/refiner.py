@@ -260,10 +260,7 @@ def _blurred(values: Tensor, share: float) -> Tensor:
     height, width = values.shape[-2:]
     deviation = share * max(height, width)
     down, right = (
-        torch.softmax(
-            -0.5 * ((place[:, None] - place) / deviation).square(),
-            dim=1,
-        )
+        torch.softmax(-0.5 * ((place[:, None] - place) / deviation).square(), dim=1)
         for place in (
             torch.arange(side, device=values.device, dtype=values.dtype) for side in (height, width)
         )

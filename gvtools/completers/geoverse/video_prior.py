@@ -11,7 +11,7 @@ four. It drops the rest of other lengths without a word, so clips have such a le
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,10 @@ from gvtools.networks.compute import half_type
 from gvtools.networks.config_json import check_choice, check_range
 
 GROUP = 4
+LAYOUTS = ("per_view", "video9", "repeat4")
+# Bytes that a pass of base needs beside all weights: 2.5 GB (benchmarks/complete.md), and what the
+# driver takes and an allocator loses.
+ROOM = 3.5e9
 
 
 @dataclass(frozen=True)
@@ -52,27 +56,6 @@ class ViewLayout:
         return tuple(where[view] for view in sorted(where))
 
 
-def _each_alone(views: int) -> tuple[tuple[int, ...], ...]:
-    return tuple((view,) for view in range(views))
-
-
-def _as_video(views: int) -> tuple[tuple[int, ...], ...]:
-    repeats = (1 - views) % GROUP
-    return ((*range(views), *[views - 1] * repeats),)
-
-
-def _four_times(views: int) -> tuple[tuple[int, ...], ...]:
-    return ((0, *(view for view in range(1, views) for _ in range(GROUP))),)
-
-
-_LAYOUTS: dict[str, Callable[[int], tuple[tuple[int, ...], ...]]] = {
-    "per_view": _each_alone,
-    "video9": _as_video,
-    "repeat4": _four_times,
-}
-LAYOUTS = tuple(_LAYOUTS)
-
-
 def view_layout(name: str, views: int) -> ViewLayout:
     """One of the ways to show ``views`` views to the VAE.
 
@@ -81,9 +64,13 @@ def view_layout(name: str, views: int) -> ViewLayout:
     first, four views share a latent. "repeat4": one clip, the first view once and every other one
     four times, so each has its latent.
     """
-    if name not in _LAYOUTS:
-        raise OptionError(f"video layout {name!r}; expected one of {', '.join(LAYOUTS)}")
-    return ViewLayout(_LAYOUTS[name](views))
+    if name == "per_view":
+        return ViewLayout(tuple((view,) for view in range(views)))
+    if name == "video9":
+        return ViewLayout(((*range(views), *[views - 1] * ((1 - views) % GROUP)),))
+    if name == "repeat4":
+        return ViewLayout(((0, *(view for view in range(1, views) for _ in range(GROUP))),))
+    raise OptionError(f"video layout {name!r}; expected one of {', '.join(LAYOUTS)}")
 
 
 def packed_mask(generate: Tensor, layout: ViewLayout, *, stride: int = 8) -> Tensor:
@@ -98,14 +85,11 @@ def packed_mask(generate: Tensor, layout: ViewLayout, *, stride: int = 8) -> Ten
     return torch.stack(packed, dim=2)
 
 
-_DTYPES = ("float32", "bfloat16", "float16")
-
-
 @dataclass(frozen=True)
 class VideoPriorConfig:
     """How features are taken from the video model."""
 
-    # How views become video, see ``video_layouts.view_layout``. The paper does not say; "per_view"
+    # How views become video, see ``view_layout``. The paper does not say; "per_view"
     # has each view's own latent and mask.
     layout: str = "per_view"
     # Backbone blocks whose outputs, VACE hint included, are the features.
@@ -130,7 +114,7 @@ class VideoPriorConfig:
     def __post_init__(self) -> None:
         check_choice("video.layout", self.layout, LAYOUTS)
         check_choice("video.prompt", self.prompt, ("empty", "zeros"))
-        check_choice("video.dtype", self.dtype, (None, *_DTYPES))
+        check_choice("video.dtype", self.dtype, (None, "float32", "bfloat16", "float16"))
         if not self.taps or list(self.taps) != sorted({*self.taps}) or self.taps[0] < 0:
             raise OptionError(f"video.taps = {self.taps}; expected ascending block numbers")
         if self.multiple < 1 or self.multiple % 16:
@@ -173,13 +157,6 @@ def seed_rows(seed: int | Sequence[Sequence[int]], batch: int, views: int) -> li
     return [list(row) for row in seed]
 
 
-__all__ = ["VideoFeatures", "VideoPrior", "VideoPriorConfig"]
-
-# Bytes that a pass of base needs beside all weights: 2.5 GB (benchmarks/complete.md), and what the
-# driver takes and an allocator loses.
-ROOM = 3.5e9
-
-
 @dataclass(frozen=True, eq=False)
 class VideoFeatures:
     """F^W, to be handed to every denoising step."""
@@ -211,20 +188,17 @@ class VideoPrior:
         # (tokens, channels) embedding of the empty prompt; None with ``prompt="zeros"``.
         prompt: Tensor | None = None,
         *,
-        config: VideoPriorConfig | None = None,  # see there
+        config: VideoPriorConfig | None = None,
     ) -> None:
         self.config = config or VideoPriorConfig()
         zeros = self.config.prompt == "zeros"
         if prompt is None and not zeros:
             raise CheckpointError(
-                "video prior: no embedding of the empty prompt; expected wan_folder."
+                "video prior: no embedding of the empty prompt; expected that of "
                 "read_empty_prompt, or video.prompt = 'zeros' where no trained network is used"
             )
         self.networks = WanNetworks(
-            transformer,
-            vae,
-            prompt=None if zeros else prompt,
-            prompt_rows=self.config.prompt_rows,
+            transformer, vae, prompt=None if zeros else prompt, prompt_rows=self.config.prompt_rows
         )
         # Where features are computed while the weights are kept elsewhere.
         self._guest: torch.device | None = None
@@ -243,7 +217,7 @@ class VideoPrior:
     @classmethod
     def from_pretrained(
         cls,
-        folder: Path | str,  # see ``wan_folder``
+        folder: Path | str,  # see ``wan.py``
         *,
         config: VideoPriorConfig | None = None,  # how features are taken
         # Of the weights; "meta" compares everything and reads no weights.
@@ -285,33 +259,28 @@ class VideoPrior:
         valid: Tensor,  # (B, V, 1, H, W), bool or 1 = valid
         context: int,  # how many views, the first ones, are photographs: they get no noise
         *,
-        # One number, or B rows of V of them (see ``noise.view_seed``): a view's noise depends on
+        # One number, or B rows of V of them (see ``view_seed``): a view's noise depends on
         # its own alone.
         seed: int | Sequence[Sequence[int]] = 0,
     ) -> VideoFeatures:
         """One forward of the video model."""
         seeds = seed_rows(seed, *images.shape[:2])
-        with self.networks.lent(self._guest):
-            return self._features(images, valid, context, seeds=seeds)
-
-    def _features(
-        self, images: Tensor, valid: Tensor, context: int, *, seeds: list[list[int]]
-    ) -> VideoFeatures:
-        """The same, with the weights in place."""
         layout = view_layout(self.config.layout, images.shape[1])
-        device = self.networks.device
-        with torch.autocast(device.type, enabled=False):
-            proxy, shown = self._proxy(images.to(device), valid.to(device), context, seeds=seeds)
-            z_proxy = self._encoded(proxy, layout)
-            outputs = self.networks.block_outputs(
-                self._noised(z_proxy, layout, seeds),
-                self._condition(z_proxy, shown, layout),
-                timestep=self.config.timestep,
-                blocks=self.config.taps,
-            )
-        where = torch.tensor(layout.latent_of_view, device=device)
-        tensors = (x.index_select(1, where).movedim(-1, 2).contiguous() for x in outputs)
-        return VideoFeatures(tuple(tensors), layout.latent_of_view)
+        with self.networks.lent(self._guest):
+            device = self.networks.device
+            with torch.autocast(device.type, enabled=False):
+                views = (images.to(device), valid.to(device))
+                proxy, shown = self._proxy(*views, context, seeds=seeds)
+                z_proxy = self._encoded(proxy, layout)
+                outputs = self.networks.block_outputs(
+                    self._noised(z_proxy, layout, seeds),
+                    self._condition(z_proxy, shown, layout),
+                    timestep=self.config.timestep,
+                    blocks=self.config.taps,
+                )
+            where = torch.tensor(layout.latent_of_view, device=device)
+            tensors = (x.index_select(1, where).movedim(-1, 2).contiguous() for x in outputs)
+            return VideoFeatures(tuple(tensors), layout.latent_of_view)
 
     def _proxy(
         self, images: Tensor, valid: Tensor, context: int, *, seeds: list[list[int]]

@@ -25,6 +25,10 @@ from gvtools.view_selection import covisible_views, nearest_views
 
 # Neighbours whose depths differ by more than this factor lie on two surfaces.
 EDGE = 1.1
+# A cell of the model's grid counts as valid from this share of valid pixels on.
+VALID_SHARE = 0.5
+# Views nearer to each other than this share of their distance from the origin stand at one place.
+COINCIDENT = 1e-12
 
 
 def model_size(height: int, width: int, *, longest: int, patch: int) -> tuple[int, int]:
@@ -81,12 +85,6 @@ def chosen_views(
     return [context[row] for row in rows]
 
 
-# A cell of the model's grid counts as valid from this share of valid pixels on.
-VALID_SHARE = 0.5
-# Views nearer to each other than this share of their distance from the origin stand at one place.
-COINCIDENT = 1e-12
-
-
 def view_batch(
     context: Sequence[ContextView],  # at least one view
     targets: Guidance,  # the projections to complete
@@ -103,7 +101,8 @@ def view_batch(
     pictures, depths, cameras = [], [], []
     for view in context:
         picture, observed, camera = _cropped(view, height / width)
-        pictures.append(_picture(picture, size))
+        image = torch.from_numpy(np.ascontiguousarray(picture)).permute(2, 0, 1)[None].float()
+        pictures.append(resampled(image, size)[0].clamp(0, 1))
         depths.append(_nearest(observed, size))
         cameras.append(camera.resized(size[1], size[0]))
     rgb, projected, valid = _reduced(targets, size)
@@ -182,12 +181,6 @@ def _evidence(fill: Filled, context: int, size: tuple[int, int]) -> Tensor:
     maps = [nothing if known is None else known for known in (fill.confidence, fill.looked_up)]
     evidence = resampled(torch.from_numpy(np.stack(maps, 1)), size).clamp(0, 1)
     return torch.cat((evidence.new_zeros((context, 2, *size)), evidence))[None]
-
-
-def _picture(picture: NDArray[np.float32], size: tuple[int, int]) -> Tensor:
-    """(H, W, 3) to (3, h, w)."""
-    image = torch.from_numpy(np.ascontiguousarray(picture)).permute(2, 0, 1)[None].float()
-    return resampled(image, size)[0].clamp(0, 1)
 
 
 def _nearest(depth: NDArray[np.float32], size: tuple[int, int]) -> Tensor:

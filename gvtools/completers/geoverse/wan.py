@@ -27,6 +27,9 @@ from gvtools.untrusted import read_json
 
 STRIDE = 8  # pixels of a latent's edge
 PATCH = (1, 2, 2)  # latents of a token
+COMPONENTS = {"transformer": "WanVACETransformer3DModel", "vae": "AutoencoderKLWan"}
+EMPTY_PROMPT = "empty_prompt.safetensors"
+_FLOAT32 = frozenset({"time_embedder", "scale_shift_table", "norm1", "norm2", "norm3"})
 
 
 class WanNetworks:
@@ -108,7 +111,7 @@ class WanNetworks:
             for tensor, data in zip(tensors, home, strict=True):
                 tensor.data = data
 
-    def encode(self, clips: Tensor) -> Tensor:  # (N, 16, 1 + k, H / 8, W / 8) float32
+    def encode(self, clips: Tensor) -> Tensor:
         """(N, 16, 1 + k, H / 8, W / 8) float32: the mode of the VAE's latents, normalised.
 
         Clips are (N, 3, 4k + 1, H, W) in [-1, 1].
@@ -123,7 +126,7 @@ class WanNetworks:
 
     def block_outputs(
         self, x: Tensor, condition: Tensor, *, timestep: float, blocks: Sequence[int]
-    ) -> list[Tensor]:  # For each block (B, F, h / 2, w / 2, C)
+    ) -> list[Tensor]:
         """(B, F, h / 2, w / 2, C) of each of some blocks in one forward, their VACE hints included.
 
         ``x`` (B, 16, F, h, w) are noised latents, ``condition`` (B, 96, F, h, w) is of the VACE
@@ -152,11 +155,6 @@ class WanNetworks:
                 hook.remove()
         frames, rows, columns = (n // p for n, p in zip(x.shape[2:], PATCH, strict=True))
         return [taken[block].unflatten(1, (frames, rows, columns)) for block in blocks]
-
-
-COMPONENTS = {"transformer": "WanVACETransformer3DModel", "vae": "AutoencoderKLWan"}
-EMPTY_PROMPT = "empty_prompt.safetensors"
-_FLOAT32 = frozenset({"time_embedder", "scale_shift_table", "norm1", "norm2", "norm3"})
 
 
 def expected_tensors(config: Mapping[str, Any], *, component: str = "transformer") -> Shapes:

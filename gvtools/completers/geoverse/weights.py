@@ -46,17 +46,25 @@ EXTENSION = ("level1.depth_embedder.", "control.", "shared.")
 WHOLE_FILE = da3.GEOVERSE_FILE
 CONFIG_FILE = da3.GEOVERSE_CONFIG
 VIDEO_FOLDER = "video"
+# Of the random numbers of an untrained extension; none of them reaches the output.
+_SEED = 0
+
+GLD = "SeonghuJeon/GLD (Geometric Latent Diffusion)"
+GLD_TERMS = "Apache-2.0 (model card); code MIT"
+
+# Dictionaries in which the tensors of a PyTorch file may lie; the first that is there counts.
+NESTED = ("ema", "model")
 
 
 @dataclass(frozen=True)
 class Part:
     """One file and the module that it fills."""
 
-    name: str  # of the part
+    name: str
     module: str  # prefix of its keys in the state dict of ``GeoVerse``
     files: tuple[str, ...]  # where it may lie in a weights folder, the publisher's own place first
     source: str  # who publishes it
-    licence: str  # its terms
+    licence: str
     strip: str = "module."  # prefix that is taken off every key that has it
     # Keys with none of these prefixes belong to other networks and are ignored; the prefix is taken
     # off as well.
@@ -85,12 +93,6 @@ class Part:
         start = next((start for start in self.only if key.startswith(start)), None)
         return None if start is None else key.removeprefix(start)
 
-
-GLD = "SeonghuJeon/GLD (Geometric Latent Diffusion)"
-GLD_TERMS = "Apache-2.0 (model card); code MIT"
-
-# Dictionaries in which the tensors of a PyTorch file may lie; the first that is there counts.
-NESTED = ("ema", "model")
 
 # A file of one's own, instead of all others.
 WHOLE = Part("geoverse", "", (WHOLE_FILE,), "gvtools train or gvtools weights create", "", strip="")
@@ -238,18 +240,14 @@ def _check_statistics(
         raise CheckpointError(f"{path}: var is negative in places; expected variances")
 
 
-# Of the random numbers of an untrained extension; none of them reaches the output.
-_SEED = 0
-
-
 @dataclass(frozen=True)
 class PartReport:
     """What was found of one part of a folder."""
 
-    name: str  # of the part
-    path: Path | None  # its file or folder, or None
+    name: str
+    path: Path | None  # its file or folder
     ok: bool  # it can be loaded, or the model does without it
-    summary: str  # one line
+    summary: str
     fit: Fit | None = None  # names, shapes and types, where a file could be read
     bytes: int = 0  # on disk
     parameters: int = 0  # numbers in the tensors that fit
@@ -378,7 +376,7 @@ def check_folder(folder: Path | str, config: GeoVerseConfig | None = None) -> li
     return reports
 
 
-def check_headers(folder: Path | str) -> GeoVerseConfig:  # Its configuration
+def check_headers(folder: Path | str) -> GeoVerseConfig:
     """The configuration of a folder that can be loaded, as far as headers show; else refused."""
     folder = Path(folder)
     config = config_of(folder)
@@ -466,7 +464,7 @@ def _tensors(folder: Path, model: GeoVerse, *, numbers: bool = True) -> dict[str
 
 def save_pretrained(
     model: GeoVerse, folder: Path | str, *, dtype: str = "float32", about: str = ""
-) -> Path:  # The weights' file
+) -> Path:
     """Write ``config.json`` and ``geoverse.safetensors``, the latter's path is the result.
 
     Each appears under its name when it is whole, and the weights of an earlier model are never

@@ -236,13 +236,13 @@ class EncoderConfig:
 class PatchEmbed(nn.Module):
     """Non-overlapping patches to tokens."""
 
-    def __init__(self, width: int, patch: int) -> None:
+    def __init__(self, channels: int, width: int, patch: int = 1) -> None:
         super().__init__()
-        self.proj = nn.Conv2d(3, width, kernel_size=patch, stride=patch)
+        self.proj = nn.Conv2d(channels, width, kernel_size=patch, stride=patch)
 
-    def forward(self, images: Tensor) -> Tensor:
-        """(B, 3, H, W) to (B, H/patch * W/patch, width), row-major."""
-        return self.proj(images).flatten(2).transpose(1, 2)
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, channels, H, W) to (B, H/patch * W/patch, width), row-major."""
+        return self.proj(x).flatten(2).transpose(1, 2)
 
 
 class Backbone(Recomputing):
@@ -255,7 +255,7 @@ class Backbone(Recomputing):
         self.cls_token = nn.Parameter(torch.zeros(1, 1, width))
         self.camera_token = nn.Parameter(torch.randn(1, 2, width) * 0.02)
         self.pos_embed = nn.Parameter(torch.zeros(1, 1 + config.base_grid**2, width))
-        self.patch_embed = PatchEmbed(width, config.patch)
+        self.patch_embed = PatchEmbed(3, width, config.patch)
         self.blocks = nn.ModuleList(
             Block(
                 width,

@@ -69,6 +69,14 @@ class Fusion(nn.Module):
         return self.out_conv(_resized(self.resConfUnit2(x), size))
 
 
+class ChannelNorm(nn.LayerNorm):
+    """LayerNorm over the channels of (B, C, h, w)."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        """The same shape."""
+        return super().forward(x.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
+
+
 class Scratch(nn.Module):
     """The layers after the projection, under the name that the checkpoints give them."""
 
@@ -98,30 +106,14 @@ class Scratch(nn.Module):
         self.output_conv2_aux = nn.ModuleList(
             nn.Sequential(
                 nn.Conv2d(half, 32, 3, padding=1),
-                ChannelsLast(),
-                nn.LayerNorm(32),
-                ChannelsFirst(),
+                nn.Identity(),
+                ChannelNorm(32),
+                nn.Identity(),
                 nn.ReLU(),
                 nn.Conv2d(32, 7, 1),
             )
             for _ in range(4)
         )
-
-
-class ChannelsLast(nn.Module):
-    """(B, C, h, w) to (B, h, w, C)."""
-
-    def forward(self, x: Tensor) -> Tensor:
-        """The same values, channels last."""
-        return x.permute(0, 2, 3, 1)
-
-
-class ChannelsFirst(nn.Module):
-    """(B, h, w, C) to (B, C, h, w)."""
-
-    def forward(self, x: Tensor) -> Tensor:
-        """The same values, channels first."""
-        return x.permute(0, 3, 1, 2)
 
 
 class GeometryHead(Recomputing):

@@ -24,11 +24,7 @@ from gvtools.networks.depth_anything.encoder import (
     imagenet_normalised,
     patch_rays,
 )
-from gvtools.networks.depth_anything.geometry_head import (
-    Geometry,
-    GeometryHead,
-    GeometryHeadConfig,
-)
+from gvtools.networks.depth_anything.geometry_head import Geometry, GeometryHead, GeometryHeadConfig
 from gvtools.networks.tensors import TensorFiles, load, not_finite, read_tensors, share_tied
 from gvtools.untrusted import read_json
 

@@ -199,7 +199,7 @@ def poses_least_squares(
     rotation = nearest_rotation(H @ K)
     K = K / K[..., 2:, 2:]
     K = torch.tensor([size[1] / width, size[0] / height, 1], dtype=K.dtype)[:, None] * K
-    return RayCameras(_pose(rotation, centre), K.expand_as(H))
+    return RayCameras(rigid(rotation, centre), K.expand_as(H))
 
 
 @torch.no_grad()
@@ -241,7 +241,7 @@ def poses_ransac(
             R, K = factor(H, upper=factorisation == "qr")
         except DegenerateError as error:
             raise DegenerateError(f"rays of view {view}: {error}") from None
-        poses.append(_pose(R, centre))
+        poses.append(rigid(R, centre))
         intrinsics.append(K)
     scale = torch.tensor([size[1] / 2, size[0] / 2, 1], dtype=ray.dtype)[:, None]
     K = torch.stack(intrinsics)
@@ -284,7 +284,8 @@ def _precise(ray: Tensor, confidence: Tensor | None) -> tuple[Tensor, Tensor]:
     return ray, confidence.detach().to("cpu", torch.float64)
 
 
-def _pose(rotation: Tensor, translation: Tensor) -> Tensor:
+def rigid(rotation: Tensor, translation: Tensor) -> Tensor:
+    """(..., 4, 4) of (..., 3, 3) and (..., 3)."""
     top = torch.cat((rotation, translation[..., None]), dim=-1)
-    last = torch.eye(4, dtype=top.dtype)[3:].expand(*top.shape[:-2], 1, 4)
+    last = torch.eye(4, dtype=top.dtype, device=top.device)[3:].expand(*top.shape[:-2], 1, 4)
     return torch.cat((top, last), dim=-2)
