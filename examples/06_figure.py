@@ -11,7 +11,7 @@ import matplotlib.pyplot as plt
 from sample import output_folder, sample_project
 
 import gvtools
-from viz.plots.growth import draw_growth
+from viz.plots.rounds import draw_growth
 
 out = output_folder() / "figure"
 shutil.rmtree(out, ignore_errors=True)

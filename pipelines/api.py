@@ -75,7 +75,7 @@ def reconstruct(
     from pipelines.console import Console
     from pipelines.reconstruction.run import reconstruct as run_reconstruct
     from pipelines.reconstruction.settings import RunSettings
-    from pipelines.report.write import draw_run
+    from pipelines.report import draw_run
 
     config = with_values(RunSettings(), {"profile": profile})
     named = {"context": context, "targets": targets, "completer": completer}

@@ -294,7 +294,7 @@ def _draw(out: Path, report: CaptureReport, *, title: str) -> None:
     """``capture.png``: the cameras from above, and which of them overlap."""
     from gvtools.files import replaced_when_written
     from gvtools.scenes.project import open_project
-    from viz.plots.capture import draw_capture
+    from viz.plots.trajectories import draw_capture
 
     scene = open_project(out)
     assert scene.points is not None
@@ -311,7 +311,7 @@ def _draw_rgbd(out: Path, report: RgbdCaptureReport, *, title: str) -> None:
     from gvtools.capture.rgbd_project import points_from_above
     from gvtools.files import replaced_when_written
     from gvtools.scenes.project import open_project
-    from viz.plots.capture import draw_capture
+    from viz.plots.trajectories import draw_capture
 
     scene = open_project(out)
     cameras, points = points_from_above(scene, report.keyframes)

@@ -46,7 +46,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
     from gvtools.procedural.room_sample import KERNELS
     from gvtools.scenes.project import open_project
     from pipelines.reconstruction.run import compile_kernels, reconstruct
-    from pipelines.report.write import draw_run
+    from pipelines.report import draw_run
 
     compile_kernels(config, console, more=(KERNELS,) if args.sample != "motorcycle" else ())
     console.line(f"sample {args.sample}, seed {config.seed}: writing {sample}")

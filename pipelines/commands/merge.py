@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace, console: Console) -> None:
     """Run ``gvtools merge``."""
     from pipelines.blocks.merge import merge
-    from pipelines.report.write import draw_run
+    from pipelines.report import draw_run
 
     merge(
         args.runs,

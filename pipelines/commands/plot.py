@@ -65,21 +65,20 @@ def _figure(what: str, folder: Path) -> Figure:
     run = load_run(folder)
     rounds = run.rounds
     if what == "trajectories":
-        from pipelines.report.data import open_sources
-        from pipelines.report.measures import read_measures, report_poses
+        from pipelines.report import open_sources, read_measures, report_poses
         from viz.plots.trajectories import draw_trajectories
 
         sources = open_sources(run)
         found = read_measures(run).poses
-        poses = report_poses(rounds, sources.scene, run.context, found=found).drawn
+        poses = report_poses(rounds, sources.scene, run.context, found=found).cameras
         if poses is None:
             raise ProjectError(f"{folder}: no cameras to draw ({sources.problem or 'no rounds'})")
         return draw_trajectories(poses, title=title)
     if what in ("growth", "coverage"):
-        from viz.plots.growth import draw_growth
+        from viz.plots.rounds import draw_growth
 
         return draw_growth(rounds, title=title, panels=None if what == "growth" else [what])
-    from viz.plots.timing import draw_timing
+    from viz.plots.rounds import draw_timing
 
     return draw_timing(rounds, title=title)
 

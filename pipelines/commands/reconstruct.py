@@ -90,7 +90,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
     """Run ``gvtools reconstruct``."""
     from pipelines.commands.capture import open_or_capture
     from pipelines.reconstruction.run import reconstruct
-    from pipelines.report.write import draw_run
+    from pipelines.report import draw_run
     from pipelines.viewing.live import live_viewer
 
     config = config_from(args)

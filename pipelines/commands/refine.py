@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace, console: Console) -> None:
     """Run ``gvtools refine``."""
     from pipelines.reconstruction.run import refine
-    from pipelines.report.write import draw_run
+    from pipelines.report import draw_run
 
     if args.steps is not None and args.steps < 1:
         raise OptionError(f"--steps {args.steps}; expected at least 1")

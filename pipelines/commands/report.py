@@ -37,8 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace, console: Console) -> None:
     """Write the page."""
     from gvtools.files import write_text
-    from pipelines.report.data import collect
-    from pipelines.report.write import PAGE
+    from pipelines.report import PAGE, collect
     from viz.report.page import report_html
 
     if args.pictures < 1:

@@ -348,7 +348,7 @@ def _round_line(report: dict[str, Any]) -> str:
 def say_results(directory: RunDirectory, drawn: Sequence[str], console: Console) -> None:
     """Say how the memory of a finished run grew, and where its files are."""
     from gvtools.runs.context_depth import off_scale
-    from viz.plots.growth import growth_text
+    from viz.plots.rounds import growth_text
 
     reports = directory.reports()
     console.line(growth_text(reports))

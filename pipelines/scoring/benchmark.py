@@ -250,7 +250,7 @@ def _reconstruct(opened: _OpenCell) -> float:
     from gvtools.settings import with_values
     from pipelines.reconstruction.run import compile_kernels, reconstruct
     from pipelines.reconstruction.settings import RunSettings
-    from pipelines.report.write import draw_run
+    from pipelines.report import draw_run
 
     cell, benchmark = opened.cell, opened.benchmark
     # All methods work at the benchmark's size, also profiles that would reduce pictures further.
@@ -321,7 +321,7 @@ def _of_pictures(opened: _OpenCell) -> tuple[dict[str, Any], dict[str, np.ndarra
 def _summary(evaluation: Mapping[str, Any]) -> dict[str, Any]:
     """What tables show of an evaluation, as ``gvtools evaluate`` has it."""
     from gvtools.evaluation.ranking import Setting
-    from pipelines.report.nested import nested
+    from pipelines.report import nested
     from pipelines.scoring.tables import measured_row, scalars
 
     nothing = Setting(data_set=None, resolution=None, context=None, targets=None)

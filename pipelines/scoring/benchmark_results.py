@@ -27,8 +27,8 @@ from pipelines.scoring.sweep import FAILED
 from pipelines.scoring.tables import write_tables
 
 if TYPE_CHECKING:
-    from viz.report.benchmark_page import BenchmarkPage, PictureRow
-    from viz.report.contact_sheet import Tile
+    from viz.report.page import BenchmarkPage, SheetRow
+    from viz.report.pictures import Thumbnail
 
 RESULTS, PAGE = "results.json", "index.html"
 MIB = 2**20
@@ -212,7 +212,7 @@ def write_results(
 
     Cells may be measured or not. Returns the comparison tables by number of context views.
     """
-    from viz.report.benchmark_page import benchmark_html
+    from viz.report.page import benchmark_html
 
     views = dict.fromkeys(cell.views for cell in cells)
     by_views = {number: method_results(benchmark.at(number), cells) for number in views}
@@ -261,7 +261,7 @@ def _page(
     tables: Mapping[str, Table],
     title: str,
 ) -> BenchmarkPage:
-    from viz.report.benchmark_page import BenchmarkPage
+    from viz.report.page import BenchmarkPage
 
     methods = dict.fromkeys(cell.method.name for cell in cells)
     scenes = dict.fromkeys(cell.scene for cell in cells)
@@ -294,9 +294,9 @@ def _page(
     )
 
 
-def _pictures(scene: str, cells: Sequence[BenchmarkCell]) -> PictureRow | None:
+def _pictures(scene: str, cells: Sequence[BenchmarkCell]) -> SheetRow | None:
     """The middle target of a scene: a given view, the photograph, each method and its error."""
-    from viz.report.benchmark_page import PictureRow
+    from viz.report.page import SheetRow
 
     folder, views = cells[0].result.parent, cells[0].views
     heading = f"{scene}, {views} context views"
@@ -309,18 +309,18 @@ def _pictures(scene: str, cells: Sequence[BenchmarkCell]) -> PictureRow | None:
             if cell.result.is_file():
                 tiles.append(_tile(path, label, f"{heading}, {cell.method.name}"))
     known = tuple(tile for tile in tiles if tile is not None)
-    return PictureRow(heading, known) if len(known) > 2 else None
+    return SheetRow(heading, known) if len(known) > 2 else None
 
 
-def _tile(path: Path, label: str, where: str) -> Tile | None:
+def _tile(path: Path, label: str, where: str) -> Thumbnail | None:
     from PIL import Image
 
-    from viz.report.contact_sheet import Tile, data_uri
+    from viz.report.pictures import Thumbnail, data_uri
 
     if not path.is_file():
         return None
     with Image.open(path) as picture:
         width, height = picture.size
-    return Tile(
+    return Thumbnail(
         label, f"{where}: {label}", data_uri(path.read_bytes(), "image/jpeg"), width, height
     )

@@ -189,7 +189,7 @@ def write_thumbnails(
     """
     from PIL import Image
 
-    from viz.report.contact_sheet import error_map
+    from viz.report.pictures import error_map
 
     name = middle(list(pictures))
     truth = scene[name].load()

@@ -21,7 +21,7 @@ from gvtools.runs.layout import RECORD
 from gvtools.runs.memory_file import load_memory
 from gvtools.runs.run import Run, load_run
 from pipelines.console import Console
-from pipelines.report.nested import nested
+from pipelines.report import nested
 from pipelines.scoring.measurement import (
     Measurement,
     context_pictures,
@@ -114,7 +114,7 @@ def run_protocol(
     from gvtools.settings import with_texts, with_values
     from pipelines.reconstruction.run import reconstruct
     from pipelines.reconstruction.settings import RunSettings
-    from pipelines.report.write import draw_run
+    from pipelines.report import draw_run
 
     context, targets, rounds = PROTOCOLS[protocol]
     split = protocol_split(

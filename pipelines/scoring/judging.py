@@ -23,7 +23,7 @@ from pipelines.scoring.measurement import (
 )
 from pipelines.scoring.method_pictures import MethodPictures, Reference, open_method
 from pipelines.scoring.tables import differences, judge_markdown, judge_tables, print_judgement
-from viz.report.judge_sheet import JudgedView, sheet
+from viz.report.pictures import JudgedView, method_sheet
 
 if TYPE_CHECKING:
     from gvtools.evaluation.lpips_distance import Lpips
@@ -192,7 +192,7 @@ def _write(
     sheets = []
     for number, first in enumerate(range(0, len(views), VIEWS_A_SHEET)):
         sheets.append(f"sheet_{number:03d}.png")
-        picture = Image.fromarray(sheet(views[first : first + VIEWS_A_SHEET]))
+        picture = Image.fromarray(method_sheet(views[first : first + VIEWS_A_SHEET]))
         with replaced_when_written(out / sheets[-1]) as temporary:
             picture.save(temporary, format="PNG")
     write_json(out / "judge.json", figures)

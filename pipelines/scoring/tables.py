@@ -13,7 +13,7 @@ from gvtools.evaluation.intervals import mean_interval
 from gvtools.evaluation.ranking import MeasuredRow, Setting
 from gvtools.evaluation.tables import Cell, Column, Table, Value, markdown, render
 from gvtools.files import write_text
-from pipelines.report.nested import nested
+from pipelines.report import nested
 from pipelines.scoring.measurement import JUDGED
 
 if TYPE_CHECKING:

@@ -25,7 +25,7 @@ from pipelines.console import Console, Silent
 from pipelines.reconstruction.run import reconstruct
 from pipelines.reconstruction.settings import RunSettings
 from pipelines.scoring.sweep import DONE, FAILED, InTurn, Job, Record, Watch, sweep
-from viz.plots.pareto import draw_pareto
+from viz.plots.comparisons import draw_pareto
 
 if TYPE_CHECKING:
     from pipelines.reconstruction.plan import Plan

@@ -9,12 +9,12 @@ from matplotlib import colormaps
 from PIL import Image
 
 from gvtools.errors import ShapeError
-from viz.report.contact_sheet import (
+from viz.report.pictures import (
     ERROR_MAP,
     SUPPORT,
     WORST,
     TargetPictures,
-    Tile,
+    Thumbnail,
     contact_row,
     error_map,
     support_map,
@@ -23,7 +23,7 @@ from viz.report.contact_sheet import (
 RNG = np.random.default_rng(0)
 
 
-def opened(tile: Tile) -> Image.Image:
+def opened(tile: Thumbnail) -> Image.Image:
     kind, data = tile.uri.split(";base64,")
     image = Image.open(io.BytesIO(base64.b64decode(data)))
     assert kind == f"data:image/{str(image.format).lower()}"

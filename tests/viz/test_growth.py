@@ -10,7 +10,7 @@ from growth_rounds import rounds
 from PIL import Image
 
 from gvtools.errors import OptionError
-from viz.plots.growth import draw_growth, growth_text
+from viz.plots.rounds import draw_growth, growth_text
 
 
 def heights(axes, label):

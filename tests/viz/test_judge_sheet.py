@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from gvtools.errors import ShapeError
-from viz.plots.palette import SKY
-from viz.report.judge_sheet import GAP, LETTERS, MISSING, JudgedView, sheet
+from viz.plots.canvas import SKY
+from viz.report.pictures import GAP, LETTERS, MISSING, JudgedView, method_sheet
 
 COLOR = [int(SKY[i : i + 2], 16) for i in (1, 3, 5)]
 WIDTH, HEIGHT = 64, 48
@@ -30,7 +30,7 @@ def tiles(canvas: np.ndarray, line: int) -> list[np.ndarray]:
 
 
 def test_a_view_has_truth_pictures_and_error_maps_below_its_methods():
-    canvas = sheet([view()])
+    canvas = method_sheet([view()])
     truth, exact, bright, absent = tiles(canvas, 0)
     assert (exact == 100).all()
     assert (bright == 250).all()
@@ -53,16 +53,16 @@ def test_a_view_has_truth_pictures_and_error_maps_below_its_methods():
 
 
 def test_without_truth_there_are_no_error_maps():
-    with_truth, without = (sheet([one]) for one in (view(), view(truth=None)))
+    with_truth, without = (method_sheet([one]) for one in (view(), view(truth=None)))
     assert with_truth.shape[0] - without.shape[0] == HEIGHT + GAP
 
 
 def test_views_stand_below_each_other():
-    one, two = sheet([view()]), sheet([view(), view()])
+    one, two = method_sheet([view()]), method_sheet([view(), view()])
     assert two.shape[1] == one.shape[1]
     assert one.shape[0] < two.shape[0] < 2 * one.shape[0]
 
 
 def test_no_view_is_refused():
     with pytest.raises(ShapeError, match="no views"):
-        sheet([])
+        method_sheet([])

@@ -17,11 +17,9 @@ from scipy.spatial.transform import Rotation
 from gvtools.errors import OptionError
 from pipelines.cli import main
 from viz.plots.canvas import png
-from viz.plots.growth import draw_growth
+from viz.plots.comparisons import draw_pareto
 from viz.plots.losses import draw_losses, loss_names, running_median
-from viz.plots.pareto import draw_pareto
-from viz.plots.quality import draw_quality
-from viz.plots.timing import draw_timing, stage_seconds
+from viz.plots.rounds import draw_growth, draw_quality, draw_timing, stage_seconds
 from viz.plots.trajectories import Trajectories, draw_trajectories, principal_axes
 
 RNG = np.random.default_rng(0)

@@ -20,12 +20,9 @@ from gvtools.scenes.project import open_project
 from pipelines.cli import main
 from pipelines.reconstruction.prepare import make_plan
 from pipelines.reconstruction.settings import RunSettings
-from pipelines.report.data import collect
-from pipelines.report.sheets import chosen_targets
-from pipelines.report.write import write_report
-from viz.report.contact_sheet import TargetPictures, contact_row
-from viz.report.content import SheetRow, Sheets
-from viz.report.page import report_html
+from pipelines.report import chosen_targets, collect, write_report
+from viz.report.page import SheetRow, Sheets, report_html
+from viz.report.pictures import TargetPictures, contact_row
 
 LABELS = ["context", "hint", "validity", "completion", "truth", "error"]
 
@@ -136,7 +133,7 @@ def test_an_evaluation_gives_intervals_and_estimated_poses(own):
     assert "evaluation/evaluation.json" in page.said
     assert "95 % interval" in page.said
     report = collect(own)
-    poses = report.poses.drawn
+    poses = report.poses.cameras
     assert poses is not None
     assert poses.estimated is not None
     located = poses.located

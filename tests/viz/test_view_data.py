@@ -16,7 +16,7 @@ from gvtools.errors import OptionError, ProjectError
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.runs.layout import inside
 from pipelines.viewing.source import ViewSource
-from viz.plots.palette import COLORS, GREY
+from viz.plots.canvas import COLORS, GREY
 from viz.run_view.detail import detail
 from viz.run_view.point_colors import (
     MODES,

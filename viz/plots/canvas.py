@@ -1,7 +1,7 @@
-"""Figures of one panel or several, each on an Agg canvas of its own: pyplot's state is left alone.
+"""Figures of one panel or several, each on an Agg canvas of its own, and the colours they share.
 
 A panel is a function that draws on the axes it is given. A page that is read on a phone shows the
-panels one by one; a file holds them side by side.
+panels one by one; a file holds them side by side. The state of pyplot is left alone.
 """
 
 from __future__ import annotations
@@ -17,50 +17,82 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Panel = Callable[["Axes"], None]
-Rounds = Sequence[Mapping[str, Any]]
+Rounds = Sequence[Mapping[str, Any]]  # the lines of a run's ``rounds.jsonl``, in order
+
+# Okabe and Ito's palette, which the common forms of colour blindness tell apart.
+BLACK, ORANGE, SKY, GREEN, YELLOW, BLUE, RED, PINK = (
+    "#000000", "#E69F00", "#56B4E9", "#009E73", "#F0E442", "#0072B2", "#D55E00", "#CC79A7",
+)  # fmt: skip
+GREY = "#999999"
+
+COLORS = {
+    "observed": BLUE,
+    "generated": ORANGE,
+    "scanned": GREEN,
+    "voxels": BLACK,
+    "added": GREEN,
+    "merged": SKY,
+    "rejected": RED,
+    "new voxels": GREY,
+    "depth": BLUE,
+    "fuse": GREEN,
+    "project": SKY,
+    "complete": ORANGE,
+    "align": PINK,
+}
+HATCHES = {
+    "generated": "//",
+    "scanned": "..",
+    "rejected": "xx",
+    "merged": "..",
+    "complete": "//",
+    "align": "xx",
+}
+# Of anything that has no colour of its own.
+OTHERS = (GREY, RED, BLACK, YELLOW)
 
 SIZE = (5.5, 3.75)  # inches, of each of several panels
 ALONE = (4.7, 3.4)  # of a single one, whose letters stay legible on a phone
+LINES: dict[str, Any] = {"color": "#dddddd", "linewidth": 0.6}  # of a grid
+LEGEND: dict[str, Any] = {"frameon": False, "fontsize": "small"}
 
 
-def figure_of(panels: Sequence[Panel], *, title: str | None = None, columns: int = 2) -> Figure:
-    """A figure with the panels row by row.
+def rgb_of(color: str) -> tuple[int, int, int]:
+    """A colour "#rrggbb" as bytes."""
+    return int(color[1:3], 16), int(color[3:5], 16), int(color[5:7], 16)
 
-    Args:
-        panels: at least one.
-        title: above all of them; None leaves it out.
-        columns: at most so many panels side by side.
 
-    Returns:
-        A figure with its own Agg canvas.
-    """
+def blank_figure(size: tuple[float, float], **options: Any) -> Figure:
+    """A figure of a size in inches with its own Agg canvas."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
+    figure = Figure(figsize=size, layout="constrained", **options)
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def figure_of(panels: Sequence[Panel], *, title: str | None = None, columns: int = 2) -> Figure:
+    """At least one panel, row by row, at most so many side by side."""
     columns = min(columns, len(panels))
     rows = -(-len(panels) // columns)
     width, height = SIZE if len(panels) > 1 else ALONE
-    figure = Figure(figsize=(width * columns, height * rows), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = blank_figure((width * columns, height * rows))
     for number, panel in enumerate(panels, start=1):
         axes = figure.add_subplot(rows, columns, number)
         panel(axes)
         axes.spines[["top", "right"]].set_visible(False)
         axes.set_axisbelow(True)
-        _take_literally(axes)
+        # Names of projects and of stages are no formulas, even with dollar signs in them.
+        legend = axes.get_legend()
+        for words in (axes.title, *(legend.get_texts() if legend else ())):
+            words.set_parse_math(False)
     if title is not None:
         figure.suptitle(title, parse_math=False)
     return figure
 
 
-def _take_literally(axes: Axes) -> None:
-    """Names of projects and of stages are no formulas, even with dollar signs in them."""
-    legend = axes.get_legend()
-    for words in (axes.title, *(legend.get_texts() if legend else ())):
-        words.set_parse_math(False)
-
-
-def chosen(panels: Mapping[str, Panel], names: Sequence[str] | None) -> list[Panel]:
+def select_panels(panels: Mapping[str, Panel], names: Sequence[str] | None) -> list[Panel]:
     """The named panels, in the order of the names; all of them without names."""
     names = tuple(panels) if names is None else tuple(names)
     unknown = [name for name in names if name not in panels]
@@ -73,16 +105,6 @@ def check_rounds(rounds: Rounds) -> None:
     """Refuse to draw nothing."""
     if not rounds:
         raise OptionError("growth: no rounds; expected the lines of a run's rounds.jsonl")
-
-
-def round_axis(axes: Axes, rounds: Rounds) -> None:
-    """The horizontal axis of a panel over rounds."""
-    axes.set_xticks(range(len(rounds)), [str(entry["round"]) for entry in rounds])
-    if len(rounds) > 20:
-        axes.set_xticks(range(0, len(rounds), len(rounds) // 10))
-    axes.set_xlim(-0.6, len(rounds) - 0.4)
-    axes.set_xlabel("round")
-    axes.grid(axis="y", color="#dddddd", linewidth=0.6)
 
 
 def png(figure: Figure, *, dpi: int = 120) -> bytes:

@@ -10,8 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.errors import OptionError
-from viz.plots.canvas import figure_of
-from viz.plots.palette import BLACK, BLUE, GREEN, GREY, ORANGE, PINK, RED, SKY
+from viz.plots.canvas import (
+    BLACK,
+    BLUE,
+    GREEN,
+    GREY,
+    LEGEND,
+    LINES,
+    ORANGE,
+    PINK,
+    RED,
+    SKY,
+    figure_of,
+)  # fmt: skip
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,7 +35,7 @@ NO_LOSSES = ("step", "seconds", "rate", "skipped", "gradient_norm")
 NO_LOSS_ENDS = ("_empty", "_pixels", "_without_scale", "_psnr", "_rel")
 TOTAL = "loss"
 PALETTE = (BLUE, ORANGE, GREEN, RED, SKY, PINK, GREY)
-LINES = ("-", "--", ":")
+STYLES = ("-", "--", ":")
 # Curves are drawn as the running median over this share of the records, over their raw values.
 WINDOW = 1 / 30
 # The axis is linear up to the largest value over this.
@@ -36,10 +47,7 @@ def draw_losses(stages: Mapping[str, Records], *, title: str | None = None) -> F
 
     Values are drawn faintly, their running median boldly. The axis is logarithmic; where parts
     of a loss are zero or negative, it is linear below about a thirtieth of the largest value.
-
-    Args:
-        stages: for each stage the records of its log, each with ``step`` and values by name.
-        title: of the training.
+    Records of a stage's log have ``step`` and values by name.
     """
     if not stages:
         raise OptionError("losses: no stage; expected the logs of a training")
@@ -64,12 +72,7 @@ def loss_names(records: Records) -> list[str]:
 
 
 def running_median(values: NDArray[np.float64], width: int) -> NDArray[np.float64]:
-    """The median over ``width`` neighbours (odd), fewer at the ends; NaN counts for nothing.
-
-    Args:
-        values: (N,).
-        width: at least 1.
-    """
+    """The median over ``width`` neighbours (odd), fewer at the ends; NaN counts for nothing."""
     reach = width // 2
     padded = np.pad(values, reach, constant_values=np.nan)
     windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1)
@@ -90,7 +93,7 @@ def _panel(axes: Axes, *, stage: str, records: Records) -> None:
         largest = max(largest, float(np.nanmax(np.abs(values), initial=0)))
         part = number - (TOTAL in names)
         color = BLACK if name == TOTAL else PALETTE[part % len(PALETTE)]
-        line = "-" if name == TOTAL else LINES[part // len(PALETTE) % len(LINES)]
+        line = "-" if name == TOTAL else STYLES[part // len(PALETTE) % len(STYLES)]
         axes.plot(steps, values, color=color, linewidth=0.5, alpha=0.3)
         axes.plot(
             steps, running_median(values, width), line, color=color, label=name,
@@ -105,8 +108,8 @@ def _panel(axes: Axes, *, stage: str, records: Records) -> None:
     axes.set_title(stage)
     axes.set_xlabel("training step")
     axes.set_ylabel("loss (no unit)")
-    axes.grid(color="#dddddd", linewidth=0.6)
-    axes.legend(fontsize="small", frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    axes.grid(**LINES)
+    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), **LEGEND)
 
 
 def _number(value: Any) -> float:

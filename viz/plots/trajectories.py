@@ -1,4 +1,4 @@
-"""Where cameras stand and look: what was given, what was asked for, where pictures look from."""
+"""Figures of cameras: of a run from above and from the side, and of a capture with its overlaps."""
 
 from __future__ import annotations
 
@@ -11,33 +11,42 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.errors import OptionError
-from viz.plots.canvas import chosen, figure_of
-from viz.plots.palette import BLACK, BLUE, GREY, ORANGE
+from viz.plots.canvas import (
+    BLACK,
+    BLUE,
+    GREY,
+    LEGEND,
+    LINES,
+    ORANGE,
+    blank_figure,
+    figure_of,
+    select_panels,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from gvtools.cameras import Cameras
 
 # Viewing directions are drawn so long, as a share of the cameras' extent, and at most so many.
 ARROW = 0.07
 MOST_ARROWS = 80
 # The mean of the cameras' up directions says nothing where it is shorter.
 LEAST_UP = 0.2
+# Share of a capture's points, nearest to their median, that decides what its figure shows.
+SHOWN = 0.9
+MOST_POINTS = 20_000
 
 
 @dataclass(frozen=True, eq=False)
 class Trajectories:
-    """Camera-to-world poses in one world frame, scene units, OpenCV axes.
+    """Camera-to-world poses in one world frame, scene units, OpenCV axes."""
 
-    Attributes:
-        context: (C, 4, 4), of the views that were given.
-        requested: (T, 4, 4), of the targets, in their order.
-        estimated: (T, 4, 4), where the completed pictures look from, NaN where that was not found;
-            None where nobody looked for it.
-    """
-
-    context: NDArray[np.float64]
-    requested: NDArray[np.float64]
+    context: NDArray[np.float64]  # (C, 4, 4), of the views that were given
+    requested: NDArray[np.float64]  # (T, 4, 4), of the targets, in their order
+    # (T, 4, 4), where the completed pictures look from, NaN where that was not found; None where
+    # nobody looked for it.
     estimated: NDArray[np.float64] | None = None
 
     @property
@@ -56,20 +65,15 @@ def draw_trajectories(
     Up is the mean of the context cameras' up directions (of the targets' without context); where
     they cancel out, the direction in which the cameras spread least. The horizontal axis is the
     one along which they spread most.
-
-    Args:
-        poses: at least one camera.
-        title: what was reconstructed.
-        panels: of "top" and "side"; None is both.
     """
     if not len(poses.context) + len(poses.requested):
         raise OptionError("trajectories: no cameras; expected those of a run")
     axes = principal_axes(np.concatenate([poses.context, poses.requested]), poses.context)
     known = {
-        "top": partial(_panel, poses=poses, axes_of_plot=axes[[0, 1]], names=("right", "forward")),
-        "side": partial(_panel, poses=poses, axes_of_plot=axes[[0, 2]], names=("right", "up")),
+        "top": partial(_poses_panel, poses=poses, plane=axes[[0, 1]], names=("right", "forward")),
+        "side": partial(_poses_panel, poses=poses, plane=axes[[0, 2]], names=("right", "up")),
     }
-    return figure_of(chosen(known, panels), title=title)
+    return figure_of(select_panels(known, panels), title=title)
 
 
 def principal_axes(
@@ -100,11 +104,11 @@ def principal_axes(
     return np.stack([right, np.cross(up, right), up])
 
 
-def _panel(
+def _poses_panel(
     axes: Axes,
     *,
     poses: Trajectories,
-    axes_of_plot: NDArray[np.float64],
+    plane: NDArray[np.float64],
     names: tuple[str, str],
 ) -> None:
     everything = np.concatenate([poses.context, poses.requested])[:, :3, 3]
@@ -112,8 +116,8 @@ def _panel(
     extent = float(np.ptp(everything, axis=0).max()) or 1.0
 
     def flat(world_from_cam: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-        place = (world_from_cam[:, :3, 3] - middle) @ axes_of_plot.T
-        look = world_from_cam[:, :3, 2] @ axes_of_plot.T
+        place = (world_from_cam[:, :3, 3] - middle) @ plane.T
+        look = world_from_cam[:, :3, 2] @ plane.T
         return place, look
 
     def arrows(world_from_cam: NDArray[np.float64], color: str) -> None:
@@ -149,8 +153,59 @@ def _panel(
     axes.set_ylabel(f"{names[1]}, scene units")
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.08, 0.14)
-    axes.grid(color="#dddddd", linewidth=0.6)
+    axes.grid(**LINES)
     axes.legend(
-        ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.08), frameon=False, fontsize="small",
-        handletextpad=0.3, columnspacing=1.0,
+        ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.08), handletextpad=0.3,
+        columnspacing=1.0, **LEGEND,
     )  # fmt: skip
+
+
+def draw_capture(
+    cameras: Cameras,
+    points: NDArray[np.float64],
+    overlap: Sequence[tuple[str, str, float]],
+    *,
+    title: str,
+) -> Figure:
+    """A capture's cameras and (N, 3) triangulated points along z, in the world's x and y.
+
+    Lines join pictures that overlap, the more the darker; names without a camera are left out.
+    """
+    from matplotlib.collections import LineCollection
+
+    figure = blank_figure((8, 7), dpi=110)
+    axes = figure.add_subplot()
+    centres = cameras.centers[:, :2]
+    ahead = cameras.world_from_cam[:, :2, 2]
+    row = {name: number for number, name in enumerate(cameras.names)}
+    pairs = [(row[a], row[b], count) for a, b, count in overlap if a in row and b in row]
+    if pairs:
+        most = max(count for _, _, count in pairs)
+        lines = [np.stack([centres[a], centres[b]]) for a, b, _ in pairs]
+        shade = [(0.6, 0.6, 0.6, 0.1 + 0.7 * count / most) for _, _, count in pairs]
+        axes.add_collection(LineCollection(lines, colors=shade, linewidths=0.8, zorder=1))
+    if len(points):
+        step = max(1, len(points) // MOST_POINTS)
+        x, y = points[::step, :2].T
+        axes.scatter(x, y, s=0.6, color=GREY, alpha=0.5, linewidths=0, zorder=0)
+    axes.plot(*centres.T, color=BLUE, linewidth=0.8, alpha=0.6, zorder=2)
+    axes.quiver(*centres.T, *ahead.T, color=BLUE, width=0.003, scale=25, zorder=3)
+    label = f"first: {cameras.names[0]}"
+    axes.scatter(centres[0, 0], centres[0, 1], color=ORANGE, s=30, zorder=4, label=label)
+    everything = centres
+    if len(points):
+        flat = points[:, :2]
+        distance = np.linalg.norm(flat - np.median(flat, axis=0), axis=1)
+        near = flat[distance <= np.quantile(distance, SHOWN)]
+        everything = np.concatenate([centres, near])
+    # A square about all that is shown, with a margin.
+    middle = (everything.min(axis=0) + everything.max(axis=0)) / 2
+    half = 0.55 * float(np.ptp(everything, axis=0).max())
+    axes.set_xlim(middle[0] - half, middle[0] + half)
+    axes.set_ylim(middle[1] - half, middle[1] + half)
+    axes.set_aspect("equal")
+    axes.set_xlabel("x")
+    axes.set_ylabel("y")
+    axes.set_title(title)
+    axes.legend(loc="upper right", **LEGEND)
+    return figure

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.errors import OptionError
-from viz.plots.palette import COLORS, GREY
+from viz.plots.canvas import COLORS, GREY, rgb_of
 
 if TYPE_CHECKING:
     from gvtools.memory.spatial_memory import SpatialMemory
@@ -146,21 +146,17 @@ def depth_errors(
 
 def viridis(share: NDArray[np.floating]) -> NDArray[np.uint8]:
     """(P, 3) uint8 colours of values in [0, 1]; what lies outside takes the ends' colours."""
-    anchors = np.array([_rgb(color) for color in VIRIDIS], np.float64)
+    anchors = np.array([rgb_of(color) for color in VIRIDIS], np.float64)
     at = np.linspace(0, 1, len(anchors))
     share = np.clip(share, 0, 1)
     return np.stack([np.interp(share, at, anchors[:, k]) for k in range(3)], 1).round().astype("u1")
-
-
-def _rgb(color: str) -> tuple[int, int, int]:
-    return int(color[1:3], 16), int(color[3:5], 16), int(color[5:7], 16)
 
 
 def _by_round(memory: SpatialMemory, rows: NDArray[np.int64]) -> PointColors:
     rounds = memory.views.round[memory.columns.view[rows]]
     last = max(1, *memory.rounds, 1)
     rgb = viridis((rounds - 1) / max(1, last - 1))
-    rgb[rounds == 0] = _rgb(GREY)
+    rgb[rounds == 0] = rgb_of(GREY)
     scale = ("round 1", f"round {last}") if last > 1 else None
     swatches = ((GREY, "context (round 0)"), *(() if scale else ((VIRIDIS[0], "round 1"),)))
     return PointColors(rgb, Legend("round that a point was fused in", swatches, scale))
@@ -168,7 +164,7 @@ def _by_round(memory: SpatialMemory, rows: NDArray[np.int64]) -> PointColors:
 
 def _by_source(memory: SpatialMemory, rows: NDArray[np.int64]) -> PointColors:
     names = ("observed", "generated", "scanned")
-    tint = np.array([_rgb(COLORS[name]) for name in names], np.float32)
+    tint = np.array([rgb_of(COLORS[name]) for name in names], np.float32)
     light = memory.columns.colors[rows] @ np.array([0.299, 0.587, 0.114], np.float32) / 255
     view = memory.columns.view[rows]
     kind = memory.views.generated[view] + 2 * memory.views.scanned[view].astype(np.int64)
@@ -197,7 +193,7 @@ def _by_depth_error(
         errors = depth_errors(memory, rows, true_depth)
     known = np.isfinite(errors)
     rgb = np.empty((len(rows), 3), np.uint8)
-    rgb[:] = _rgb(GREY)
+    rgb[:] = rgb_of(GREY)
     if not known.any():
         return PointColors(rgb, Legend("no view has a recorded depth", ((GREY, "unknown"),)))
     rgb[known] = viridis(errors[known] / WORST_ERROR)

@@ -20,7 +20,7 @@ from gvtools.cameras import Cameras, concatenate
 from gvtools.errors import GvError, OptionError
 from gvtools.scenes.transforms_json import write_transforms, written_here
 from gvtools.trajectories import interpolate
-from viz.plots.palette import GREEN
+from viz.plots.canvas import GREEN
 from viz.run_view.view import RunView
 from viz.web.cameras import SHARE, rgb_of, vertical_field_of_view
 from viz.web.frame import TYPICAL, PageFrame

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
 from gvtools.errors import GvError
-from viz.plots.palette import COLORS, RED
+from viz.plots.canvas import COLORS, RED
 from viz.run_view.view import CONTEXT, TARGET, TRUTH, RunView, ShownCamera
 from viz.web.frame import TYPICAL, PageFrame
 

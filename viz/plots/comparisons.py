@@ -1,19 +1,56 @@
-"""Accuracy against time, trial by trial, with the front that no trial beats."""
+"""Figures that compare methods and trials: accuracy over the number of views, and over time."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from viz.plots.canvas import figure_of
-from viz.plots.palette import BLUE, GREY, ORANGE, RED
+from viz.plots.canvas import (
+    BLACK,
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    PINK,
+    RED,
+    SKY,
+    figure_of,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# The horizontal axis is logarithmic where the largest is more than so many times the smallest.
+# Number of context views, mean, lower and upper end of its interval.
+Point = tuple[int, float, float | None, float | None]
+# Side by side, so that intervals of one number of views do not hide each other; views.
+APART = 0.12
+STYLES = tuple(zip((BLUE, ORANGE, GREEN, RED, SKY, PINK, BLACK, GREY), "os^vDPX*", strict=True))
+# The axis of time is logarithmic where the largest is more than so many times the smallest.
 LOGARITHMIC = 3
+
+
+def draw_by_views(lines: Mapping[str, Sequence[Point]], *, label: str = "PSNR [dB]") -> Figure:
+    """A line a method, of its points by name, with the interval of each mean."""
+
+    def panel(axes: Axes) -> None:
+        for number, (name, points) in enumerate(lines.items()):
+            color, marker = STYLES[number % len(STYLES)]
+            shift = APART * (number - (len(lines) - 1) / 2)
+            views, means = [p[0] + shift for p in points], [p[1] for p in points]
+            # Without an interval, the ends are the mean itself.
+            below = [p[1] - (p[1] if p[2] is None else p[2]) for p in points]
+            above = [(p[1] if p[3] is None else p[3]) - p[1] for p in points]
+            axes.errorbar(
+                views, means, yerr=(below, above), color=color, marker=marker, capsize=3, label=name
+            )
+        axes.set_xticks(sorted({p[0] for points in lines.values() for p in points}))
+        axes.set_xlabel("context views")
+        axes.set_ylabel(label)
+        axes.grid(alpha=0.3)
+        axes.legend()
+
+    return figure_of([panel])
 
 
 def draw_pareto(
@@ -24,7 +61,7 @@ def draw_pareto(
     budget: float | None,
     title: str | None = None,
 ) -> Figure:
-    """PSNR over seconds of a run, logarithmic where they spread.
+    """PSNR over seconds of a run, logarithmic where they spread, with the front.
 
     Args:
         trials: at least one, each with ``label``, ``seconds`` and ``psnr``.
@@ -32,9 +69,6 @@ def draw_pareto(
         chosen: the recommended one; None where none is within the budget.
         budget: seconds; None for no limit.
         title: of the scene.
-
-    Returns:
-        A figure with its own Agg canvas.
     """
     from matplotlib.ticker import LogLocator
 
@@ -46,8 +80,11 @@ def draw_pareto(
         # Marks differ, not colours alone.
         mark([t for t in trials if t not in profiles], "trial", _marks("o", GREY))
         mark(profiles, "profile", _marks("^", ORANGE))
-        for trial in profiles:
-            _name(axes, trial)
+        for profile in profiles:
+            axes.annotate(
+                profile.label.removeprefix("profile "), (profile.seconds, profile.psnr),
+                xytext=(6, -3), textcoords="offset points", fontsize="small", parse_math=False,
+            )  # fmt: skip
         mark(front, "front", {"color": BLUE, "drawstyle": "steps-post", "zorder": 1.5})
         if chosen is not None:
             mark([chosen], "recommended", _marks("o", RED, fillstyle="none", markersize=13))
@@ -70,11 +107,3 @@ def draw_pareto(
 
 def _marks(marker: str, color: str, **more: Any) -> dict[str, Any]:
     return {"linestyle": "none", "marker": marker, "color": color, **more}
-
-
-def _name(axes: Axes, profile: Any) -> None:
-    """Write a profile's name beside its mark."""
-    axes.annotate(
-        profile.label.removeprefix("profile "), (profile.seconds, profile.psnr), xytext=(6, -3),
-        textcoords="offset points", fontsize="small", parse_math=False,
-    )  # fmt: skip

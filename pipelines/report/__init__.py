@@ -1,1 +1,0 @@
-"""What the HTML report of a run shows, collected from its folder."""
