@@ -86,10 +86,7 @@ def depth_reprojection(
 ) -> DepthReprojection:
     """Follow first's pixels by their depth into second, and back by second's depth.
 
-    Args:
-        first: the view whose pixels are reprojected.
-        second: the view they are reprojected into; its size may differ.
-        occlusion: largest relative depth difference at which both see one surface.
+    Both see one surface up to ``occlusion``, a relative difference of depth.
     """
     return _compare(first, second, occlusion)[0]
 
@@ -97,12 +94,7 @@ def depth_reprojection(
 def depth_reprojection_of_views(
     pictures: Sequence[PosedPicture], *, occlusion: float = 0.05
 ) -> DepthReprojectionOfViews:
-    """Depth reprojection of each view into its successor.
-
-    Args:
-        pictures: the views, in their order along the path.
-        occlusion: as in `depth_reprojection`.
-    """
+    """Depth reprojection of each view into its successor along the path."""
     found, pixels, relative = [], [], []
     for first, second in pairwise(pictures):
         figures, distances, differences = _compare(first, second, occlusion)

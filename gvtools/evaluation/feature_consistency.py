@@ -28,6 +28,8 @@ from gvtools.evaluation.posed_picture import PosedPicture, Seen, correspond
 
 Float32 = NDArray[np.float32]
 
+# Where unrelated content scores less, the features tell nothing apart and neither does the score.
+LEAST_SCALE = 0.02
 CELL = 4  # pixels
 ORIENTATIONS = 8
 REACH = 2  # cells between the middles of neighbouring histograms
@@ -41,20 +43,22 @@ FLATNESS = 0.3
 
 
 class DenseGradient:
-    """The feature network that needs no weights; see the module's text."""
+    """Dense gradient-orientation and colour descriptors, which need no weights.
+
+    For every 4 x 4 pixels, orientation histograms of the luminance gradient in a 3 x 3 layout of
+    cells (in the manner of HOG: N. Dalal and B. Triggs, CVPR 2005; and of the dense layout of
+    DAISY: E. Tola, V. Lepetit and P. Fua, PAMI 32(5), 2010), beside the local colour. They tell
+    edges, their place to a few pixels, and colours; they know nothing of what things are, and an
+    in-plane roll or a strong change of scale changes them.
+    """
 
     name = "dense-gradient"
 
     def features(self, rgb: NDArray[np.uint8]) -> Float32:
-        """Features of a picture.
+        """(76, ceil(H / 4), ceil(W / 4)) features of an (H, W, 3) picture.
 
-        Args:
-            rgb: (H, W, 3) uint8.
-
-        Returns:
-            (76, ceil(H / 4), ceil(W / 4)) float32: 9 x 8 gradient components whose common length is
-            at most 1 and whose mean is 0; luminance about mid-grey, red-green and yellow-blue; and
-            the constant.
+        They are 9 x 8 gradient components whose common length is at most 1 and whose mean is 0;
+        luminance about mid-grey, red-green and yellow-blue; and the constant.
         """
         height, width = rgb.shape[:2]
         shape = -(-height // CELL), -(-width // CELL)
@@ -108,10 +112,6 @@ def _neighbours(cells: Float32) -> Float32:
     )
 
 
-# Where unrelated content scores less, the features tell nothing apart and neither does the score.
-LEAST_SCALE = 0.02
-
-
 class FeatureNetwork(Protocol):
     """What turns a picture into features."""
 
@@ -120,14 +120,7 @@ class FeatureNetwork(Protocol):
         """What the score is reported under."""
 
     def features(self, rgb: NDArray[np.uint8]) -> Float32:
-        """Features of a picture.
-
-        Args:
-            rgb: (H, W, 3) uint8.
-
-        Returns:
-            (C, h, w) float32; the h x w cells cover the picture evenly.
-        """
+        """(C, h, w) features of an (H, W, 3) picture, whose h x w cells cover it evenly."""
 
 
 @dataclass(frozen=True)
@@ -174,11 +167,8 @@ def feature_consistency(
 ) -> FeatureConsistency:
     """Compare second's features, carried into first by depth and cameras, with first's.
 
-    Args:
-        first: the view that is looked at, with depth.
-        second: the view that is carried into it, with depth for the occlusion test.
-        network: what makes the features; None is `DenseGradient`, which needs no weights.
-        occlusion: largest relative depth difference at which both see one surface.
+    Both pictures need depth, second for the occlusion test. Without a network, features are those
+    of `DenseGradient`, which needs no weights.
     """
     network = network or DenseGradient()
     ours, theirs = _features(network, first), _features(network, second)
@@ -233,14 +223,10 @@ def _status(
 
 
 def load_met3r(size: int = 256) -> tuple[Callable[..., Any] | None, str]:
-    """The original ``met3r.MEt3R`` with its own defaults, made once for many pairs.
+    """The original ``met3r.MEt3R`` with its own defaults (on the GPU if there is one), and "ready".
 
-    Args:
-        size: pixels, a multiple of 16.
-
-    Returns:
-        The module, on the GPU if there is one, and "ready"; or None and "unavailable: ..." with
-        what is lacking. Making it fetches its weights.
+    Without it, None and "unavailable: ..." with what is lacking. Making it fetches its weights. The
+    size is in pixels, a multiple of 16.
     """
     import torch
 
@@ -261,16 +247,10 @@ def load_met3r(size: int = 256) -> tuple[Callable[..., Any] | None, str]:
 def met3r_score(
     first: PosedPicture, second: PosedPicture, metric: Callable[..., Any], *, size: int = 256
 ) -> Met3rScore:
-    """The original MEt3R of two pictures.
+    """The original MEt3R of two pictures, by a module that was made for ``size``.
 
     The largest centred square of each picture, resampled to ``size``, goes in; cameras, depth and
     masks do not. MEt3R gives 0 (its best) where the pictures do not overlap; here that is None.
-
-    Args:
-        first: the view that MEt3R compares in.
-        second: the view that it carries there.
-        metric: a ``met3r.MEt3R`` module made for ``size``, see `load_met3r`.
-        size: pixels, a multiple of 16.
     """
     import torch
 

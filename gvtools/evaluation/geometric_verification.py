@@ -46,6 +46,15 @@ if TYPE_CHECKING:
 MIN_MATCHES = 15
 # Degrees between rays. COLMAP's 1.5 would leave out near pairs, whose matches still tell.
 MIN_TRIANGULATION_ANGLE = 0.2
+# Largest reprojection error of a triangulated observation, as a share of the longest picture side:
+# 32 of 640 pixels, 3 to 4 degrees of an ordinary lens.
+REPROJECTION_LIMIT = 0.05
+# Pixels; what COLMAP verifies matches with, at a geometry of their own.
+EPIPOLAR_LIMIT = 4.0
+# Centres nearer than this share of their extent, or of their distance from the origin, which
+# rounding moves them by, have no epipolar geometry.
+COINCIDENT = 1e-6
+ROUNDING = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,12 +76,9 @@ class Matched:
 
 
 def match_pictures(pictures: Sequence[PosedPicture], folder: Path, *, seed: int) -> Matched:
-    """Extract features and match every pair; the poses play no part.
+    """Extract features, where no mask is False, and match every pair; the poses play no part.
 
-    Args:
-        pictures: the views; features where a mask is False are left out.
-        folder: empty; receives the pictures, masks and ``database.db``.
-        seed: of the random sampling.
+    The empty folder receives the pictures, masks and ``database.db``.
     """
     import pycolmap
 
@@ -113,14 +119,10 @@ def match_pictures(pictures: Sequence[PosedPicture], folder: Path, *, seed: int)
 def triangulate(
     pictures: Sequence[PosedPicture], matched: Matched, folder: Path, *, limit: float, seed: int
 ) -> pycolmap.Reconstruction:
-    """Triangulate the verified matches; poses and intrinsics stay as they are.
+    """Triangulate the verified matches of at least one pair; poses and intrinsics stay as they are.
 
-    Args:
-        pictures: those that were matched.
-        matched: what `match_pictures` made of them, with at least one pair.
-        folder: where it did so; receives the model.
-        limit: largest reprojection error of an observation, pixels.
-        seed: of the random sampling.
+    The folder is that of the matching and receives the model; ``limit`` is the largest reprojection
+    error of an observation, pixels.
     """
     import pycolmap
 
@@ -205,17 +207,6 @@ def _read_matches(database: Path, count: int) -> Matched:
     return Matched(tuple(keypoints), tuple(sorted(pairs, key=lambda pair: (pair.i, pair.j))))
 
 
-# Largest reprojection error of a triangulated observation, as a share of the longest picture side:
-# 32 of 640 pixels, 3 to 4 degrees of an ordinary lens.
-REPROJECTION_LIMIT = 0.05
-# Pixels; what COLMAP verifies matches with, at a geometry of their own.
-EPIPOLAR_LIMIT = 4.0
-# Centres nearer than this share of their extent, or of their distance from the origin, which
-# rounding moves them by, have no epipolar geometry.
-COINCIDENT = 1e-6
-ROUNDING = 1e-12
-
-
 @dataclass(frozen=True)
 class PairVerification:
     """Two pictures with verified matches."""
@@ -264,14 +255,9 @@ def verify_geometry(
 ) -> GeometricVerification:
     """Match the pictures with one another and triangulate with their poses fixed.
 
-    Runs on one thread, so that equal pictures and seed give equal figures. Time grows with the
-    number of pairs. Features where a picture's mask is False are not used.
-
-    Args:
-        pictures: the views; depth is not used.
-        workspace: a new or empty folder for the pictures, database and model, which are kept; None
-            uses a temporary folder.
-        seed: of the random sampling in verification and triangulation, 0 or more.
+    Equal pictures and seed give equal figures. Time grows with the number of pairs. Features where
+    a picture's mask is False are not used. A new or empty ``workspace`` keeps the pictures, the
+    database and the model.
     """
     for picture in pictures:
         skew = float(picture.camera.K[0, 0, 1])
@@ -290,18 +276,11 @@ def verify_geometry(
 
 
 def epipolar_distances(first: Cameras, second: Cameras, places: tuple[Float64, Float64]) -> Float64:
-    """Distances of matched places to each other's epipolar lines, the mean of both, pixels.
+    """(M,) distances of matched places to each other's epipolar lines, the mean of both, pixels.
 
-    The lines are those of F = K₂⁻ᵀ [t]ₓ R K₁⁻¹ (Hartley and Zisserman, Multiple View Geometry, 2nd
-    edition, eq. 9.12).
-
-    Args:
-        first: a batch of one.
-        second: a batch of one, with another centre.
-        places: (M, 2) and (M, 2), pixels of the first and of the second picture.
-
-    Returns:
-        (M,) float64.
+    The places are (M, 2) pixels of either picture, whose cameras have two centres. The lines are
+    those of F = K₂⁻ᵀ [t]ₓ R K₁⁻¹ (Hartley and Zisserman, Multiple View Geometry, 2nd edition, eq.
+    9.12).
     """
     move = second.cam_from_world[0] @ invert_rigid(first.cam_from_world[0])
     x, y, z = move[:3, 3] / np.linalg.norm(move[:3, 3])

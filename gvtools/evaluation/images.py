@@ -29,15 +29,10 @@ LOWEST, HIGHEST = -1.0, 2.0
 
 
 def psnr(image: ArrayLike, truth: ArrayLike, *, mask: ArrayLike | None = None) -> float | None:
-    """Peak signal-to-noise ratio, dB, for a peak of 1.
+    """Peak signal-to-noise ratio, dB, for a peak of 1, where an (H, W) mask is True.
 
-    Args:
-        image: (H, W, C) floats in [0, 1], or uint8, which stands for 255 times that.
-        truth: likewise.
-        mask: (H, W) bool, True = compare; None compares all pixels.
-
-    Returns:
-        The ratio; infinity when the compared pixels are equal; None when there are none.
+    Images are (H, W, C) floats in [0, 1], or uint8, which stands for 255 times that. The ratio is
+    infinite when the compared pixels are equal, and None when there are none.
     """
     first, second, where = _pair(image, truth, mask)
     if where is not None:
@@ -55,17 +50,9 @@ def ssim(
     """Structural similarity, -1 to 1: the mean of the SSIM map over the compared pixels.
 
     The outermost 5 pixels are never compared, with a mask or without, so that a mask of all pixels
-    gives the figure of no mask. Windows at the rim of a mask see pixels outside it.
-
-    Args:
-        image: (H, W, C) floats in [0, 1], or uint8, which stands for 255 times that.
-        truth: likewise.
-        mask: (H, W) bool, True = compare; None compares all pixels.
-        sample_covariance: as scikit-image's default and GLD's evaluation have it; False is the
-            published definition.
-
-    Returns:
-        The mean over pixels and channels; None when no pixel is compared.
+    gives the figure of no mask. Windows at the rim of a mask see pixels outside it. Images and mask
+    are as of ``psnr``; sample covariances are scikit-image's default and GLD's, the published
+    definition has those of the population.
     """
     first, second, where = _pair(image, truth, mask)
     if min(first.shape[:2]) < SIDE:
@@ -80,14 +67,7 @@ def image_figures(
 ) -> dict[str, dict[str, float | None]]:
     """PSNR and SSIM over several regions of one image, for little more than the price of one.
 
-    Args:
-        image: (H, W, C) floats in [0, 1], or uint8, which stands for 255 times that.
-        truth: likewise.
-        regions: by name, (H, W) bool, True = compare; None compares all pixels.
-
-    Returns:
-        For each region ``psnr`` and ``ssim``, as those functions give them; the SSIM of an image
-        below 11 x 11 pixels is None.
+    A region is an (H, W) mask as of ``psnr``. The SSIM of an image below 11 x 11 pixels is None.
     """
     first, second, _ = _pair(image, truth, None)
     square = ((first - second) ** 2).mean(axis=-1)
@@ -108,15 +88,9 @@ def image_figures(
 def ssim_map(
     image: NDArray[np.float64], truth: NDArray[np.float64], *, sample_covariance: bool = False
 ) -> NDArray[np.float64]:
-    """SSIM of every whole window, averaged over the channels.
+    """SSIM of every whole window of (H, W, C) images in [0, 1], averaged over the channels.
 
-    Args:
-        image: (H, W, C) in [0, 1], at least 11 x 11 pixels.
-        truth: (H, W, C), likewise.
-        sample_covariance: see ``ssim``.
-
-    Returns:
-        (H - 10, W - 10): entry (i, j) is centred on pixel (i + 5, j + 5).
+    Of (H - 10, W - 10) entries, (i, j) is centred on pixel (i + 5, j + 5).
     """
     import cv2
 
@@ -151,15 +125,9 @@ def _decibels(squares: NDArray[np.float64]) -> float | None:
 def relative_depth_error(
     depth: ArrayLike, truth: ArrayLike, *, mask: ArrayLike | None = None
 ) -> float | None:
-    """Median of |depth - truth| / truth over the pixels where both are there.
+    """Median of |depth - truth| / truth over the pixels where both are there; None without any.
 
-    Args:
-        depth: (H, W) z-depth, scene units, 0 = none.
-        truth: likewise, in the same unit.
-        mask: (H, W) bool, True = compare.
-
-    Returns:
-        The share of the true depth; None where no pixel has both.
+    Depth maps are (H, W) z-depth in one unit, 0 = none; the mask is as of ``psnr``.
     """
     first, second = np.asarray(depth, np.float64), np.asarray(truth, np.float64)
     if first.shape != second.shape or first.ndim != 2:
@@ -225,22 +193,14 @@ def view_figures(
     depth: ArrayLike | None = None,
     lpips: Lpips | None = None,
 ) -> dict[str, float | None]:
-    """PSNR, SSIM, LPIPS and depth error of one picture.
+    """FIGURES of one picture, and those of ``others``; None where there is nothing to compare.
 
-    Args:
-        picture: (H, W, 3) uint8, or floats in [0, 1]; holes are black, and count so on the whole
-            picture.
-        truth: the true picture; its mask limits every comparison, its depth is the reference.
-        observed: (H, W) bool, pixels that stand on observations.
-        generated: (H, W) bool, pixels that a completer made; never observed ones.
-        others: (H, W) bool each, more regions by name; their figures end in ``_NAME``.
-        depth: (H, W) z-depth of the picture, scene units, 0 = none.
-        lpips: the network; None leaves LPIPS out. On a region it is the mean of the distance's
-            map, which has no meaning for regions much smaller than the network's view. Pictures
-            below 32 x 32 pixels have none.
-
-    Returns:
-        FIGURES by name, and those of ``others``; None where there is nothing to compare.
+    The picture is uint8, or floats in [0, 1]; holes are black, and count so on the whole picture.
+    The truth's mask limits every comparison. Regions are (H, W) bool: ``observed`` stands on
+    observations, ``generated`` a completer made, and figures of ``others`` end in ``_NAME``. Depth
+    is z-depth, scene units, 0 = none. LPIPS of a region is the mean of the distance's map, which
+    has no meaning for regions much smaller than the network's view; pictures below 32 x 32 pixels
+    have none.
     """
     if picture.shape != truth.rgb.shape:
         raise ShapeError(f"the picture is {picture.shape}; its truth is {truth.rgb.shape}")

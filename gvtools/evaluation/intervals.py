@@ -27,11 +27,9 @@ class Interval:
 
 
 def mean_interval(values: Iterable[float | None], *, seed: int = 0) -> Interval:
-    """The mean of the values that are there, with its bootstrap interval.
+    """The mean of the values that are neither None nor NaN, with its bootstrap interval.
 
-    Args:
-        values: one for each view, or for each scene; None and NaN are left out.
-        seed: of the resampling; the same values and seed give the same interval.
+    The same values and seed give the same interval.
     """
     kept = np.array([value for value in values if value is not None and value == value])
     if not len(kept):

@@ -106,9 +106,8 @@ class Model:
 class Lpips:
     """The distance of one network; about 0 for equal pictures, up to about 1.
 
-    Args:
-        net: "vgg", as view synthesis usually reports, or "alex".
-        folder: where the weights are; None looks into torch's cache (``torch.hub.get_dir()``).
+    The network is "vgg", as view synthesis usually reports, or "alex"; its weights are in
+    ``folder``, or else in torch's cache (``torch.hub.get_dir()``).
     """
 
     def __init__(self, net: str = "vgg", *, folder: Path | None = None) -> None:

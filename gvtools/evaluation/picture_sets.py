@@ -50,6 +50,13 @@ if TYPE_CHECKING:
 
 RULES = ("auto", "name", "order")
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".ppm")
+SPLITS = ("test", "val", "train")
+_CANVAS = re.compile(r"(\d{6})-img\.(jpg|png)", re.IGNORECASE)
+_RENDER = re.compile(r"(val|compress)_step(\d+)_(\d{4,})\.png")
+COLOR, TRUTH = "color/", "gt-color/"
+LAYOUT = "NerfBaselines"
+_ARCHIVE = re.compile(r"predictions-(\d+)\.tar\.gz")
+RENDERED = ".rgb.png"
 
 
 @dataclass(frozen=True)
@@ -143,9 +150,9 @@ def _natural_order(names: Sequence[str]) -> list[int]:
 
 
 def _by_name(pictures: Sequence[str], views: Sequence[str], what: str) -> list[int | None]:
-    """For each view the index of the picture with its name; None where there is none.
+    """For each view the index of the picture with its name, with or without folders; or None.
 
-    Names are compared with and without folders; what finds most partners is taken.
+    Of both, what finds most partners is taken.
     """
     tried: list[list[list[int]]] = [[[] for _ in views]]
     for view_keys in (_paths(views), _last_parts(views)):
@@ -254,18 +261,8 @@ def in_natural_order(paths: Iterable[Path], folder: Path) -> list[Path]:
     return sorted(paths, key=lambda path: natural_key(path.relative_to(folder).as_posix()))
 
 
-def plain_picture(path: Path, folder: Path) -> Picture:
-    """A picture that is a file of its own, named by its path below ``folder``."""
-    return Picture(path.relative_to(folder).as_posix(), lambda: Frame(read_rgb(path)))
-
-
 def read_rgb(source: Path | IO[bytes], *, name: str = "") -> NDArray[np.uint8]:
-    """(H, W, 3) uint8; what is transparent lies before black. EXIF orientation is not applied.
-
-    Args:
-        source: a file, or its bytes.
-        name: of messages, for bytes.
-    """
+    """(H, W, 3) uint8; what is transparent lies before black. EXIF orientation is not applied."""
     from gvtools.scenes.images import UNREADABLE, read_header, read_image
 
     if isinstance(source, Path) and not read_header(source).has_alpha:
@@ -284,38 +281,31 @@ def _on_black(image: Image) -> NDArray[np.uint8]:
     return np.rint(rgba[..., :3] * (rgba[..., 3:] / 255)).astype(np.uint8)
 
 
-def right_half(canvas: NDArray[np.uint8], name: str) -> NDArray[np.uint8]:
-    """The right one of two pictures of one size side by side."""
-    return _half(canvas, name)[1]
+def canvas_picture(file: Path, folder: Path) -> Picture:
+    """A picture whose left half is the truth and whose right half is the render."""
+    name = file.relative_to(folder).as_posix()
+    return Picture(name, lambda: Frame(_half(file, 1)), lambda: _half(file, 0))
 
 
-def left_half(canvas: NDArray[np.uint8], name: str) -> NDArray[np.uint8]:
-    """The left one of two pictures of one size side by side."""
-    return _half(canvas, name)[0]
-
-
-def _half(canvas: NDArray[np.uint8], name: str) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+def _half(file: Path, side: int) -> NDArray[np.uint8]:
+    canvas = read_rgb(file)
     width = canvas.shape[1]
     if width % 2:
         raise ProjectError(
-            f"{name}: {width} pixels wide; expected truth and render of one width side by side"
+            f"{file}: {width} pixels wide; expected truth and render of one width side by side"
         )
-    return (
-        np.ascontiguousarray(canvas[:, : width // 2]),
-        np.ascontiguousarray(canvas[:, width // 2 :]),
-    )
+    return np.ascontiguousarray(canvas[:, side * width // 2 :][:, : width // 2])
 
 
-SPLITS = ("test", "val", "train")
-_CANVAS = re.compile(r"(\d{6})-img\.(jpg|png)", re.IGNORECASE)
+def _beside_truth(file: Path, folder: Path, truths: Path) -> Picture:
+    """A picture named by its path below ``folder``, whose truth lies at the same path elsewhere."""
+    name = file.relative_to(folder)
+    truth = partial(read_rgb, truths / name) if (truths / name).is_file() else None
+    return Picture(name.as_posix(), lambda: Frame(read_rgb(file)), truth)
 
 
 def nerfstudio_dataset(path: Path) -> PictureSet | None:
-    """The pictures of ``ns-render dataset``; None where the folder is none.
-
-    Args:
-        path: the folder of all splits, or of one.
-    """
+    """The pictures of ``ns-render dataset``, in the folder of all splits or of one; or None."""
     splits = {split: path / split for split in SPLITS if (path / split / "rgb").is_dir()}
     folder = next(iter(splits.values()), path)
     if not (folder / "rgb").is_dir():
@@ -326,7 +316,10 @@ def nerfstudio_dataset(path: Path) -> PictureSet | None:
     return PictureSet(
         path,
         "nerfstudio, ns-render dataset",
-        tuple(_render(file, folder) for file in image_files(folder / "rgb")),
+        tuple(
+            _beside_truth(file, folder / "rgb", folder / "gt-rgb")
+            for file in image_files(folder / "rgb")
+        ),
         notes=tuple(notes),
     )
 
@@ -345,39 +338,8 @@ def nerfstudio_evaluation(path: Path) -> PictureSet | None:
     )
 
 
-def canvas_picture(file: Path, folder: Path) -> Picture:
-    """A picture whose left half is the truth and whose right half is the render."""
-    name = file.relative_to(folder).as_posix()
-    return Picture(name, partial(_right, file), partial(_left, file))
-
-
-def _right(file: Path) -> Frame:
-    return Frame(right_half(read_rgb(file), str(file)))
-
-
-def _left(file: Path) -> NDArray[np.uint8]:
-    return left_half(read_rgb(file), str(file))
-
-
-def _render(file: Path, folder: Path) -> Picture:
-    name = file.relative_to(folder / "rgb")
-    truth = folder / "gt-rgb" / name
-    return Picture(
-        name.as_posix(),
-        lambda: Frame(read_rgb(file)),
-        partial(read_rgb, truth) if truth.is_file() else None,
-    )
-
-
-_RENDER = re.compile(r"(val|compress)_step(\d+)_(\d{4,})\.png")
-
-
 def gsplat_renders(path: Path) -> PictureSet | None:
-    """The validation pictures of a run; None where the folder holds none.
-
-    Args:
-        path: the run's folder, or its folder ``renders``.
-    """
+    """The validation pictures of a run's folder, or of its ``renders``; None without any."""
     folder = path / "renders" if (path / "renders").is_dir() else path
     found: dict[tuple[str, int], list[Path]] = defaultdict(list)
     for file in folder.iterdir():
@@ -403,37 +365,19 @@ def gsplat_renders(path: Path) -> PictureSet | None:
     )
 
 
-COLOR, TRUTH = "color/", "gt-color/"
-LAYOUT = "NerfBaselines"
-_ARCHIVE = re.compile(r"predictions-(\d+)\.tar\.gz")
-
-
 def nerfbaselines_predictions(path: Path) -> PictureSet | None:
-    """The pictures of a folder or archive of predictions; None where it is none.
-
-    Args:
-        path: the folder, the archive, or the folder of a training with its archives.
-    """
+    """The pictures of a folder or archive of predictions, or a training's last archive; or None."""
     if path.name.endswith(".tar.gz"):
         return _archive(path, path)
     if (path / "info.json").is_file() and (path / COLOR).is_dir():
         files = image_files(path / COLOR)
-        return PictureSet(path, LAYOUT, tuple(_picture(file, path) for file in files))
+        pictures = (_beside_truth(file, path / COLOR, path / TRUTH) for file in files)
+        return PictureSet(path, LAYOUT, tuple(pictures))
     archives = {int(m[1]): file for file in path.iterdir() if (m := _ARCHIVE.fullmatch(file.name))}
     if not archives:
         return None
     last = max(archives)
     return _archive(archives[last], path, others=len(archives) - 1)
-
-
-def _picture(file: Path, folder: Path) -> Picture:
-    name = file.relative_to(folder / COLOR)
-    truth = folder / TRUTH / name
-    return Picture(
-        name.as_posix(),
-        lambda: Frame(read_rgb(file)),
-        partial(read_rgb, truth) if truth.is_file() else None,
-    )
 
 
 def _archive(file: Path, path: Path, *, others: int = 0) -> PictureSet:
@@ -482,7 +426,6 @@ def _stored(name: str, stored: dict[str, bytes], file: Path) -> Picture:
 
 # Recognised in this order, by what no other layout has.
 READERS = (nerfbaselines_predictions, gsplat_renders, nerfstudio_dataset, nerfstudio_evaluation)
-RENDERED = ".rgb.png"
 
 
 def open_pictures(path: Path) -> PictureSet:
@@ -491,9 +434,6 @@ def open_pictures(path: Path) -> PictureSet:
     A plain folder holds the pictures, perhaps in folders of its own. Beside ``NAME.rgb.png`` a
     ``NAME.depth.npz`` (z-depth, scene units, key ``depth``) is read, as ``gvtools render`` writes
     them; a picture ``NAME.png`` may have a ``NAME.depth.npz`` as well.
-
-    Args:
-        path: a folder, or a .tar.gz of NerfBaselines.
     """
     if not path.exists():
         raise ProjectError(f"{path}: no such folder; expected a folder of pictures")
@@ -518,7 +458,7 @@ def open_pictures(path: Path) -> PictureSet:
 def _plain(file: Path, folder: Path) -> Picture:
     if file.with_suffix(".depth.npz").is_file():
         return _rendered(file, folder, file.suffix)
-    return plain_picture(file, folder)
+    return Picture(file.relative_to(folder).as_posix(), lambda: Frame(read_rgb(file)))
 
 
 def _rendered(file: Path, folder: Path, ending: str) -> Picture:

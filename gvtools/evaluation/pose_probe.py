@@ -28,6 +28,9 @@ NEAR = 3.0
 ROTATION_DEG = 10.0
 DEPTH_SHARE = 0.25
 RIVALS = 3  # looked at: near ones may come first
+# Cells along the longer side of a picture, in which the spread of the inliers is counted.
+CELLS = 16
+LOCATED = "located"
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,17 +53,10 @@ def absolute_pose(
 ) -> AbsolutePose | None:
     """Estimate by LO-RANSAC over P3P, refine over all inliers, and count those of the result.
 
-    Args:
-        xy: (M, 2), pixels; the first pixel's centre is (0.5, 0.5).
-        points: (M, 3), world frame, scene units.
-        K: (3, 3), pixels.
-        max_error: reprojection error of an inlier, pixels.
-        seed: of the sampling.
-        min_inlier_share: samples are drawn until a pose of this share would have been met; below
-            0.1 there are at most 10,000.
-
-    Returns:
-        The pose; None when no four matches agree on one.
+    Matches are (M, 2) pixels, the first pixel's centre being (0.5, 0.5), and (M, 3) points in the
+    world; an inlier's reprojection error is at most ``max_error`` pixels. Samples are drawn until a
+    pose of the smallest share of inliers would have been met; below 0.1 there are at most 10,000.
+    None when no four matches agree on a pose.
     """
     import pycolmap
 
@@ -103,19 +99,7 @@ def rival_pose(
     """The best pose that contradicts ``pose``, if about ``share`` of its inliers support one.
 
     Repeated and symmetric things give such poses: a rug that looks the same from both ends, two
-    chairs of one kind, pictures put together from pieces.
-
-    Args:
-        xy: (M, 2), pixels.
-        points: (M, 3), world frame, scene units.
-        K: (3, 3), pixels.
-        pose: of these matches.
-        max_error: reprojection error of an inlier, pixels.
-        share: of the inliers of ``pose``; rivals with far fewer are not looked for.
-        seed: of the sampling.
-
-    Returns:
-        The rival, its inliers as (M,) bool; None when there is none.
+    chairs of one kind, pictures put together from pieces. Matches are as of ``absolute_pose``.
     """
     wanted = share * int(pose.inliers.sum())
     depth = float(np.median((points[pose.inliers] @ pose.cam_from_world[:3, :3].T)[:, 2]))
@@ -173,20 +157,12 @@ def _reprojection_errors(pose: Float64, xy: Float64, points: Float64, *, K: Floa
 def lift_keypoints(
     xy: Float64, depth: NDArray[np.float32], camera: Cameras, *, edge: float
 ) -> tuple[Float64, NDArray[np.bool_]]:
-    """Keypoints lifted by the depth between the four pixel centres around each.
+    """(N, 3) world points of (N, 2) keypoints by the depth around each, and (N,) which hold.
 
-    Depth is interpolated as its inverse, which on a plane is linear in the picture. A keypoint
-    needs all four depths, and they may not spread over more than ``edge``: across a silhouette
-    the interpolated depth would lie on neither surface.
-
-    Args:
-        xy: (N, 2), pixels; the first pixel's centre is (0.5, 0.5).
-        depth: (H, W) z-depth, scene units; 0, NaN and inf mean none.
-        camera: a batch of one, of the same size.
-        edge: largest spread of the four depths, as a share of the depth.
-
-    Returns:
-        (N, 3) float64, world frame, scene units, and (N,) bool, which of them hold.
+    Depth (H, W; 0, NaN and inf mean none) is interpolated between the four nearest pixel centres as
+    its inverse, which on a plane is linear in the picture. A keypoint needs all four depths, and
+    they may not spread over more than the share ``edge``: across a silhouette the interpolated
+    depth would lie on neither surface.
     """
     height, width = depth.shape
     corner = np.clip(np.floor(xy - 0.5), 0, np.maximum([width - 2, height - 2], 0)).astype(np.int64)
@@ -204,9 +180,6 @@ def lift_keypoints(
     rays = np.column_stack([xy, np.ones(len(xy))]) @ np.linalg.inv(camera.K[0]).T
     points = rays * z[:, None] @ camera.world_from_cam[0, :3, :3].T + camera.centers[0]
     return points, ok
-
-
-LOCATED = "located"
 
 
 @dataclass(frozen=True, eq=False)
@@ -294,10 +267,6 @@ def _statistics(values: Sequence[float | None]) -> Statistics | None:
     return Statistics.of([value for value in values if value is not None])
 
 
-# Cells along the longer side of a picture, in which the spread of the inliers is counted.
-CELLS = 16
-
-
 class PoseProbeOptions(Settings):
     """How a picture is located, and when it counts as located.
 
@@ -350,16 +319,8 @@ class _Counts:
 class PoseProbe:
     """Locates pictures against posed context views with depth.
 
-    Attributes:
-        options: see PoseProbeOptions.
-        extent: twice the largest distance of a context centre from their mean, scene units.
-
-    Args:
-        context: views with depth from any source (measured, or the memory's projection); those
-            without depth give no points.
-        matcher: finds and matches keypoints.
-        options: see PoseProbeOptions.
-        seed: of the robust estimate; the same seed gives the same answer.
+    The depth is from any source (measured, or the memory's projection); views without it give no
+    points. The same seed gives the same answer.
     """
 
     def __init__(
@@ -385,11 +346,10 @@ class PoseProbe:
         self.extent = _extent([picture.camera for picture in self._context])
 
     def locate(self, picture: PosedPicture, *, leave_out: Collection[str] = ()) -> Located:
-        """Where ``picture`` looks from, by its pixels alone.
+        """Where a picture looks from, by its pixels alone.
 
-        Args:
-            picture: its mask limits the keypoints; its camera's pose is only compared with.
-            leave_out: names of context views not to match; other names mean nothing.
+        Its mask limits the keypoints; its camera's pose is only compared with. Context views whose
+        names are left out are not matched.
         """
         features = self._matcher.extract(picture.rgb)
         features = features[_inside(features.xy, picture.mask)]
@@ -406,12 +366,9 @@ class PoseProbe:
         )
 
     def leave_one_out(self, count: int | None = None) -> list[Located]:
-        """Context views located by the others: the error that the probe has on real pictures.
+        """So many context views located by the others: the probe's error on real pictures.
 
         What a generated picture is off by means little below it.
-
-        Args:
-            count: how many, evenly spread over the context; None takes all.
         """
         total = len(self._context)
         chosen = np.unique(np.linspace(0, total - 1, min(count or total, total)).round())

@@ -85,13 +85,8 @@ def correspond(
 
     Second's depth at a place between its pixels is interpolated bilinearly in 1/depth, which is
     exact on a plane, wherever the four neighbours are known and lie on one surface: their depths
-    differ by no more than ``occlusion``. Elsewhere it is that of the nearest pixel.
-
-    Args:
-        first: the view whose pixels are reprojected, those with depth inside its mask.
-        second: the view they are reprojected into; its size may differ.
-        occlusion: largest relative depth difference |z / depth - 1| on one surface.
-        where: (H, W) bool, the only pixels of first to follow; None means all.
+    differ by no more than ``occlusion``, |z / depth - 1|. Elsewhere it is that of the nearest
+    pixel. The pixels of first may be limited by an (H, W) mask, ``where``.
     """
     if not 0 < occlusion < 1:
         raise OptionError(

@@ -93,13 +93,7 @@ def split_scene(
 ) -> SceneSplit:
     """The views of a scene that a rule gives and completes.
 
-    Args:
-        rule: of the benchmark.
-        names: of the scene's views, in its order.
-        views: how many are given.
-        targets: target views of a round, for "protocol".
-        rounds: how many rounds, for "protocol".
-        folder: of the scene, for "files".
+    The scene's folder is read for "files"; targets of a round and rounds are of "protocol".
 
     >>> rule = SplitRule(kind="every", every=8, source="RegNeRF")
     >>> split = split_scene(rule, [f"{i:02d}" for i in range(20)], views=3)
@@ -200,16 +194,11 @@ def protocol_split(
     stride: int | None = None,
     seed: int = 0,
 ) -> Split:
-    """The split of a scene by the rule above.
+    """The split of a scene by the protocol's rule; the targets are those of a round.
 
-    Args:
-        names: of the scene's views, in its order.
-        context: how many views are given.
-        targets: how many views a round completes.
-        rounds: how many rounds.
-        stride: views from one of the window to the next; None is as wide as the scene allows. In
-            a video's many frames that leaves the views little in common; give a number there.
-        seed: draws where the window begins. The same seed takes about the same part of any scene.
+    Without a stride, it is as wide as the scene allows. In a video's many frames that leaves the
+    views little in common; give a number there. The same seed takes about the same part of any
+    scene.
     """
     counts = {"context": context, "targets": targets, "rounds": rounds, "stride": stride}
     for what, number in counts.items():

@@ -104,12 +104,7 @@ def markdown(table: Table) -> str:
 
 
 def latex(table: Table, *, label: str | None = None) -> str:
-    """A table environment for booktabs; caption above, notes below in small print.
-
-    Args:
-        table: what to print.
-        label: what LaTeX refers to it by; None for none.
-    """
+    """A table environment for booktabs; caption above, notes below in small print."""
     arrow = {"higher": r"~$\uparrow$", "lower": r"~$\downarrow$", None: ""}
     heads = [_latex_text(column.heading) + arrow[column.better] for column in table.columns]
     sides = "".join("r" if _numeric(table, i) else "l" for i in range(len(heads)))

@@ -202,13 +202,9 @@ def pose_auc(reference: ArrayLike, estimate: ArrayLike) -> PoseAuc:
     """Area under the recall of pairwise pose errors: no alignment, no scale, no unit.
 
     All pairs of poses count once, at the thresholds AUC_THRESHOLDS. The area is a sum of trapezoids
-    over AUC_BINS bins, as GLD's evaluation takes it; poses without any error have
-    1 - 0.5 / AUC_BINS. Where the estimate stands still and the reference does not, the direction is
-    off by 90 degrees.
-
-    Args:
-        reference: (N, 4, 4) world_from_cam.
-        estimate: (N, 4, 4), row by row the same cameras.
+    over AUC_BINS bins, as GLD's evaluation takes it; poses without any error have 1 - 0.5 /
+    AUC_BINS. Where the estimate stands still and the reference does not, the direction is off by 90
+    degrees. Poses are as of ``absolute_errors``.
     """
     first, second = _poses(reference, estimate)
     if len(first) < 2:
@@ -357,18 +353,11 @@ def by_time(
     max_difference: float = MAX_DIFFERENCE,
     offset: float = 0.0,
 ) -> tuple[Rows, Rows]:
-    """Pairs of nearest time stamps, as evo associates TUM and EuRoC trajectories.
+    """Pairs of nearest time stamps, as evo associates TUM and EuRoC trajectories, in seconds.
 
-    Each pose of the shorter trajectory takes the nearest of the longer one.
-
-    Args:
-        reference: (N,) seconds, in any order.
-        estimate: (M,) seconds.
-        max_difference: seconds; farther pairs are none.
-        offset: seconds, added to the estimate's stamps.
-
-    Returns:
-        Rows of the reference and of the estimate, (K,) each, in the order of the shorter one.
+    Each pose of the shorter trajectory takes the nearest of the longer one; pairs farther apart
+    than the largest difference are none. The offset is added to the estimate's stamps. The rows
+    (K,) of both are in the order of the shorter one.
     """
     first, second = np.asarray(reference, np.float64), np.asarray(estimate, np.float64) + offset
     for name, stamps in (("reference", first), ("estimate", second)):
@@ -395,11 +384,7 @@ def by_time(
 
 
 def by_name(reference: Sequence[str], estimate: Sequence[str]) -> tuple[Rows, Rows]:
-    """Pairs of equal names; where no name is equal, of equal file names without folder and suffix.
-
-    Returns:
-        Rows of the reference and of the estimate, in the reference's order.
-    """
+    """Rows of equal names, in the reference's order; without any, of equal stems of files."""
     for form in (str, lambda name: PurePosixPath(name.replace("\\", "/")).stem.split(".")[0]):
         first, second = [form(name) for name in reference], [form(name) for name in estimate]
         row = {name: i for i, name in enumerate(second)}
@@ -417,12 +402,7 @@ def by_name(reference: Sequence[str], estimate: Sequence[str]) -> tuple[Rows, Ro
 
 
 def by_index(reference: int, estimate: int) -> tuple[Rows, Rows]:
-    """Row by row.
-
-    Args:
-        reference: number of its poses.
-        estimate: likewise.
-    """
+    """Row by row, of as many poses in both."""
     if reference != estimate or not reference:
         raise DegenerateError(
             f"association by index: {reference} and {estimate} poses; expected as many"
