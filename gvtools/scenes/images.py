@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from gvtools.errors import ProjectError
 from gvtools.scenes.scene import Frame
@@ -76,6 +76,16 @@ def read_image(path: Path) -> Frame:
             return _decode(image, path)
     except UNREADABLE as error:
         raise _unreadable(path, error) from None
+
+
+def decode_picture(data: bytes, *, where: str) -> Frame:
+    """The picture that an encoded file in another file is, as ``read_image`` has it."""
+    try:
+        with open_picture(data) as image:
+            return _decode(image, Path(where))
+    except UNREADABLE as error:
+        unknown = isinstance(error, UnidentifiedImageError)
+        raise _unreadable(Path(where), ValueError("no picture") if unknown else error) from None
 
 
 def _decode(image: Image.Image, path: Path) -> Frame:

@@ -33,7 +33,7 @@ from gvtools.scenes.calibration import (
     scaled_lens,
 )
 from gvtools.scenes.depth_files import exr_depth
-from gvtools.scenes.images import UNREADABLE, readings
+from gvtools.scenes.images import decode_picture, readings
 from gvtools.scenes.layout import Layout
 from gvtools.scenes.phones import confident, phone_scene
 from gvtools.scenes.photographs import Depth, PosedFrame
@@ -216,11 +216,7 @@ def _picture_size(path: Path, held: set[str]) -> tuple[int, int] | None:
 
 
 def _picture(path: Path, *, member: str) -> Frame:
-    try:
-        image = open_picture(_stored(path, member))
-        return Frame(np.array(image.convert("RGB")))
-    except UNREADABLE as error:
-        raise _damaged(path / member, error) from None
+    return decode_picture(_stored(path, member), where=str(path / member))
 
 
 def _lzfse_depth(home: Path, maps: list[str], _: Path, *, shape: tuple[int, int]) -> Depth:

@@ -200,7 +200,7 @@ def _print_check(check: SceneCheck, console: Console, said: set[tuple[str, str]]
 
 
 @dataclass
-class Statistics:
+class DownloadStatistics:
     """Figures of scenes that were seen one after the other."""
 
     scenes: int = 0  # that were read
@@ -288,7 +288,7 @@ def statistics_of_data_set(args: argparse.Namespace, console: Console) -> None:
     """Print figures of all scenes of a download together."""
     spec = load_spec(args.name)
     names = chosen_scenes(args.name, args.root, args.scene)
-    total = Statistics()
+    total = DownloadStatistics()
     first = ""
     for name in console.track(names, "scenes"):
         try:
@@ -312,7 +312,7 @@ def statistics_of_data_set(args: argparse.Namespace, console: Console) -> None:
         _print_statistics(total, console)
 
 
-def _print_statistics(total: Statistics, console: Console) -> None:
+def _print_statistics(total: DownloadStatistics, console: Console) -> None:
     console.line(
         f"{total.scenes:,} scenes, {total.views:,} views, {total.with_depth:,} with depth; depth "
         f"of {total.sampled:,} sampled views"

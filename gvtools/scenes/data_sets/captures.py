@@ -1,4 +1,7 @@
-"""Recorded data sets: ScanNet v2, 7-Scenes, ARKitScenes, MapFree and RealEstate10K."""
+"""Recorded data sets: ScanNet v2, 7-Scenes, ARKitScenes, MapFree and RealEstate10K.
+
+Files, axes, units and traps of each are in its spec, ``data_specs/data_sets``.
+"""
 
 from __future__ import annotations
 
@@ -27,14 +30,14 @@ from gvtools.scenes.calibration import (
     rigid_poses,
     sky_findings,
 )
-from gvtools.scenes.images import UNREADABLE, read_depth, readings
+from gvtools.scenes.images import decode_picture, read_depth, readings
 from gvtools.scenes.layout import Layout
 from gvtools.scenes.matching import natural, pictures_by_stem, pose_at, scenes_holding
 from gvtools.scenes.photographs import Depth, PosedFrame, Registration, first_size, posed_scene
 from gvtools.scenes.rgbd import SCANNET, SCANNET_FOLDER, SEVENSCENES, RgbdOptions, rgbd_scene
 from gvtools.scenes.scene import Finding, Frame, Scene
 from gvtools.scenes.transforms_frame import LensParameters
-from gvtools.untrusted import open_picture, read_text, regular
+from gvtools.untrusted import read_text, regular
 
 # --- 7-Scenes as published: ``SCENE/seq-NN/frame-NNNNNN.{color.png, depth.png, pose.txt}`` ------
 
@@ -50,9 +53,8 @@ def _read_sevenscenes(root: Path, scene: str) -> Scene:
 
 # --- ScanNet v2 -------------------------------------------------------------------------------
 #
-# ``[scans/]SCENE`` with exported folders, see ``gvtools.scenes.rgbd``, or with the native
-# ``SCENE.sens``, which holds the same, each frame's colour as JPEG and depth through zlib: a head
-# with the cameras, then frames one after another. It is indexed at opening and read frame by frame.
+# Exported folders, see ``gvtools.scenes.rgbd``, or the native ``SCENE.sens``: a head with the
+# cameras, then frames one after another. It is indexed at opening and read frame by frame.
 
 
 def _scannet_scenes(root: Path) -> tuple[str, ...]:
@@ -190,10 +192,10 @@ def read_sens_color(path: Path, *, frame: SensFrame) -> Frame:
     try:
         with regular(path).open("rb") as file:
             file.seek(frame.offset)
-            image = open_picture(file.read(frame.color_bytes))
-            return Frame(np.array(image.convert("RGB")))
-    except UNREADABLE as error:
-        raise ProjectError(f"{path}: unreadable picture ({error}); copy it again") from None
+            data = file.read(frame.color_bytes)
+    except OSError as error:
+        raise ProjectError(f"{path}: unreadable ({error}); copy it again") from None
+    return decode_picture(data, where=str(path))
 
 
 def read_sens_depth(path: Path, *, frame: SensFrame, sens: SensFile) -> Depth:
@@ -213,17 +215,12 @@ def read_sens_depth(path: Path, *, frame: SensFrame, sens: SensFile) -> Depth:
 
 # --- ARKitScenes ------------------------------------------------------------------------------
 #
-# ``[FOLD/]VIDEO/{lowres_wide, lowres_depth, lowres_wide.traj, ...}``. A line of the trajectory
-# holds a time stamp in seconds, an axis-angle rotation and a translation of cam_from_world, in
-# metres; there are about ten a second, and up to sixty frames. Files are named ``VIDEO_STAMP``
-# with three decimals. A frame within a millisecond of a pose gets it; one between two not more than
-# 0.2 s apart gets their interpolation; others are left out. Each frame has its own ``.pincam``
-# (width, height, fx, fy, cx, cy), the name of which may be a millisecond off.
-#
-# Scenes are of the low-resolution pair (256x192, LiDAR). ``VIDEO/wide`` asks for the
-# high-resolution one: ``wide`` and ``highres_depth`` (1920x1440, from a laser scanner's mesh).
-# Depth is in millimetres. Pictures are stored as the sensor lay, not turned upright; a finding
-# tells where up is.
+# A line of the trajectory holds a time stamp in seconds, an axis-angle rotation and a translation
+# of cam_from_world; there are about ten a second, and up to sixty frames. A frame within a
+# millisecond of a pose gets it; one between two not more than 0.2 s apart gets their
+# interpolation; others are left out. Each frame has its own ``.pincam`` (width, height, fx, fy,
+# cx, cy), the name of which may be a millisecond off. Scenes are of the low-resolution pair;
+# ``VIDEO/wide`` asks for the other.
 
 LOW, HIGH = "lowres_wide", "wide"
 DEPTH_OF = {LOW: "lowres_depth", HIGH: "highres_depth"}
@@ -305,12 +302,10 @@ def _pincams(folder: Path) -> dict[int, LensParameters]:
 
 # --- MapFree ----------------------------------------------------------------------------------
 #
-# ``SPLIT/SCENE/{poses.txt, intrinsics.txt, seq0, seq1}``. A line of ``poses.txt`` holds a picture's
-# path and qw qx qy qz tx ty tz of cam_from_world, metric; a line of ``intrinsics.txt`` the path and
-# fx fy cx cy width height. Poses of the test split are withheld: all of their numbers are 0, except
-# for the reference picture of ``seq0``. The data set holds no depth; maps that were estimated
-# beside a picture (``NAME.METHOD.png`` in millimetres, ``NAME.npy`` or ``NAME.METHOD.npy`` in
-# metres) are read.
+# Lines hold a picture's path, then qw qx qy qz tx ty tz of cam_from_world, or fx fy cx cy width
+# height. Withheld poses of the test split are all 0. The data set holds no depth; maps that were
+# estimated beside a picture (``NAME.METHOD.png`` in millimetres, ``NAME[.METHOD].npy`` in metres)
+# are read.
 
 
 def _mapfree_scenes(root: Path) -> tuple[str, ...]:
@@ -372,11 +367,11 @@ def _named_numbers(path: Path, columns: int) -> dict[str, Float64]:
 
 # --- RealEstate10K ----------------------------------------------------------------------------
 #
-# Camera files ``SPLIT/ID.txt``: the first line is the video's address; each further line holds a
-# time stamp in microseconds, fx, fy, cx, cy as shares of the picture's width and height, k1, k2,
-# and a 3x4 cam_from_world, row by row. The data set holds no pictures. They are looked for as
-# ``STAMP.png`` or ``.jpg`` in ``SPLIT/ID``, ``frames/SPLIT/ID`` or ``frames/ID``, and otherwise
-# taken from a video ``ID`` or named like the address, in ``videos``, ``videos/SPLIT`` or ``SPLIT``.
+# The first line of a camera file is the video's address; each further line holds a time stamp in
+# microseconds, fx, fy, cx, cy as shares of the picture's width and height, k1, k2, and a 3x4
+# cam_from_world. Pictures are looked for as ``STAMP.png`` or ``.jpg`` in ``SPLIT/ID``,
+# ``frames/SPLIT/ID`` or ``frames/ID``, and otherwise taken from a video ``ID`` or named like the
+# address, in ``videos``, ``videos/SPLIT`` or ``SPLIT``.
 
 LONGEST = 10_000  # of an address
 VIDEOS = (".mp4", ".mkv", ".webm", ".mov")

@@ -30,86 +30,70 @@ Texts = Annotated[tuple[str, ...], Field(strict=False)]
 class _Record(BaseModel):
     """Part of a spec: exactly these keys, of exactly these types."""
 
-    model_config = ConfigDict(
-        frozen=True,
-        extra="forbid",
-        strict=True,
-        allow_inf_nan=False,
-        use_attribute_docstrings=True,
-    )
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
 
-class Counts(_Record):
+class SceneCounts(_Record):
     """How large a data set is, and who says so."""
 
+    # Scenes, sequences or trajectories, as the source counts them.
     scenes: int | None = Field(None, ge=1)
-    """Scenes, sequences or trajectories, as the source counts them."""
-    images: int | None = Field(None, ge=1)
-    """Colour images."""
-    source: str
-    """Where the counts are published."""
+    images: int | None = Field(None, ge=1)  # colour images
+    source: str  # where the counts are published
+    # What the data set's authors count, where the source counts a part or in another way.
     whole: str | None = None
-    """What the data set's authors count, where the source counts a part or in another way."""
 
 
-class Camera(_Record):
+class CameraConvention(_Record):
     """The convention in which cameras are stored."""
 
-    axes: str
-    """Directions of x, y and z of a camera, such as "x right, y down, z forward"."""
+    axes: str  # directions of x, y and z of a camera, such as "x right, y down, z forward"
+    # Which way a stored pose maps; "none" where poses are not published.
     pose: Literal["world_from_cam", "cam_from_world", "none"]
-    """Which way a stored pose maps; "none" where poses are not published."""
+    # Metres in a unit of translation; None where the scale is not known.
     unit_m: float | None = Field(None, gt=0)
-    """Metres in a unit of translation; None where the scale is not known."""
+    # Where the centre of the first pixel lies: at (0, 0) or at (0.5, 0.5).
     pixel_centre: Literal["integer", "half", "not stated"]
-    """Where the centre of the first pixel lies: at (0, 0) or at (0.5, 0.5)."""
-    distortion: str = "none"
-    """The lens model of the published images."""
-    intrinsics: str | None = None
-    """Where intrinsics are stored, and in which unit."""
+    distortion: str = "none"  # the lens model of the published images
+    intrinsics: str | None = None  # where intrinsics are stored, and in which unit
 
 
-class Depth(_Record):
+class DepthEncoding(_Record):
     """How depth is stored; a data set without depth has none of this."""
 
-    encoding: str
-    """File type and number type, such as "16-bit PNG"."""
+    encoding: str  # file type and number type, such as "16-bit PNG"
+    # Depth along z, distance from the camera's centre, 1 / z, disparity in pixels, or what a
+    # renderer's depth buffer holds.
     measures: Literal["z", "distance", "inverse", "disparity", "buffer"]
-    """Depth along z, distance from the camera's centre, 1 / z, disparity in pixels, or what a
-    renderer's depth buffer holds."""
+    # Metres in a stored unit; None where the scale is not known or does not apply.
     unit_m: float | None = Field(None, gt=0)
-    """Metres in a stored unit; None where the scale is not known or does not apply."""
+    # How z follows from a stored value, where the unit alone does not say it.
     formula: str | None = None
-    """How z follows from a stored value, where the unit alone does not say it."""
-    invalid: Texts = ()
-    """Stored values that mean "no depth", in words or numbers."""
+    invalid: Texts = ()  # stored values that mean "no depth", in words or numbers
+    # Whether every pixel has depth (rendered scenes), so that nothing has to be estimated.
     complete: bool
-    """Whether every pixel has depth (rendered scenes), so that nothing has to be estimated."""
 
 
 class Licence(_Record):
     """On what terms the data can be had, and from where."""
 
-    terms: str
-    """Name of the licence, or the terms in short."""
-    obtain: str
-    """Where to ask or to download."""
+    terms: str  # name of the licence, or the terms in short
+    obtain: str  # where to ask or to download
+    # Whether copies may be passed on; None where that could not be verified.
     redistribution: bool | None = None
-    """Whether copies may be passed on; None where that could not be verified."""
 
 
-class Geometry(_Record):
+class GeometrySource(_Record):
     """Where the poses and depth of training samples come from (the paper's appendix)."""
 
+    # Own: the data set's. Estimated: by a network alone. Mixed: drawn at ``own_share``.
     source: Literal["own", "estimated", "mixed"]
-    """Own: the data set's. Estimated: by a network alone. Mixed: drawn at ``own_share``."""
+    # Probability of the data set's own geometry: 2/3 where own and estimated mix 2:1.
     own_share: float = Field(ge=0, le=1)
-    """Probability of the data set's own geometry: 2/3 where own and estimated mix 2:1."""
-    fallback: str
-    """What stands in where depth is missing or incomplete."""
+    fallback: str  # what stands in where depth is missing or incomplete
 
     @model_validator(mode="after")
-    def _share_fits(self) -> Geometry:
+    def _share_fits(self) -> GeometrySource:
         """Own geometry alone has a share of 1, an estimate alone one of 0."""
         fits = {
             "own": self.own_share == 1,
@@ -124,38 +108,27 @@ class Geometry(_Record):
 class DataSetSpec(_Record):
     """A data set: what it holds, how it is stored, on what terms, and how it is sampled."""
 
-    name: str
-    """As printed."""
+    name: str  # as printed
+    # Such as "real / RGB-D" or "synthetic / indoor", in the paper's words where it has them.
     kind: str
-    """Such as "real / RGB-D" or "synthetic / indoor", in the paper's words where it has them."""
+    # What the paper, or the field, uses it for.
     roles: Annotated[tuple[Literal["training", "benchmark"], ...], Field(strict=False)]
-    """What the paper, or the field, uses it for."""
-    cited_as: str
-    """Authors and year, or the key of the citation."""
-    home: str
-    """The data set's own page."""
-    counts: Counts
-    """Of the paper's table where that lists the data set."""
-    layout: str
-    """The native layout: a name in ``LAYOUTS``."""
+    cited_as: str  # authors and year, or the key of the citation
+    home: str  # the data set's own page
+    counts: SceneCounts  # of the paper's table where that lists the data set
+    layout: str  # the native layout: a name in ``LAYOUTS``
+    # What each kind of file is called, relative to the root; {scene} stands for a scene's
+    # name.
     files: dict[str, str]
-    """What each kind of file is called, relative to the root; {scene} stands for a scene's name."""
-    camera: Camera
-    """Conventions of the cameras."""
-    depth: Depth | None = None
-    """Of stored depth; None where the data set has none."""
-    licence: Licence
-    """Terms and address."""
-    splits: dict[str, str] = {}
-    """Official splits: name, and which file or rule defines it."""
-    geometry: Geometry | None = None
-    """Of training; None for data sets that serve as benchmarks alone."""
-    sources: Texts
-    """Where each of these facts was read."""
-    not_verified: Texts = ()
-    """Which facts could not be verified, and why."""
-    traps: Texts = ()
-    """What readers of this data set get wrong."""
+    camera: CameraConvention  # conventions of the cameras
+    depth: DepthEncoding | None = None  # of stored depth; None where the data set has none
+    licence: Licence  # terms and address
+    splits: dict[str, str] = {}  # official splits: name, and which file or rule defines it
+    # Of training; None for data sets that serve as benchmarks alone.
+    geometry: GeometrySource | None = None
+    sources: Texts  # where each of these facts was read
+    not_verified: Texts = ()  # which facts could not be verified, and why
+    traps: Texts = ()  # what readers of this data set get wrong
 
     @model_validator(mode="after")
     def _trains_from_something(self) -> DataSetSpec:

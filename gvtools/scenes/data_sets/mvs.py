@@ -106,13 +106,10 @@ def mvsnet_frames(
 
 # --- DTU MVS, in millimetres ------------------------------------------------------------------
 #
-# - MVSNet's: ``Rectified/scanN[_train]/rect_VVV_L_r5000.png`` (picture VVV from 1, light L) with
-#   ``Cameras/NNNNNNNN_cam.txt`` (of 1600x1200) or ``Cameras/train/`` (of 160x128 for pictures of
-#   640x512), N from 0, and depth in ``Depths[_raw]/scanN[_train]/depth_map_NNNN.pfm``. Of the seven
-#   lights the fourth (L = 3) is read.
-# - MVSNet's for testing: ``scanN/images/NNNNNNNN.jpg`` with ``scanN/cams/NNNNNNNN_cam.txt``.
-# - IDR's and pixelNeRF's: ``scanN/image/NNNNNN.png`` with ``scanN/cameras.npz``: ``world_mat_i`` is
-#   K [R t]; ``scale_mat_i`` would shrink the scene and is left aside.
+# MVSNet's training form has pictures VVV from 1 of seven lights (the fourth, L = 3, is read) and
+# cameras N from 0, of 1600x1200 or, in ``Cameras/train``, of 160x128; its form for testing has
+# ``cams``. IDR's and pixelNeRF's ``world_mat_i`` is K [R t]; ``scale_mat_i`` would shrink the
+# scene and is left aside.
 
 RECTIFIED, NPZ = "Rectified", "cameras.npz"
 LIGHT = "3"
@@ -215,13 +212,9 @@ def decomposed(projection: Float64) -> MvsCamera:
 
 # --- Tanks and Temples ------------------------------------------------------------------------
 #
-# - ``SCENE/*.log`` (blocks of a number and a 4x4 world_from_cam) with the pictures in ``SCENE`` or
-#   ``SCENE/images`` in the order of their names. The data set publishes no intrinsics:
-#   ``SCENE/intrinsics.txt`` (3x3 or 4x4, pixels of the pictures) has to be given.
-# - ``SCENE/cams/NNNNNNNN_cam.txt`` or ``cams_1`` with ``SCENE/images`` (MVSNet).
-# - ``SCENE/sparse/0`` with ``SCENE/images`` or ``images_N``.
-#
-# The unit is that of the reconstruction, without metric scale.
+# The official trajectory (``.log``) counts pictures in the order of their names, in ``SCENE`` or
+# ``SCENE/images``; intrinsics are not published and have to be given. Or MVSNet's cameras, or a
+# COLMAP model.
 
 GIVEN = "intrinsics.txt"
 CAMS = ("cams", "cams_1")

@@ -1,6 +1,7 @@
 """Data sets whose cameras a reconstruction found: Mip-NeRF 360, LLFF, DL3DV, ETH3D, ScanNet++ v2.
 
-Their models are COLMAP's or nerfstudio's; pictures may lie elsewhere, or at another size, than
+Files, axes, units and traps of each are in its spec, ``data_specs/data_sets``. Models are COLMAP's
+or nerfstudio's; pictures may lie elsewhere, or at another size, than
 these say. A scene is read from its largest pictures; ``SCENE/images_4`` asks for reduced copies.
 """
 
@@ -199,9 +200,8 @@ def _factor(name: str) -> int:
 
 # --- Mip-NeRF 360 -----------------------------------------------------------------------------
 #
-# ``SCENE/sparse/0`` with ``images`` and its copies. The model's cameras are of the pictures in
-# ``images``; copies have another size, rounded to whole pixels, so intrinsics follow each picture's
-# own width and height. The unit is COLMAP's, without metric scale.
+# The model's cameras are of the pictures in ``images``; copies have another size, rounded to whole
+# pixels, so intrinsics follow each picture's own width and height.
 
 
 def _mipnerf360_scenes(root: Path) -> tuple[str, ...]:
@@ -232,12 +232,11 @@ MIPNERF360 = Layout(
 
 # --- LLFF -------------------------------------------------------------------------------------
 #
-# ``SCENE/poses_bounds.npy`` with ``images`` and its copies. Each row holds a 3x5 matrix, the first
-# three columns of which are the camera's axes "down, right, backwards" in the world, then its
-# centre, then height, width and focal length in pixels of ``images``; and the nearest and farthest
-# depth. The principal point is the picture's middle. Rows follow the pictures in the order of their
-# names, so that a row's picture is known only where a folder is complete, where ``sparse/0`` names
-# the pictures, or where copies are numbered.
+# Each row holds a 3x5 matrix, the first three columns of which are the camera's axes "down, right,
+# backwards" in the world, then its centre, then height, width and focal length in pixels of
+# ``images``. Rows follow the pictures in the order of their names, so that a row's picture is
+# known only where a folder is complete, where ``sparse/0`` names the pictures, or where copies are
+# numbered.
 
 POSES_BOUNDS = "poses_bounds.npy"
 # Columns "right, down, forward" of the columns "down, right, backwards".
@@ -291,12 +290,9 @@ def _llff_files(folder: Path, home: Path, count: int) -> list[Path]:
 
 # --- DL3DV ------------------------------------------------------------------------------------
 #
-# ``[SUBSET/]HASH/transforms.json`` of nerfstudio, with ``images_4`` or ``images_8``. The file's
-# intrinsics are of the full pictures and its paths name the folder ``images``, also where only
-# ``images_4`` (960P) or ``images_8`` (480P) was downloaded: paths are taken below the folder that
-# is there, and intrinsics follow each picture's own size. The benchmark keeps all of this in
-# ``HASH/nerfstudio``. A download of the COLMAP cache alone (``HASH/colmap/sparse/0`` beside the
-# pictures) is read through the model. The unit is COLMAP's, without metric scale.
+# The file's paths name the folder ``images``, also where only ``images_4`` (960P) or ``images_8``
+# (480P) was downloaded: they are taken below the folder that is there. The benchmark keeps all of
+# this in ``HASH/nerfstudio``. A download of the COLMAP cache alone is read through the model.
 
 INSIDE = "nerfstudio"  # where the benchmark keeps a scene
 
@@ -342,12 +338,9 @@ def _dl3dv_variants(root: Path) -> tuple[str, ...]:
 
 # --- ETH3D, high-resolution multi-view --------------------------------------------------------
 #
-# ``SCENE/dslr_calibration_undistorted`` with ``images``. The undistorted pictures
-# (``images/dslr_images_undistorted``) are read where they are there, else the original ones
-# (``dslr_calibration_jpg``, a fisheye model) are undistorted here. Depth (``ground_truth_depth/
-# dslr_images/NAME``: raw 4-byte floats row by row, infinite for none, metres) was rendered for the
-# *original* pictures. It goes through the original camera to the undistorted one, for which
-# ``dslr_calibration_jpg`` is needed.
+# Undistorted pictures are read where they are there, else the original ones are undistorted here.
+# Depth (raw 4-byte floats row by row) was rendered for the *original* pictures. It goes through
+# the original camera to the undistorted one, for which ``dslr_calibration_jpg`` is needed.
 
 UNDISTORTED, ORIGINAL = "dslr_calibration_undistorted", "dslr_calibration_jpg"
 
@@ -426,18 +419,12 @@ def read_raw_depth(path: Path, *, size: tuple[int, int], lens: Undistortion | No
 
 # --- ScanNet++ v2 -----------------------------------------------------------------------------
 #
-# ``[data/]SCENE/dslr`` and ``[data/]SCENE/iphone``, each a scene of its own.
-#
-# DSLR: poses and the fisheye camera come from ``dslr/colmap``, whose world is the laser scan's, in
-# metres (that of ``nerfstudio/transforms.json`` is another). Pictures that the data set's tools
-# undistorted (``resized_undistorted_images`` with ``nerfstudio/transforms_undistorted.json``) are
-# read where they are there, else ``resized_images`` are undistorted here. ``render_depth`` of the
-# tools (millimetres) is of the fisheye pictures and is read with those alone. Anonymisation masks
-# (``resized_anon_masks``) are read with either.
-#
-# iPhone: ``iphone/rgb`` and ``iphone/depth`` (millimetres, 256x192) as the data set's tools extract
-# them from ``rgb.mp4`` and ``depth.bin``, with ``pose_intrinsic_imu.json``: ``aligned_pose`` is
-# world_from_cam with OpenCV axes in the scan's world, ``intrinsic`` is of the picture.
+# ``dslr`` and ``iphone`` are a scene each. DSLR: poses and the fisheye camera come from
+# ``dslr/colmap``, whose world is the laser scan's (that of ``nerfstudio/transforms.json`` is
+# another). Pictures that the data set's tools undistorted are read where they are there, else
+# ``resized_images`` are undistorted here. ``render_depth`` of the tools is of the fisheye pictures
+# and is read with those alone; anonymisation masks with either. iPhone: ``rgb`` and ``depth`` as
+# the tools extract them, with ``aligned_pose``, world_from_cam in the scan's world.
 
 IPHONE_POSES = "pose_intrinsic_imu.json"
 

@@ -1,6 +1,7 @@
 """Rendered data sets as published: TartanAir, Virtual KITTI, Spring, MVS-Synth, OmniWorld, GTA-SfM.
 
-Most of them number their files: a frame is what has a picture or a row of poses.
+Files, axes, units and traps of each are in its spec, ``data_specs/data_sets``. Most of them number
+their files: a frame is what has a picture or a row of poses.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from gvtools.scenes.depth_files import (
     hdf5_file,
     read_dataset,
 )
-from gvtools.scenes.images import UNREADABLE, read_depth, read_mask, readings
+from gvtools.scenes.images import UNREADABLE, decode_picture, read_depth, read_mask, readings
 from gvtools.scenes.layout import Layout
 from gvtools.scenes.matching import natural, numbers_in, scenes_holding
 from gvtools.scenes.photographs import Depth, PosedFrame, first_size, posed_scene
@@ -80,14 +81,10 @@ def numbered_frames(
 
 # --- TartanAir, the first and v2 --------------------------------------------------------------
 #
-# ``ENV/Easy/P000/image_left/000000_left.png`` and others, or ``ENV/Data_easy/P000/
-# image_lcam_front/000000_lcam_front.png``. Row i of ``pose_CAMERA.txt`` is the pose of frame i:
-# ``tx ty tz qx qy qz qw``, metres, camera to world. Both frames are NED, as aircraft have them: a
-# camera's x axis looks forward, y to the right, z down. The world stays as it is here; the cameras
-# get OpenCV axes. Intrinsics are in no file: 90 degrees wide, the principal point in the middle of
-# pixels whose first centre is (0.5, 0.5). Depth is metres: an array, or in v2 a float32 whose four
-# bytes are the channels of a PNG in OpenCV's order (blue, green, red, alpha). v2 has twelve pinhole
-# cameras, a stereo pair in each of six directions.
+# Row i of ``pose_CAMERA.txt`` is the pose of frame i. Both frames are NED, as aircraft have them;
+# the world stays as it is here, the cameras get OpenCV axes. Intrinsics are in no file. Depth is
+# an array of metres, or in v2 a float32 whose four bytes are the channels of a PNG in OpenCV's
+# order (blue, green, red, alpha).
 
 # The sky is a sphere some kilometres away, at depths such as 10000 (metres).
 SKY_FROM = 1000.0
@@ -190,12 +187,9 @@ TARTANAIR_V2 = _trajectories(
 
 # --- Virtual KITTI 2 --------------------------------------------------------------------------
 #
-# ``Scene01/clone/frames/rgb/Camera_0/rgb_00000.jpg`` and others. Depth lies in ``frames/depth/
-# Camera_0/depth_00000.png``, centimetres, 65535 for the sky. Cameras are rows of ``intrinsic.txt``
-# (frame, camera, fx, fy, cx, cy) and ``extrinsic.txt`` (frame, camera, the 16 numbers of
-# cam_from_world, metres), one for each frame and each of the two cameras. Pixel centres count as
-# integers: the principal point (620.5, 187) is the middle of 1242x375. The archives unpack into one
-# folder or into ``vkitti_2.0.3_rgb``, ``_depth`` and ``_textgt`` side by side.
+# ``intrinsic.txt`` has rows of frame, camera, fx, fy, cx, cy, ``extrinsic.txt`` of frame, camera
+# and the 16 numbers of cam_from_world. The archives unpack into one folder, or into
+# ``vkitti_2.0.3_rgb``, ``_depth`` and ``_textgt`` side by side.
 
 CENTIMETRES = 0.01
 _KITTI_CAMERAS = ("Camera_0", "Camera_1")
@@ -240,11 +234,9 @@ def _read_kitti(root: Path, scene: str) -> Scene:
 
 # --- Spring, its training part ----------------------------------------------------------------
 #
-# ``spring/train/0001/frame_left/frame_left_0001.png``. Depth comes from ``disp1_left/
-# disp1_left_0001.dsp5``, HDF5 with the disparity to the right camera, 0.065 m beside the left one:
-# in pixels of the frame, but at twice its resolution. Row i of ``cam_data/intrinsics.txt`` (fx, fy,
-# cx, cy) and ``cam_data/extrinsics.txt`` (the 16 numbers of cam_from_world, metres, OpenCV axes)
-# belongs to frame i, counted from 1. Pixels that ``maps/skymap_left`` calls sky have no depth.
+# Disparity is to a camera 0.065 m beside the left one, in pixels of the frame, but at twice its
+# resolution. Row i of intrinsics and extrinsics belongs to frame i, counted from 1. Pixels that
+# ``maps/skymap_left`` calls sky have no depth.
 
 BASELINE = 0.065  # metres
 LEAST_DISPARITY = 1e-9  # pixels
@@ -331,11 +323,8 @@ def _read_spring(root: Path, scene: str) -> Scene:
 
 # --- MVS-Synth --------------------------------------------------------------------------------
 #
-# ``GTAV_720/0000`` with ``images/0000.png``, ``depths/0000.exr`` and ``poses/0000.json``. Depth is
-# the channel Y of an OpenEXR file, z-depth, infinity for the sky. A pose file holds ``extrinsic``,
-# 4x4 cam_from_world with OpenCV axes in the camera, and ``f_x, f_y, c_x, c_y`` in pixels. The world
-# is left-handed, so that the matrix has the determinant -1; here the world's y axis is turned
-# round. The unit is the game's and is not published, so the scene is not taken to be metric.
+# The world of the files is left-handed, so that poses have the determinant -1; here its y axis is
+# turned round. The unit is the game's and is not published.
 
 # From a right-handed world to the left-handed one of the files, and back.
 MIRRORED = np.diag([1.0, -1.0, 1.0, 1.0])
@@ -380,12 +369,10 @@ def _read_synth(root: Path, scene: str) -> Scene:
 
 # --- OmniWorld-Game, as its authors' script unpacks it ----------------------------------------
 #
-# ``SCENE`` with ``color`` and ``camera``. Recordings are cut into splits, each with cameras of its
-# own, so that a split is a scene here. ``split_info.json`` lists the frames of each split;
-# ``camera/split_0.json`` holds for them ``quats`` (w, x, y, z) and ``trans`` of cam_from_world with
-# OpenCV axes, ``focals``, ``cx`` and ``cy`` in pixels whose first centre is (0.5, 0.5). Depth is a
-# 16-bit PNG of a depth buffer between a near plane at 1 and a far one at 1000, times 250; the unit
-# is not published. Masks of what moves are not applied.
+# Recordings are cut into splits, each with cameras of its own, so that a split is a scene here:
+# ``split_info.json`` lists its frames, ``camera/split_N.json`` holds their cameras. Depth is a
+# 16-bit depth buffer between a near plane at 1 and a far one at 1000, times 250; the unit is not
+# published. Masks of what moves are not applied.
 
 NEAR, FAR, SCALE = 1.0, 1000.0, 250.0
 # Shares of the buffer's range, as the authors' script has them: nearer is too close, farther sky.
@@ -445,10 +432,8 @@ def _read_omniworld(root: Path, scene: str) -> Scene:
 
 # --- GTA-SfM ----------------------------------------------------------------------------------
 #
-# One HDF5 file a sequence, with ``image_0, depth_0, pose_0, K_0`` and so on. Images are encoded
-# files (JPEG or PNG) as bytes; depth is float z-depth; poses are 4x4 world_from_cam with OpenCV
-# axes; K is 3x3 with its principal point at (W / 2, H / 2). The unit is the game's and is not
-# published.
+# One HDF5 file a sequence, with ``image_0, depth_0, pose_0, K_0`` and so on; images are encoded
+# files as bytes. The unit is the game's and is not published.
 
 _GTA_KEY = re.compile(r"(image|depth|pose|K)_([0-9]+)")
 
@@ -456,11 +441,7 @@ _GTA_KEY = re.compile(r"(image|depth|pose|K)_([0-9]+)")
 def _hdf5_picture(path: Path, *, key: str) -> Frame:
     """The picture that an HDF5 file holds as the bytes of a JPEG or PNG."""
     data = np.asarray(hdf5_array(path, key), np.uint8).tobytes()
-    try:
-        with open_picture(data) as image:
-            return Frame(np.array(image.convert("RGB")))
-    except UNREADABLE as error:
-        raise ProjectError(f"{path}, {key}: no picture ({error}); download it again") from None
+    return decode_picture(data, where=f"{path}, {key}")
 
 
 def _gta_scenes(root: Path) -> tuple[str, ...]:

@@ -20,13 +20,13 @@ import numpy as np
 from gvtools.errors import ProjectError
 from gvtools.optional import require
 from gvtools.scenes.calibration import Float64
-from gvtools.scenes.images import UNREADABLE
+from gvtools.scenes.images import UNREADABLE, decode_picture
 from gvtools.scenes.layout import Layout
 from gvtools.scenes.matching import natural
 from gvtools.scenes.photographs import PosedFrame, posed_scene
 from gvtools.scenes.scene import Finding, Frame, Scene
 from gvtools.scenes.transforms_frame import LensParameters
-from gvtools.untrusted import open_picture, regular
+from gvtools.untrusted import regular
 
 CAMERAS = {1: "front", 2: "front_left", 3: "front_right", 4: "side_left", 5: "side_right"}
 TIME, CAMERA = "key.frame_timestamp_micros", "key.camera_name"
@@ -91,7 +91,7 @@ def read_picture(path: Path, *, group: int, row: int) -> Frame:
             ):
                 if row < seen + batch.num_rows:
                     data = batch.column(0)[row - seen].as_py()
-                    return Frame(np.array(open_picture(data).convert("RGB")))
+                    return decode_picture(data, where=f"{path}, row {row} of group {group}")
                 seen += batch.num_rows
     except UNREADABLE as error:
         raise ProjectError(f"{path}: unreadable picture ({error}); copy it again") from None

@@ -250,7 +250,7 @@ def test_a_damaged_picture_in_an_hdf5_file_is_an_error_when_it_is_loaded(written
         del file["image_0"]
         file["image_0"] = np.zeros(40, np.uint8)
     scene = written.read()
-    with pytest.raises(ProjectError, match="image_0: no picture"):
+    with pytest.raises(ProjectError, match=r"image_0: unreadable \(no picture\)"):
         scene["image_0"].load()
     assert scene["image_1"].load().rgb.shape == (48, 64, 3)
 
