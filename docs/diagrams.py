@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+import ast
+import re
 from dataclasses import dataclass, field
 from html import escape
+from pathlib import Path
+from textwrap import wrap
+
+ROOT = Path(__file__).resolve().parent.parent
 
 CELL_WIDTH, CELL_HEIGHT = 190, 100
 BOX_WIDTH, BOX_HEIGHT = 158, 56
@@ -183,21 +189,51 @@ DIAGRAMS = {
         [("held", "split", ""), ("made", "split", ""), ("split", "images", ""),
          ("split", "consistency", ""), ("split", "poses", "")],
     ),
-    "architecture": Diagram(
-        {
-            "pipelines": (0.5, 0, "step", "pipelines|composes, talks"),
-            "viz": (0, 1, "step", "viz|draws"),
-            "runs": (0, 2, "data", "runs|the run folder"),
-            "training": (1, 2, "data", "training"),
-            "middle": (0.5, 3, "data", "depth, completers,|evaluation"),
-            "memory": (0.5, 4, "data", "memory"),
-            "store": (0, 5, "data", "the memory's store"),
-            "scenes": (1, 5, "data", "scenes"),
-            "base": (0.5, 6, "data", "cameras, settings,|errors"),
-        },
-        [("pipelines", "viz", ""), ("pipelines", "training", ""), ("viz", "runs", ""),
-         ("runs", "middle", ""), ("training", "middle", ""), ("middle", "memory", ""),
-         ("memory", "store", ""), ("memory", "scenes", ""), ("store", "base", ""),
-         ("scenes", "base", "")],
-    ),
 }  # fmt: skip
+
+
+def rooms() -> list[list[tuple[str, str]]]:
+    """Layers of packages from the top down, each with the first sentence of its docstring.
+
+    A package imports from those below; the layers are the ones that ``make lint`` holds.
+    """
+    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    match = re.search(r'containers = \["gvtools"\]\nlayers = (\[.*?\])', text, re.DOTALL)
+    assert match is not None
+    inside = ast.literal_eval(match[1])
+    found = [[_room(ROOT / "pipelines")], [_room(ROOT / "viz")]]
+    for layer in inside:
+        folders = [ROOT / "gvtools" / name.strip() for name in re.split("[|:]", layer)]
+        found.append([_room(folder) for folder in folders if folder.is_dir()])
+    return [layer for layer in found if layer]
+
+
+def _room(folder: Path) -> tuple[str, str]:
+    text = ast.get_docstring(ast.parse((folder / "__init__.py").read_text(encoding="utf-8"))) or ""
+    name = folder.relative_to(ROOT).as_posix()
+    return name, " ".join(re.split(r"(?<=[.])\s", text)[0].split())
+
+
+def rooms_svg() -> str:
+    """The layers as rows of boxes with the packages' names and sentences."""
+    layers, width, height, gap = rooms(), 262, 80, 12
+    across = max(map(len, layers)) * (width + gap) + gap
+    down = len(layers) * (height + gap) + gap
+    parts = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {across} {down}" width="{across}" '
+        f'height="{down}" font-family="sans-serif">',
+        f'<rect width="{across}" height="{down}" rx="8" fill="#ffffff"/>',
+    ]
+    for row, layer in enumerate(layers):
+        begin = (across - len(layer) * (width + gap) + gap) / 2
+        for column, (name, sentence) in enumerate(layer):
+            x, y = begin + column * (width + gap), gap + row * (height + gap)
+            kind = "data" if name.startswith("gvtools") else "step"
+            parts.append(
+                f'<rect x="{x:g}" y="{y}" width="{width}" height="{height}" rx="6" '
+                f'fill="{FILLS[kind]}" stroke="#455a64"/>'
+            )
+            parts.append(_text(x + width / 2, y + 18, name))
+            for line, text in enumerate(wrap(sentence, 42)):
+                parts.append(_text(x + width / 2, y + 36 + 14 * line, text, size=11))
+    return "\n".join([*parts, "</svg>"]) + "\n"

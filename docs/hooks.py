@@ -30,7 +30,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the generated pages and diagrams to those of the folder."""
     # MkDocs restores the path after it has read its hooks.
     sys.path[:0] = [str(ROOT), str(ROOT / "docs")]
-    from diagrams import DIAGRAMS
+    from diagrams import DIAGRAMS, rooms_svg
 
     pages = {name: _copied(ROOT / source) for name, source in COPIED.items()}
     pages |= {
@@ -42,6 +42,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         "data_sets.md": data_sets_page(),
     }
     pages |= {f"images/{name}.svg": diagram.svg() for name, diagram in DIAGRAMS.items()}
+    pages["images/architecture.svg"] = rooms_svg()
     for name, content in pages.items():
         files.append(File.generated(config, name, content=content))
     return files

@@ -1,1 +1,1 @@
-"""What a user runs: the command line and the steps it composes."""
+"""Command line and the steps that it composes."""

@@ -1,1 +1,1 @@
-"""Pictures of runs: functions that take data and draw."""
+"""Pictures of runs: plots, report, web viewer, Open3D window."""

@@ -1,1 +1,1 @@
-"""What a scene looks like: a compact set of Gaussians fitted to its photographs."""
+"""Appearance: a compact set of Gaussians fitted to the photographs of a scene."""

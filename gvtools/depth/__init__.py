@@ -1,1 +1,1 @@
-"""Where the depth of a view comes from."""
+"""Sources of depth: sensors, COLMAP, plane sweep, networks and fitted Gaussians."""

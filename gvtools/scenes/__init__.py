@@ -1,1 +1,1 @@
-"""What a run reads: COLMAP projects, posed RGB-D folders, transforms.json, and samples."""
+"""Projects as they are read: COLMAP, posed RGB-D, transforms.json, phones, data sets, samples."""

@@ -1,1 +1,1 @@
-"""What the generative core is trained on: procedural scenes, recorded scenes, hints, batches."""
+"""Training of the generative core: stages, sources of examples, checkpoints."""

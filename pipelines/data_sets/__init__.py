@@ -1,1 +1,1 @@
-"""What ``gvtools data`` does with data sets."""
+"""Listing, checks, statistics and shards of data sets."""

@@ -1,1 +1,1 @@
-"""What commands accept as input: trajectories, runs and memories."""
+"""Inputs of commands: trajectories, runs and memories."""

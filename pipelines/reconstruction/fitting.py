@@ -9,7 +9,7 @@ from __future__ import annotations
 import signal
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -451,7 +451,12 @@ def fit_appearance(plan: Plan, console: Console, *, earlier: Fitted | None = Non
         fit.options = fit.options.replaced(seconds=left)
     if fit.splatter is GsplatSplat:
         console.line("fitting: on the CUDA device, by gsplat")
-    fits: Sequence[Fit] = _run(fit, console)
+    with _stopped_by_ctrl_c(fit, console):
+        fits: Sequence[Fit] = run_fits(fit, report=_progress(console))
+    if fit.cameras.with_poses:
+        console.line(f"fitting: {fit.cameras.summary()}")
+    if len(fits) > 1:
+        console.line(f"fitting: the mean of {len(fits)} fits")
     if earlier is not None and not fit.begin:
         fits = _worth_adding(fits, earlier)
     found = replace(_fitted(fits, plan, earlier), sweep=sweep)
@@ -590,8 +595,8 @@ def _stopped_by_ctrl_c(fit: Fit, console: Console) -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-def _run(first: Fit, console: Console) -> list[Fit]:
-    """Run a fit and further ones, and print progress."""
+def _progress(console: Console) -> Callable[[Fit, float], None]:
+    """Prints progress now and then."""
     began, told = time.perf_counter(), 0.0
 
     def say(fit: Fit, share: float) -> None:
@@ -606,13 +611,7 @@ def _run(first: Fit, console: Console) -> list[Fit]:
                 f"{len(fit.population):,} Gaussians, {fit.psnr:.2f} dB{left_out}"
             )
 
-    with _stopped_by_ctrl_c(first, console):
-        fits = run_fits(first, report=say)
-    if first.cameras.with_poses:
-        console.line(f"fitting: {first.cameras.summary()}")
-    if len(fits) > 1:
-        console.line(f"fitting: the mean of {len(fits)} fits")
-    return fits
+    return say
 
 
 def _fitted(fits: Sequence[Fit], plan: Plan, earlier: Fitted | None) -> Fitted:
