@@ -23,12 +23,12 @@ settings.load_profile("any machine")
 FIRST = (
     "test_splat.py",
     "test_room_sample.py",
-    "test_completers_inpaint.py",
+    "test_inpaint.py",
     "test_stereo_depth.py",
     "test_training_run.py",
     "test_bench_complete.py",
     "test_experiments.py",
-    "test_geoverse_checkpoints.py",
+    "test_geoverse_weights.py",
 )
 
 

@@ -11,22 +11,33 @@ import geoverse_models as micro
 import numpy as np
 import pytest
 import torch
+from run_files import results, untimed
+from tiny_scan import write_scan
 
+from benchmarks.experiments import completion, poses
+from benchmarks.experiments.classical import CLASSICAL
+from benchmarks.experiments.options import ExperimentOptions
 from gvtools.cameras import Cameras
 from gvtools.completers import Completer, Completion, ContextView, ScaleStatus, create
 from gvtools.completers.base import run_completer
 from gvtools.completers.geoverse import completer as completer_module
-from gvtools.completers.geoverse.completer import GeoVerseCompleter
+from gvtools.completers.geoverse.completer import SHIPPED, GeoVerseCompleter
 from gvtools.completers.geoverse.composition import GENERATED
 from gvtools.completers.geoverse.conditioning import ViewBatch
 from gvtools.completers.geoverse.depth_scale import PassScale
 from gvtools.completers.geoverse.model import Generated, GeoVerse
 from gvtools.completers.geoverse.views import chosen_views
+from gvtools.completers.geoverse.weights import config_of
 from gvtools.errors import CheckpointError, OptionError
 from gvtools.guidance import Guidance
+from gvtools.memory.spatial_memory import SpatialMemory
+from gvtools.training.records import STAGES
+from pipelines.cli import main
 
 pytest.importorskip("safetensors", reason="weights are read with safetensors")
-pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+pytestmark = pytest.mark.usefixtures("one_thread", "unpainted")
 
 
 def complete(
@@ -65,6 +76,8 @@ def watched(monkeypatch: pytest.MonkeyPatch) -> list[tuple[ViewBatch, Any, Gener
 
 
 FIELDS = ("rgb", "depth", "valid", "confidence", "generated")
+
+
 SIZES = [(30, 40), (24, 32), (17, 23), (9, 7), (64, 31), (1, 40), (100, 133)]
 
 
@@ -176,6 +189,8 @@ def test_a_photograph_and_a_target_of_one_name_start_from_different_noise(weight
 
 
 TURN = micro.rotation((0.3, 1.0, -0.4), 2.0)
+
+
 WORLDS: dict[str, dict[str, Any]] = {
     "kilometres": {"scale": 1e-3},
     "millimetres": {"scale": 1e3},
@@ -397,3 +412,159 @@ def test_untrained_weights_are_said(tmp_path, weights):
     (plain / "config.json").write_text(json.dumps({**config, "trained": False}))
     (note,) = GeoVerseCompleter(weights=str(plain)).notes
     assert "untrained" in note
+
+
+OPTIONS = ("--context", "first:2", "--targets", "range:2-5", "--views-per-round", "2")
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory) -> Path:
+    return write_scan(tmp_path_factory.mktemp("scan"))
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory) -> Path:
+    return micro.weights_folder(tmp_path_factory.mktemp("weights") / "micro")
+
+
+@pytest.fixture(scope="module")
+def whole(scan, weights, tmp_path_factory) -> Path:
+    """An uninterrupted run of two rounds after the photographs' own."""
+    out = tmp_path_factory.mktemp("runs") / "whole"
+    assert reconstruct(scan, weights, out) == 0
+    return out
+
+
+def reconstruct(scan: Path, weights: Path, out: Path, *words: str) -> int:
+    """Exit status of the command."""
+    given = ("--completer", "geoverse", "--set", f"completer.weights={weights}", "--quiet")
+    return main(
+        ["reconstruct", str(scan), "--refine", "0", "--out", str(out), *OPTIONS, *given, *words]
+    )
+
+
+def test_a_dry_run_says_what_it_would_do_and_computes_nothing(
+    scan, weights, tmp_path, capsys, monkeypatch
+):
+    def called(*args, **options):
+        raise AssertionError("a dry run completes nothing")
+
+    monkeypatch.setattr(GeoVerseCompleter, "complete", called)
+    given = ("--completer", "geoverse", "--set", f"completer.weights={weights}", "--dry-run")
+    assert (
+        main(
+            [
+                "reconstruct",
+                str(scan),
+                "--refine",
+                "0",
+                "--out",
+                str(tmp_path / "run"),
+                *OPTIONS,
+                *given,
+            ]
+        )
+        == 0
+    )
+    said = capsys.readouterr().out
+    assert "geoverse" in said and "dry run" in said
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_run_ends_with_its_files(whole):
+    assert {"run.json", "rounds.jsonl", "metrics.json", "memory.npz"} <= {
+        path.name for path in whole.iterdir()
+    }
+    rounds = untimed(whole)
+    assert [entry["round"] for entry in rounds] == [0, 1, 2]
+    for number in range(3):
+        assert (whole / f"round_{number:03d}" / "report.json").is_file()
+    assert len(SpatialMemory.load(whole / "memory.npz")) == rounds[-1]["points"] > 0
+    assert len(json.loads((whole / "run.json").read_text(encoding="utf-8"))["weights"]) == 64
+
+
+def lose_the_last_round(scan: Path, weights: Path, out: Path, whole: Path) -> None:
+    """A finished run without its last round's folder."""
+    shutil.copytree(whole, out)
+    shutil.rmtree(out / "round_002")
+
+
+def stop_in_the_last_round(scan: Path, weights: Path, out: Path, whole: Path) -> None:
+    """A run that is interrupted when its last round is to be completed."""
+    complete = GeoVerseCompleter.complete
+    calls = []
+
+    def stopping(self, *args, **options):
+        calls.append(self)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return complete(self, *args, **options)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(GeoVerseCompleter, "complete", stopping)
+        assert reconstruct(scan, weights, out) == 1
+    assert (out / "round_001").is_dir() and not (out / "round_002").exists()
+
+
+@pytest.mark.parametrize("stop", [lose_the_last_round, stop_in_the_last_round])
+def test_resuming_after_a_stop_between_rounds_gives_the_same_bytes(
+    whole, scan, weights, tmp_path, capsys, stop
+):
+    out = tmp_path / "run"
+    stop(scan, weights, out, whole)
+    capsys.readouterr()
+    assert reconstruct(scan, weights, out, "--resume") == 0
+    assert results(out) == results(whole)
+    assert untimed(out) == untimed(whole)
+
+
+def test_changed_weights_refuse_to_resume(scan, tmp_path, capsys):
+    folder, out = micro.weights_folder(tmp_path / "weights"), tmp_path / "run"
+    assert reconstruct(scan, folder, out) == 0
+    before = results(out)
+    micro.weights_folder(tmp_path / "other", seed=1)
+    for path in (tmp_path / "other").iterdir():
+        shutil.copyfile(path, folder / path.name)
+    capsys.readouterr()
+    assert reconstruct(scan, folder, out, "--resume") == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and "another run (weights differ)" in said
+    assert results(out) == before
+
+
+def test_it_is_small_and_brings_its_record():
+    files = [path for path in SHIPPED.rglob("*") if path.is_file()]
+    assert sum(path.stat().st_size for path in files) <= 30e6
+    card = (SHIPPED / "MODEL_CARD.md").read_text(encoding="utf-8")
+    for word in ("gvtools train tiny", "Seed 0", "Limits", "Figures", "Data"):
+        assert word in card, word
+    for stage in STAGES:
+        settings = json.loads((SHIPPED / f"training_{stage}.json").read_text(encoding="utf-8"))
+        lines = (SHIPPED / f"log_{stage}.jsonl").read_text(encoding="utf-8").splitlines()
+        assert settings["seed"] == 0
+        assert json.loads(lines[-1])["step"] == settings[stage]["optimizer"]["steps"]
+
+
+def test_a_completer_without_weights_uses_it():
+    completer = create("geoverse")
+    assert isinstance(completer, GeoVerseCompleter)
+    assert completer.folder == SHIPPED
+    assert config_of(SHIPPED).trained and not completer.notes
+
+
+@pytest.mark.slow
+def test_its_rays_give_back_the_cameras_that_it_was_told():
+    found, _ = poses.run(ExperimentOptions(scenes=3))
+    figures = found["true pictures, cameras told"]
+    assert figures["rotation_deg_median"] < 6
+    assert figures["gain_over_first_view"] > 2
+
+
+@pytest.mark.slow
+def test_it_completes_held_out_rooms_better_than_the_usual_fillers():
+    found, _ = completion.run(ExperimentOptions(scenes=3))
+    rows = {row["method"]: row for row in found["against_best_other_filler"]}
+    student = rows["student 3+1"]
+    others = [rows[name] for name in CLASSICAL]
+    assert student["depth"] < 0.8 * min(row["depth"] for row in others)
+    assert student["psnr"] > max(row["psnr"] for row in others)

@@ -2,10 +2,18 @@ from __future__ import annotations
 
 from dataclasses import fields, replace
 
+import geoverse_loss_reference as formula
+import numpy as np
 import pytest
 import torch
+from geoverse_loss_reference import sobel, weights
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import ndimage
+from torch import Tensor
 
 from gvtools.completers.geoverse.objective import (
+    DEFECTS,
     LossWeights,
     Objective,
     Prediction,
@@ -13,14 +21,23 @@ from gvtools.completers.geoverse.objective import (
     center_similarity,
     depth_loss,
     flow_matching_loss,
+    gradient_weights,
+    grayscale,
     high_gradient_loss,
     objective,
     rgb_loss,
+    sobel_magnitude,
+    view_errors,
 )
 from gvtools.errors import OptionError
+from gvtools.similarity import fit_similarity
 
 B, V, CONTEXT = 2, 5, 2
+
+
 T = V - CONTEXT
+
+
 TERMS = ["level1", "level0", "rgb", "hf", "depth"]
 
 
@@ -137,8 +154,8 @@ def test_missing_targets_are_counted_and_give_zero_within_the_graph():
     )
     assert float(found.total) == 0 and found.total.requires_grad
     found.total.backward()
-    for given in (prediction.image, prediction.depth):
-        assert given is not None and given.grad is not None and not bool(given.grad.any())
+    for leaf in (prediction.image, prediction.depth):
+        assert leaf is not None and leaf.grad is not None and not bool(leaf.grad.any())
     assert {name: int(value) for name, value in found.counts.items()} == {
         "rgb_pixels": 0,
         "rgb_empty": B,
@@ -180,3 +197,456 @@ def test_the_device_changes_neither_the_terms_nor_the_gradients():
 def test_wrong_coefficients_are_refused(value):
     with pytest.raises(OptionError, match="loss weight rgb"):
         LossWeights(rgb=value)
+
+
+SAMPLES, VIEWS, KNOWN, H, W = 2, 5, 2, 5, 6
+
+
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def _normal(rng: np.random.Generator, *shape: int) -> Tensor:
+    return torch.tensor(rng.normal(size=shape))
+
+
+def _mask(rng: np.random.Generator, *shape: int) -> Tensor:
+    return torch.tensor(rng.random(shape) < rng.choice([0.0, 0.5, 1.0]))
+
+
+def _outside(values: Tensor, mask: Tensor, poison: float) -> Tensor:
+    return torch.where(mask, values, poison)
+
+
+# --- flow matching ------------------------------------------------------------------------------
+
+
+@settings(deadline=None)
+@given(SEEDS, st.integers(0, VIEWS), st.floats(0, 2))
+def test_the_flow_loss_is_a_constant_factor_of_the_papers_formula(seed, context, alpha):
+    rng = np.random.default_rng(seed)
+    predicted, clean, noise = (_normal(rng, SAMPLES, VIEWS, 3, 2, 2) for _ in range(3))
+    options = {"context": context, "context_weight": alpha}
+    found = flow_matching_loss(predicted, noise - clean, **options)
+    for b in range(SAMPLES):
+        weights = [alpha] * context + [1.0] * (VIEWS - context)
+        expected = formula.flow_matching(
+            predicted[b].numpy(), clean[b].numpy(), noise[b].numpy(), weights
+        )
+        assert float(found[b]) * (3 * 2 * 2 * VIEWS) == pytest.approx(expected)
+
+
+def test_context_views_weigh_a_quarter():
+    predicted = torch.zeros(1, 2, 1, 1, 1)
+    target = torch.tensor([3.0, 5.0]).reshape(1, 2, 1, 1, 1)
+    found = flow_matching_loss(predicted, target, context=1)
+    assert float(found) == (0.25 * 9 + 25) / 2
+
+
+# --- pictures -----------------------------------------------------------------------------------
+
+
+@settings(deadline=None, max_examples=50)
+@given(SEEDS)
+def test_picture_losses_are_the_papers_formulas(seed):
+    rng = np.random.default_rng(seed)
+    predicted, image = _normal(rng, SAMPLES, T, 3, H, W), _normal(rng, SAMPLES, T, 3, H, W)
+    valid = _mask(rng, SAMPLES, T, H, W)
+    rgb = rgb_loss(predicted, image, valid=valid)
+    hf = high_gradient_loss(predicted, image, valid=valid)
+    for b in range(SAMPLES):
+        sample = predicted[b].numpy(), image[b].numpy(), valid[b].numpy()
+        assert float(rgb[b]) == pytest.approx(formula.rgb(*sample), rel=1e-9)
+        assert float(hf[b]) == pytest.approx(formula.high_gradient(*sample), rel=1e-9)
+
+
+@pytest.mark.parametrize("loss", [rgb_loss, high_gradient_loss])
+@pytest.mark.parametrize("poison", [np.nan, np.inf])
+def test_what_lies_outside_the_mask_poisons_neither_picture_loss_nor_gradient(loss, poison):
+    rng = np.random.default_rng(3)
+    predicted, image = _normal(rng, SAMPLES, T, 3, H, W), _normal(rng, SAMPLES, T, 3, H, W)
+    valid = torch.tensor(rng.random((SAMPLES, T, H, W)) < 0.6)
+    shown = valid[:, :, None].expand_as(image)
+    expected = loss(predicted, image, valid=valid)
+    damaged = _outside(predicted, shown, poison).requires_grad_()
+    found = loss(damaged, _outside(image, shown, poison), valid=valid)
+    torch.testing.assert_close(found, expected)
+    found.sum().backward()
+    assert damaged.grad is not None and bool(damaged.grad.isfinite().all())
+    assert not bool(damaged.grad[~shown].any()) and bool(damaged.grad[shown].any())
+
+
+def test_a_diverged_prediction_is_not_hidden():
+    image = torch.rand(1, 1, 3, 4, 4)
+    predicted = image.clone()
+    predicted[0, 0, 0, 0, 0] = np.nan
+    assert bool(rgb_loss(predicted, image).isnan().all())
+
+
+@pytest.mark.parametrize("loss", [rgb_loss, high_gradient_loss])
+def test_samples_without_pixels_give_zero_within_the_graph(loss):
+    predicted = torch.rand(SAMPLES, T, 3, H, W, requires_grad=True)
+    valid = torch.zeros(SAMPLES, T, H, W, dtype=torch.bool)
+    found = loss(predicted, torch.full((SAMPLES, T, 3, H, W), np.nan), valid=valid)
+    assert found.tolist() == [0.0] * SAMPLES and found.requires_grad
+    found.sum().backward()
+    assert predicted.grad is not None and not bool(predicted.grad.any())
+
+
+def test_constant_pictures_and_single_pixels_have_no_high_gradient():
+    predicted = torch.rand(1, 2, 3, 8, 8, requires_grad=True)
+    image = torch.full((1, 2, 3, 8, 8), 0.3)
+    for valid in (None, torch.rand(1, 2, 8, 8) < 0.5):
+        found = high_gradient_loss(predicted, image, valid=valid)
+        assert found.tolist() == [0.0] and found.requires_grad
+    assert rgb_loss(predicted, image).item() > 0
+    one = torch.zeros(1, 2, 8, 8, dtype=torch.bool)
+    one[0, 1, 3, 3] = True
+    textured = torch.rand(1, 2, 3, 8, 8)
+    assert high_gradient_loss(predicted, textured, valid=one).tolist() == [0.0]
+    expected = (predicted - textured)[0, 1, :, 3, 3].abs().mean()
+    torch.testing.assert_close(rgb_loss(predicted, textured, valid=one)[0], expected)
+
+
+def test_a_picture_of_almost_no_contrast_is_weighted_by_the_formula():
+    # weights far below 1: delta holds the share down, and their sum, below 1, still divides
+    rng = np.random.default_rng(0)
+    predicted, image = _normal(rng, 1, T, 3, H, W), 0.5 + 1e-9 * _normal(rng, 1, T, 3, H, W)
+    valid = np.ones((T, H, W), bool)
+    assert 0 < formula.weights(image[0].numpy(), valid).sum() < 1
+    expected = formula.high_gradient(predicted[0].numpy(), image[0].numpy(), valid)
+    assert high_gradient_loss(predicted, image).item() == pytest.approx(expected, rel=1e-6)
+
+
+def test_the_weights_follow_the_reference_and_not_the_prediction():
+    generator = torch.Generator().manual_seed(0)
+    image = torch.rand(1, 1, 3, 12, 12, generator=generator)
+    predicted = image + 0.1  # the same error everywhere: any weights give 0.1
+    torch.testing.assert_close(high_gradient_loss(predicted, image), torch.tensor([0.1]))
+    flat = torch.full_like(image, 0.5)
+    weight = formula.weights(image[0].double().numpy(), np.ones((1, 12, 12), bool))
+    error = (flat - image).abs().mean(2)[0].numpy()
+    expected = (weight * error).sum() / weight.sum()
+    assert float(high_gradient_loss(flat, image)) == pytest.approx(expected, rel=1e-5)
+
+
+def test_half_precision_pictures_are_compared_in_float32():
+    image = torch.rand(1, 1, 3, 64, 64, generator=torch.Generator().manual_seed(0))
+    half = image.to(torch.bfloat16)
+    found = rgb_loss(half + 0.125, half)
+    assert found.dtype == torch.float32
+    exact = ((half + 0.125).double() - half.double()).abs().mean()
+    assert float(found) == pytest.approx(float(exact), rel=1e-6)
+
+
+# --- depth --------------------------------------------------------------------------------------
+
+
+def _depths(rng: np.random.Generator) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Predicted depth, reference depth with gaps, predicted and reference centres."""
+    predicted = torch.tensor(rng.uniform(0.5, 2, (SAMPLES, T, H, W)))
+    reference = torch.tensor(rng.uniform(1, 6, (SAMPLES, T, H, W)))
+    gaps = torch.tensor(rng.choice([np.nan, np.inf, 0.0, -1.0], (SAMPLES, T, H, W)))
+    reference = torch.where(torch.tensor(rng.random((SAMPLES, T, H, W)) < 0.3), gaps, reference)
+    return (
+        predicted,
+        reference,
+        _normal(rng, SAMPLES, VIEWS, 3),
+        _normal(rng, SAMPLES, VIEWS, 3),
+    )
+
+
+@settings(deadline=None, max_examples=50)
+@given(SEEDS)
+def test_the_depth_loss_is_the_papers_formula(seed):
+    rng = np.random.default_rng(seed)
+    predicted, reference, found_centers, centers = _depths(rng)
+    valid = _mask(rng, SAMPLES, T, H, W)
+    similarity = center_similarity(found_centers, centers)
+    found = depth_loss(predicted, reference, similarity=similarity, valid=valid)
+    for b in range(SAMPLES):
+        scale = formula.scale_of(found_centers[b].numpy(), centers[b].numpy())
+        expected = formula.depth(
+            predicted[b].numpy(), reference[b].numpy(), scale, valid[b].numpy()
+        )
+        assert float(found[b]) == pytest.approx(expected, rel=1e-9)
+
+
+def test_a_scene_of_another_unit_and_frame_has_no_depth_loss():
+    rng = np.random.default_rng(0)
+    predicted, _, centers, _ = _depths(rng)
+    turn = torch.linalg.qr(_normal(rng, SAMPLES, 3, 3))[0]
+    turn = turn * torch.linalg.det(turn)[:, None, None]
+    units = torch.tensor([0.2, 7.0], dtype=torch.float64)
+    moved = units[:, None, None] * centers @ turn.mT + 5
+    similarity = center_similarity(centers, moved)
+    found = depth_loss(predicted, units[:, None, None, None] * predicted, similarity=similarity)
+    torch.testing.assert_close(found, torch.zeros(SAMPLES, dtype=torch.float64), atol=1e-9, rtol=0)
+
+
+def test_samples_without_a_scale_are_dropped():
+    predicted, reference, found_centers, centers = _depths(np.random.default_rng(1))
+    found_centers[1] = 0.5
+    similarity = center_similarity(found_centers, centers)
+    assert similarity.status == ("aligned", "coincident predicted centres")
+    predicted.requires_grad_()
+    dropped = depth_loss(predicted, reference, similarity=similarity)
+    assert dropped[1].item() == 0 < dropped[0].item()
+    (gradient,) = torch.autograd.grad(dropped.sum(), predicted)
+    assert not bool(gradient[1].any()) and bool(gradient[0].any())
+    assert bool(gradient.isfinite().all())
+
+
+@pytest.mark.parametrize("poison", [np.nan, np.inf])
+def test_what_lies_outside_the_mask_poisons_neither_depth_loss_nor_gradient(poison):
+    predicted, reference, found_centers, centers = _depths(np.random.default_rng(2))
+    known = reference.isfinite() & (reference > 0)
+    damaged = _outside(predicted, known, poison).requires_grad_()
+    similarity = center_similarity(found_centers, centers)
+    found = depth_loss(damaged, reference, similarity=similarity)
+    torch.testing.assert_close(found, depth_loss(predicted, reference, similarity=similarity))
+    found.sum().backward()
+    assert damaged.grad is not None and bool(damaged.grad.isfinite().all())
+    assert not bool(damaged.grad[~known].any()) and bool(damaged.grad[known].all())
+
+
+def test_a_batch_without_any_depth_gives_zero_within_the_graph():
+    predicted = torch.rand(SAMPLES, T, H, W, requires_grad=True)
+    similarity = center_similarity(torch.randn(SAMPLES, VIEWS, 3), torch.randn(SAMPLES, VIEWS, 3))
+    found = depth_loss(predicted, torch.zeros(SAMPLES, T, H, W), similarity=similarity)
+    assert found.tolist() == [0.0] * SAMPLES
+    found.sum().backward()
+    assert predicted.grad is not None and not bool(predicted.grad.any())
+
+
+# --- gradients ----------------------------------------------------------------------------------
+
+
+def test_gradients_are_those_of_finite_differences():
+    rng = np.random.default_rng(4)
+    predicted, target = _normal(rng, 2, 3, 2, 2, 2).requires_grad_(), _normal(rng, 2, 3, 2, 2, 2)
+    assert torch.autograd.gradcheck(lambda x: flow_matching_loss(x, target, context=1), predicted)
+    image, reference = _normal(rng, 2, 2, 3, 3, 4).requires_grad_(), _normal(rng, 2, 2, 3, 3, 4)
+    valid = torch.tensor(rng.random((2, 2, 3, 4)) < 0.7)
+    for loss in (rgb_loss, high_gradient_loss):
+        assert torch.autograd.gradcheck(lambda x, f=loss: f(x, reference, valid=valid), image)
+    depth, wanted, *centers = _depths(rng)
+    similarity = center_similarity(*centers)
+    assert torch.autograd.gradcheck(
+        lambda x: depth_loss(x, wanted, similarity=similarity), depth.requires_grad_()
+    )
+
+
+def test_references_receive_no_gradient():
+    predicted, target = (torch.randn(1, 3, 3, 4, 4, requires_grad=True) for _ in range(2))
+    depth, wanted = (torch.rand(1, 3, 4, 4, requires_grad=True) for _ in range(2))
+    found, centers = (torch.randn(1, 4, 3, requires_grad=True) for _ in range(2))
+    total = (
+        flow_matching_loss(predicted, target, context=1)
+        + rgb_loss(predicted, target)
+        + high_gradient_loss(predicted, target)
+        + depth_loss(depth, wanted, similarity=center_similarity(found, centers))
+    )
+    total.sum().backward()
+    assert all(x.grad is not None for x in (predicted, depth))
+    assert all(x.grad is None for x in (target, wanted, found, centers))
+
+
+def test_view_errors_tell_the_views_apart():
+    predicted = torch.zeros(1, 2, 1, 2, 2)
+    target = torch.tensor([1.0, 2.0]).reshape(1, 2, 1, 1, 1).expand(1, 2, 1, 2, 2)
+    assert view_errors(predicted, target).tolist() == [[1.0, 4.0]]
+
+
+def _pictures(seed: int, shape: tuple[int, ...]) -> np.ndarray:
+    return np.random.default_rng(seed).random(shape)
+
+
+@pytest.mark.parametrize("size", [(9, 7), (1, 5), (5, 1), (1, 1), (2, 2)])
+def test_whole_pictures_have_scipys_sobel_gradient(size):
+    gray = _pictures(0, (2, 3, *size))
+    expected = np.zeros_like(gray)
+    # scipy's filter differentiates along one axis and smooths along all others: one picture a call
+    for index in np.ndindex(2, 3):
+        one = gray[index]
+        expected[index] = np.hypot(
+            ndimage.sobel(one, axis=1, mode="nearest"), ndimage.sobel(one, axis=0, mode="nearest")
+        )
+    found = sobel_magnitude(torch.tensor(gray), torch.ones(gray.shape, dtype=torch.bool))
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
+@settings(deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(0, 1))
+def test_masked_pictures_have_the_gradient_of_the_formula(seed, share):
+    rng = np.random.default_rng(seed)
+    gray, valid = rng.random((1, 2, 6, 5)), rng.random((1, 2, 6, 5)) < share
+    found = sobel_magnitude(torch.tensor(np.where(valid, gray, np.nan)), torch.tensor(valid))
+    for v in range(2):
+        np.testing.assert_allclose(found[0, v], sobel(gray[0, v], valid[0, v]), atol=1e-12)
+
+
+def test_the_edge_of_a_mask_is_no_edge_of_the_picture():
+    rng = np.random.default_rng(0)
+    valid = torch.tensor(rng.random((1, 1, 20, 20)) < 0.5)
+    flat = torch.full((1, 1, 20, 20), 0.7)
+    assert not bool(sobel_magnitude(flat, valid).any())
+
+
+def test_grayscale_is_luma():
+    image = torch.zeros(3, 3, 1, 1)
+    image[range(3), range(3)] = 1
+    torch.testing.assert_close(grayscale(image).flatten(), torch.tensor([0.299, 0.587, 0.114]))
+    assert grayscale(image.to(torch.bfloat16)).dtype == torch.float32
+
+
+@settings(deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([(1, 1, 6, 7), (2, 3, 4, 4), (2, 1, 1, 1)]))
+def test_weights_are_those_of_the_formula_sample_by_sample(seed, shape):
+    rng = np.random.default_rng(seed)
+    batch, views, height, width = shape
+    image = rng.random((batch, views, 3, height, width))
+    valid = rng.random(shape) < rng.choice([0.0, 0.3, 1.0])
+    image = np.where(valid[:, :, None], image, np.nan)
+    found = gradient_weights(torch.tensor(image), torch.tensor(valid))
+    for b in range(batch):
+        np.testing.assert_allclose(found[b], weights(image[b], valid[b]), atol=1e-9)
+    assert float(found.min()) >= 0 and float(found.max()) <= 1
+
+
+def test_one_strong_edge_takes_the_weight_and_flat_ground_none():
+    image = torch.full((1, 1, 3, 50, 50), 0.2)
+    image[..., 25:] = 0.9
+    found = gradient_weights(image, torch.ones(1, 1, 50, 50, dtype=torch.bool))[0, 0]
+    assert bool((found[:, 24:26] > 0.99999).all())
+    assert not bool(found[:, :24].any()) and not bool(found[:, 26:].any())
+
+
+def test_weights_do_not_depend_on_the_pictures_brightness_or_contrast():
+    image = torch.tensor(_pictures(0, (1, 2, 3, 16, 16)))
+    valid = torch.ones(1, 2, 16, 16, dtype=torch.bool)
+    torch.testing.assert_close(
+        gradient_weights(image, valid),
+        gradient_weights(0.5 * image + 0.3, valid),
+        atol=1e-5,
+        rtol=0,
+    )
+
+
+def test_no_gradient_passes():
+    image = torch.rand(1, 1, 3, 8, 8, requires_grad=True)
+    assert not gradient_weights(image, torch.ones(1, 1, 8, 8, dtype=torch.bool)).requires_grad
+
+
+def _rotation(rng: np.random.Generator) -> np.ndarray:
+    q, r = np.linalg.qr(rng.normal(size=(3, 3)))
+    q = q * np.sign(np.diag(r))
+    return q * np.linalg.det(q)
+
+
+def _fit(predicted, reference):
+    return center_similarity(
+        torch.as_tensor(np.asarray(predicted))[None], torch.as_tensor(np.asarray(reference))[None]
+    )
+
+
+@settings(deadline=None)
+@given(SEEDS, st.integers(2, 8), st.floats(0.01, 100))
+def test_a_similarity_is_recovered_from_two_centres_on(seed, count, scale):
+    rng = np.random.default_rng(seed)
+    points, q, b = rng.normal(size=(count, 3)), _rotation(rng), rng.normal(size=3)
+    fit = _fit(points, scale * points @ q.T + b)
+    assert fit.status == ("aligned",)
+    assert float(fit.scale) == pytest.approx(scale, rel=1e-9)
+    assert float(fit.correlation) == pytest.approx(1)
+    if count >= 4:
+        np.testing.assert_allclose(fit.rotation[0], q, atol=1e-6)
+        np.testing.assert_allclose(fit.translation[0], b, atol=1e-6 * (1 + scale))
+    assert float(torch.linalg.det(fit.rotation)) == pytest.approx(1)
+
+
+@settings(deadline=None)
+@given(SEEDS, st.integers(3, 8), st.floats(0, 2))
+def test_noisy_centres_give_the_scale_of_the_numpy_fit(seed, count, noise):
+    rng = np.random.default_rng(seed)
+    predicted = rng.normal(size=(count, 3))
+    reference = 3 * predicted @ _rotation(rng).T + noise * rng.normal(size=(count, 3)) + 5
+    expected = fit_similarity(predicted, reference)
+    fit = _fit(predicted, reference)
+    if expected.ok:
+        assert float(fit.scale) == pytest.approx(expected.scale, rel=1e-9)
+        np.testing.assert_allclose(fit.rotation[0], expected.rotation, atol=1e-6)
+        np.testing.assert_allclose(fit.translation[0], expected.translation, atol=1e-6)
+        spread = reference - reference.mean(axis=0)
+        left = (expected.residuals**2).sum() / (spread**2).sum()
+        assert 1 - float(fit.correlation) ** 2 == pytest.approx(left, abs=1e-9)
+
+
+@settings(deadline=None)
+@given(SEEDS)
+def test_mirrored_centres_are_not_matched_by_a_reflection(seed):
+    rng = np.random.default_rng(seed)
+    predicted = rng.normal(size=(6, 3))
+    reference = 2 * predicted * np.array([-1.0, 1, 1])
+    fit = _fit(predicted, reference)
+    assert float(torch.linalg.det(fit.rotation)) == pytest.approx(1)
+    singular = np.linalg.svd((predicted - predicted.mean(0)).T @ (predicted - predicted.mean(0)))[1]
+    expected = 2 * (singular[0] + singular[1] - singular[2]) / singular.sum()
+    assert float(fit.scale) == pytest.approx(expected, rel=1e-9)
+    assert 0 < float(fit.scale) < 2
+
+
+def test_centres_on_a_line_give_a_scale_where_the_numpy_fit_refuses():
+    line = np.linspace(0, 1, 5)[:, None] * np.array([[1.0, 2.0, -1.0]]) + 3
+    reference = 4 * line @ _rotation(np.random.default_rng(0)).T
+    assert not fit_similarity(line, reference).ok
+    fit = _fit(line, reference)
+    assert fit.status == ("aligned",) and float(fit.scale) == pytest.approx(4)
+
+
+def test_samples_are_fitted_one_by_one_from_their_finite_centres():
+    rng = np.random.default_rng(1)
+    predicted = rng.normal(size=(3, 6, 3))
+    reference = np.array([2.0, 3.0, 5.0])[:, None, None] * predicted + rng.normal(size=(3, 1, 3))
+    reference[0, 4:], reference[1, 0], predicted[2, 3] = np.nan, np.nan, np.inf
+    fit = center_similarity(torch.tensor(predicted), torch.tensor(reference))
+    np.testing.assert_allclose(fit.scale, [2, 3, 5])
+    assert fit.used.tolist() == [4, 5, 5]
+
+
+@pytest.mark.parametrize(
+    ("predicted", "reference", "defect"),
+    [
+        (np.eye(3), np.where(np.arange(3)[:, None] > 0, np.nan, np.eye(3)), 1),
+        (np.full((3, 3), np.nan), np.eye(3), 1),
+        (np.full((3, 3), 0.1), np.eye(3), 2),
+        (np.zeros((3, 3)), np.eye(3), 2),
+        (np.eye(3), np.full((3, 3), 1e6 / 3), 3),
+        (
+            np.array([[1.0, 0, 0], [-1, 0, 0], [0, 0, 0], [0, 0, 0]]),
+            np.array([[0.0, 0, 0], [0, 0, 0], [0, 1, 0], [0, -1, 0]]),
+            4,
+        ),
+    ],
+)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
+def test_what_leaves_the_scale_open_is_said(predicted, reference, defect, dtype):
+    fit = center_similarity(
+        torch.tensor(predicted, dtype=dtype)[None], torch.tensor(reference, dtype=dtype)[None]
+    )
+    assert fit.status == (DEFECTS[defect],)
+    assert not bool(fit.ok) and bool(fit.scale.isnan()) and bool(fit.rotation.isnan().all())
+
+
+def test_small_baselines_far_out_are_geometry_as_long_as_the_dtype_resolves_them():
+    rng = np.random.default_rng(0)
+    predicted = rng.normal(size=(4, 3)) * 1e-3 + 100
+    fine = _fit(predicted, 2 * predicted)
+    assert float(fine.scale) == pytest.approx(2, rel=1e-6)
+    coarse = _fit(predicted.astype(np.float32) + np.float32(1e5), predicted)
+    assert coarse.status == ("coincident predicted centres",)
+
+
+def test_half_precision():
+    points = torch.randn(1, 5, 3, generator=torch.Generator().manual_seed(0))
+    fit = center_similarity(points.to(torch.bfloat16), 3 * points)
+    assert fit.scale.dtype == torch.float32 and float(fit.scale) == pytest.approx(3, rel=0.01)

@@ -5,23 +5,25 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
+import tiny_wan as tiny
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-pytest.importorskip("diffusers", reason="the extra wan is not installed")
-
-import tiny_wan as tiny
-
 from gvtools.completers.geoverse.flow import view_seed
 from gvtools.completers.geoverse.video_prior import (
+    ROOM,
     VideoPrior,
     VideoPriorConfig,
+    _leaves,
     packed_mask,
     resized,
     view_layout,
 )
 from gvtools.errors import CheckpointError, OptionError
+
+pytest.importorskip("diffusers", reason="the extra wan is not installed")
+
 
 LAYOUTS = ("per_view", "video9", "repeat4")
 
@@ -401,3 +403,67 @@ def test_a_copied_model_shares_its_prior(network):
 
     prior = tiny.prior(network)
     assert copy.deepcopy([prior])[0] is prior
+
+
+pytest.importorskip("diffusers", reason="the extra wan is not installed")
+
+
+def test_lent_weights_come_home_without_being_copied_back(
+    network: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    prior = tiny.prior(network)
+    views = (*tiny.views(3), 1)
+    wanted = prior.features(*views)
+    networks = prior.networks
+    tensors = [
+        tensor
+        for part in (networks.transformer, networks.vae)
+        for tensor in (*part.parameters(), *part.buffers())
+    ]
+    home = [tensor.data_ptr() for tensor in tensors]
+    moved: list[torch.device] = []
+    to = Tensor.to
+
+    def copied(tensor: Tensor, *args: Any, **kwargs: Any) -> Tensor:
+        if args == (torch.device("cpu", 0),):
+            # Another place of the same memory stands for a device.
+            moved.append(args[0])
+            return tensor.clone()
+        return to(tensor, *args, **kwargs)
+
+    monkeypatch.setattr(Tensor, "to", copied)
+    with networks.lent(torch.device("cpu", 0)):
+        away = [tensor.data_ptr() for tensor in tensors]
+        assert not {*away} & {*home}
+    assert [tensor.data_ptr() for tensor in tensors] == home
+    prior._guest = torch.device("cpu", 0)
+    moved.clear()
+    found = prior.features(*views)
+    assert len(moved) >= len(tensors)
+    assert [tensor.data_ptr() for tensor in tensors] == home
+    for one, other in zip(found.tensors, wanted.tensors, strict=True):
+        assert torch.equal(one, other)
+    with pytest.raises(ZeroDivisionError), networks.lent(torch.device("cpu", 0)):
+        _ = 1 / 0
+    assert [tensor.data_ptr() for tensor in tensors] == home
+
+
+@pytest.mark.parametrize(
+    ("device", "offload", "free", "leaves"),
+    [
+        ("cpu", "always", 0, False),
+        ("cuda", "never", 0, False),
+        ("cuda", "always", 1e12, True),
+        ("cuda", "auto", 1e12, False),
+        ("cuda", "auto", ROOM + 999, True),
+        ("cuda", "auto", ROOM + 1000, False),
+    ],
+)
+def test_weights_leave_where_a_pass_would_lack_room(
+    tmp_path: Any, monkeypatch: pytest.MonkeyPatch, device: str, offload: str, *, free: float,
+    leaves: bool,
+) -> None:  # fmt: skip
+    (tmp_path / "vae").mkdir()
+    (tmp_path / "vae" / "x.safetensors").write_bytes(bytes(1000))
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda place: (free, 1e12))
+    assert _leaves(tmp_path, device, offload) is leaves

@@ -1,5 +1,3 @@
-"""Views with small holes are left to a cheap completer; the others are completed as before."""
-
 from __future__ import annotations
 
 import numpy as np
