@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
 from gvtools.guidance import Guidance
-from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory
-from gvtools.memory.tiled_memory import TiledMemory
+from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory, TiledMemory
 from pipelines.bench.procedural_cloud import inside_camera, photograph
 
 ROOM = np.array([4.0, 3.0, 4.0])
@@ -114,7 +113,7 @@ def measure(observations: int, budget: str | None, scratch: Path) -> dict[str, A
         "mean": float(guidance.rgb.mean()),
         "coverage": guidance.coverage,
         "stored_MB": memory.stored_bytes / 1e6,
-        "tiles": 0 if memory.tiles is None else sum(1 for _ in memory.tiles),
+        "tiles": sum(1 for _ in memory.tiles),
         "peak_MB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3,
     }
 

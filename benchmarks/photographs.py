@@ -26,7 +26,7 @@ from gvtools.depth.source import DepthMap
 from gvtools.depth.stereo.options import StereoOptions
 from gvtools.evaluation.images import psnr
 from gvtools.memory.spatial_memory import SpatialMemory
-from gvtools.memory.store.points import PointSet
+from gvtools.memory.store.views import PointSet
 from gvtools.scenes.project import open_project
 from gvtools.scenes.scene import Scene
 from gvtools.scenes.selection import select

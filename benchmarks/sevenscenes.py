@@ -28,7 +28,7 @@ from gvtools.evaluation.images import psnr
 from gvtools.files import write_json
 from gvtools.memory.back_projection import back_project
 from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory
-from gvtools.memory.store.points import PointSet
+from gvtools.memory.store.views import PointSet
 from gvtools.scenes.project import open_project
 from gvtools.scenes.selection import select
 from pipelines.bench import fuse as bench_fuse

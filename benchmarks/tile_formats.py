@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.memory.tiles.array_file import ArrayFile, write_arrays
+from gvtools.memory.store.array_file import ArrayFile, write_arrays
 
 ROWS, CHUNK, RUN = 1_000_000, 65_536, 100
 SHOWN = ("positions", "colors", "confidence", "spacing")

@@ -34,8 +34,7 @@ if TYPE_CHECKING:
     from gvtools.evaluation.trajectories import relative_errors as rpe
     from gvtools.guidance import Guidance
     from gvtools.memory.projection import project
-    from gvtools.memory.spatial_memory import SpatialMemory
-    from gvtools.memory.tiled_memory import TiledMemory
+    from gvtools.memory.spatial_memory import SpatialMemory, TiledMemory
     from gvtools.runs.run import load_run
     from gvtools.scenes.project import open_project
     from gvtools.trajectory_files import read_poses
@@ -50,7 +49,7 @@ _SOURCES = {
     "Guidance": "gvtools.guidance:Guidance",
     "GvError": "gvtools.errors:GvError",
     "SpatialMemory": "gvtools.memory.spatial_memory:SpatialMemory",
-    "TiledMemory": "gvtools.memory.tiled_memory:TiledMemory",
+    "TiledMemory": "gvtools.memory.spatial_memory:TiledMemory",
     "ate": "gvtools.evaluation.trajectories:absolute_errors",
     "complete": "gvtools.completers.base:complete",
     "evaluate": "pipelines.api:evaluate",

@@ -14,7 +14,7 @@ from gvtools.cameras import Cameras, check_usable
 from gvtools.errors import ShapeError
 from gvtools.kernels import compiled
 from gvtools.memory.store.local_frame import LocalFrame
-from gvtools.memory.store.points import PointSet
+from gvtools.memory.store.views import PointSet
 from gvtools.memory.store.voxel_levels import VoxelLevels, level_of
 from gvtools.settings import Settings
 

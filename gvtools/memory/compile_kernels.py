@@ -8,7 +8,7 @@ from gvtools.cameras import Cameras
 from gvtools.kernels import KernelSet
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.splat.api import SplatOptions
-from gvtools.memory.splat.cpu_kernels import resolve
+from gvtools.memory.splat.cpu import resolve
 
 
 def compile_kernels(backend: str = "cpu") -> None:

@@ -1,8 +1,4 @@
-"""What spares the splatting its work, and rules on what may stand in front.
-
-Which segments are in view, which of them can still write a pixel, and which hold something nearer
-than what the first tier saw.
-"""
+"""Frustum and occlusion culling of segments."""
 
 # mypy: no-check-untyped-defs
 
@@ -52,19 +48,9 @@ def cull_segments(
 ):  # fmt: skip
     """Image rectangle and depth range of each segment's box, for a part of ``rows``.
 
-    Args:
-        begin: of the part, see ``in_threads``.
-        end: likewise.
-        boxes: (R, 7) float32, see Segments.
-        rows: (n,) int64, the boxes that are asked.
-        cam_from_local: (4, 4) float64.
-        K: (3, 3) float64.
-        width: pixels.
-        height: pixels.
-        reach: footprints extend this many spacings from their centre.
-        rect: out (R, 4) int32: first and last column, first and last row; empty (0, -1, 0, -1)
-            when the segment is out of view.
-        z_range: out (R, 2) float32, nearest and farthest depth.
+    ``boxes`` are (R, 7), see Segments; footprints extend ``reach`` spacings from their centre. Out:
+    ``rect`` (R, 4) int32, first and last column, first and last row, empty (0, -1, 0, -1) when the
+    segment is out of view; ``z_range`` (R, 2) float32, nearest and farthest depth.
     """
     focal = max(K[0, 0], K[1, 1])
     for k in range(begin, end):
@@ -133,43 +119,34 @@ def touching(rect, writable, segments):
     return out[:n]
 
 
-@compiled(inline="always")
-def _farthest_in(rect, farthest):
-    """The farthest depth of the tiles that a rectangle touches."""
-    bound = np.float32(0)
-    for row in range(rect[2] // TILE, rect[3] // TILE + 1):
-        for col in range(rect[0] // TILE, rect[1] // TILE + 1):
-            bound = max(bound, farthest[row, col])
-    return bound
-
-
 @compiled()
 def may_be_in_front(begin, end, segments, rect, z_range, farthest, margin, out):
-    """Mark in ``out`` (n,) the segments that ``in_front`` would look into."""
+    """Mark in ``out`` (n,) the segments not wholly behind the ``farthest`` depth of their tiles."""
     share = np.float32(1 - margin)
     for i in range(begin, end):
         r = segments[i]
-        out[i] = not z_range[r, 0] >= _farthest_in(rect[r], farthest) * share
+        bound = np.float32(0)
+        for row in range(rect[r, 2] // TILE, rect[r, 3] // TILE + 1):
+            for col in range(rect[r, 0] // TILE, rect[r, 1] // TILE + 1):
+                bound = max(bound, farthest[row, col])
+        out[i] = not z_range[r, 0] >= bound * share
 
 
 @compiled(fastmath=FAST)
 def in_front(
-    begin, end, segments, segment_start, segment_length, rect, z_range, positions, M, K, depth,
-    farthest, margin, grid_K, grid_cam, grids, tolerance, hit,
+    begin, end, segments, segment_start, segment_length, positions, M, K, depth, margin, grid_K,
+    grid_cam, grids, tolerance, hit,
 ):  # fmt: skip
     """Mark in ``hit`` (n,) those of ``segments`` (n,) with a sampled point in front of ``depth``.
 
-    In front is what is nearer by more than ``margin`` of the depth.
-    A segment wholly behind the farthest depth of its rectangle's tiles (``farthest``) is not
-    sampled; of the others, every SAMPLE-th point is looked up in the image. A point in space that
-    one of the T views with free-space ``grids`` (T, h, w) saw through does not count.
+    In front is what is nearer by more than ``margin`` of the depth. Every SAMPLE-th point is looked
+    up in the image. A point in space that one of the T views with free-space ``grids`` (T, h, w)
+    saw through does not count.
     """
     height, width = depth.shape
     share = np.float32(1 - margin)
     for i in range(begin, end):
         r = segments[i]
-        if z_range[r, 0] >= _farthest_in(rect[r], farthest) * share:
-            continue
         first = segment_start[r]
         for p in range(first, first + segment_length[r], SAMPLE):
             x, y, z = positions[p, 0], positions[p, 1], positions[p, 2]

@@ -1,11 +1,10 @@
-"""Fusion of one view's points into a store, and the report of what became of them."""
+"""Fusion of one view's points into a memory, and its report."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,17 +13,15 @@ from gvtools.errors import OptionError, ShapeError
 from gvtools.memory import fusion_kernels as kernels
 from gvtools.memory.occlusion import in_free_space
 from gvtools.memory.store.columns import LAST_ROUND
-from gvtools.memory.store.points import PointSet
+from gvtools.memory.store.observations import Observations
 from gvtools.memory.store.store import Store
-from gvtools.memory.store.views import SourceView
+from gvtools.memory.store.views import PointSet, SourceView
 from gvtools.memory.store.voxel_index import EMPTY_KEY, group_by_block, voxel_keys
 
 
 @dataclass(frozen=True)
 class FuseReport:
-    """What became of the points of one ``fuse``.
-
-    ``added``, ``merged`` and ``rejected`` add up to ``points``.
+    """What became of the points of one ``fuse``: added, merged or rejected.
 
     Attributes:
         points: points that arrived.
@@ -61,44 +58,20 @@ class FuseReport:
         return FuseReport(**numbers, dropped=dict(dropped))
 
 
-@dataclass(frozen=True, eq=False)
-class Fused:
-    """What became of points in one store.
-
-    Attributes:
-        report: see FuseReport.
-        first_point: (S,) int64, of each new segment's block the first of the points.
-        first_changed: the first segment of before whose box may have grown.
-    """
+class _Fused(NamedTuple):
+    """What became of points in one tile."""
 
     report: FuseReport
+    # Of each new segment's block the first of the points.
     first_point: NDArray[np.int64]
+    # The first segment of before whose box may have grown.
     first_changed: int
 
 
-# Points as columns (positions, colours, confidence, spacing), and the row of their view.
-Take = Callable[[list[NDArray[Any]], int], FuseReport]
-
-
 def fuse(
-    store: Store,
-    points: PointSet,
-    *,
-    round: int,
-    generated: bool = False,
-    scanned: bool = False,
-    take: Take | None = None,
+    store: Store, points: PointSet, *, round: int, generated: bool = False, scanned: bool = False
 ) -> FuseReport:
-    """Take one view's points in; see SpatialMemory.fuse.
-
-    Args:
-        store: that checks the points and knows the views.
-        points: see SpatialMemory.fuse.
-        round: likewise.
-        generated: likewise.
-        scanned: likewise.
-        take: gets what is left of the points; None fuses it into the store itself.
-    """
+    """Take one view's points in; see SpatialMemory.fuse."""
     _check(store, points, round)
     arrived = len(points)
     keep = np.isfinite(points.positions).all(axis=1)
@@ -115,11 +88,8 @@ def fuse(
         free = int((hit & keep).sum())
         keep &= ~hit
     columns: list[NDArray[Any]] = [
-        points.positions,
-        points.colors,
-        points.confidence,
-        points.spacing,
-    ]
+        points.positions, points.colors, points.confidence, points.spacing,
+    ]  # fmt: skip
     if not keep.all():
         columns = [column[keep] for column in columns]
     grid = points.free_depth if points.free_depth is not None else np.zeros((0, 0), np.float32)
@@ -128,13 +98,13 @@ def fuse(
     view = store.views.row_for(
         SourceView(points.camera, int(round), bool(generated), grid, bool(scanned))
     )
-    report = take(columns, view) if take else fuse_columns(store, columns, view).report
-    return replace(
-        report,
-        points=arrived,
-        rejected_free=free,
-        out_of_reach=report.out_of_reach + unusable,
-    )
+    if store.in_ram:
+        report = _fuse(store, store.whole, columns, view=view).report
+    else:
+        report = _fuse_tiles(store, columns, view)
+    store.page_if_large()
+    unusable += report.out_of_reach
+    return replace(report, points=arrived, rejected_free=free, out_of_reach=unusable)
 
 
 def _check(store: Store, points: PointSet, round: int) -> None:
@@ -151,14 +121,51 @@ def _check(store: Store, points: PointSet, round: int) -> None:
         raise OptionError(f"round {round}; expected 0 to {LAST_ROUND}")
 
 
-def fuse_columns(store: Store, columns: list[NDArray[Any]], view: int) -> Fused:
-    """Fuse points that were checked into a store.
+def _fuse_tiles(store: Store, columns: list[NDArray[Any]], view: int) -> FuseReport:
+    """Fuse points tile by tile; new segments enter the table in the order without tiles."""
+    tiles, table = store.tiles, store.segments
+    columns = [np.ascontiguousarray(column) for column in columns]
+    total, new = FuseReport(), []
+    with tiles.lock:
+        touched = tiles.of_points(columns[0], columns[3], store.levels)
+        for number, points in touched:
+            part = tiles.load(number)
+            before = part.segments.count
+            fused = _fuse(store, part, [c.take(points, axis=0) for c in columns], view=view)
+            total += fused.report
+            # New points may widen the boxes of older segments.
+            grown = slice(fused.first_changed, before)
+            rows, boxes = tiles[number].segments[grown], part.segments.box[grown]
+            differs = (table.box[rows] != boxes).any(axis=1)
+            table.widen(rows[differs], boxes[differs])
+            of_part = part.segments.rows()
+            start, length, box = (of_part[k][before:].copy() for k in ("start", "length", "box"))
+            count = len(start)
+            new.append((
+                points[fused.first_point], np.full(count, number, np.int32),
+                np.arange(before, before + count, dtype=np.int32), start,
+                part.columns.level[start], length, box,
+            ))  # fmt: skip
+            tiles.changed(number)
+        if new:
+            order = np.argsort(np.concatenate([part[0] for part in new]), kind="stable")
+            row = np.empty(len(order), np.int32)
+            row[order] = np.arange(table.count, table.count + len(order))
+            _, tile, local, first, level, length, box = (
+                np.concatenate(column)[order] for column in zip(*new, strict=True)
+            )
+            ends = np.cumsum([len(part[0]) for part in new])
+            for (at, _), rows in zip(touched, np.split(row, ends[:-1]), strict=True):
+                tiles[at].segments = np.concatenate([tiles[at].segments, rows])
+            table.follow(length, np.full(len(order), view, np.int32), box)
+            tiles.places.append(tile, local, first, level=level)
+        tiles.divide_large([number for number, _ in touched])
+        tiles.shrink()
+    return total
 
-    Args:
-        store: knows the views.
-        columns: positions, colours, confidence and spacing of the points.
-        view: row of the view that they come from.
-    """
+
+def _fuse(store: Store, part: Observations, columns: list[NDArray[Any]], *, view: int) -> _Fused:
+    """Fuse points (positions, colours, confidence, spacing) that were checked into one tile."""
     positions, colors, confidence, spacing = (np.ascontiguousarray(c) for c in columns)
     count = len(positions)
     keys = np.empty(count, np.int64)
@@ -168,17 +175,17 @@ def fuse_columns(store: Store, columns: list[NDArray[Any]], view: int) -> Fused:
     if outside:
         near = keys != EMPTY_KEY
         inside = [column[near] for column in (positions, colors, confidence, spacing)]
-        fused = fuse_columns(store, inside, view)
+        fused = _fuse(store, part, inside, view=view)
         report = replace(fused.report, out_of_reach=int(outside))
-        return replace(fused, report=report, first_point=np.flatnonzero(near)[fused.first_point])
+        return _Fused(report, np.flatnonzero(near)[fused.first_point], fused.first_changed)
     if not count:
-        return Fused(FuseReport(), np.empty(0, np.int64), store.segments.count)
-    index, views, segments = store.index, store.views, store.segments
+        return _Fused(FuseReport(), np.empty(0, np.int64), part.segments.count)
+    index, views, segments, options = part.index, store.views, part.segments, store.options
     blocks = index.block_numbers(keys)
     touched, starts, order = group_by_block(blocks, index.blocks)
     index.reserve_voxels(count, touched)
     index.top = max(index.top, int(levels.max()))
-    store.columns.reserve(count)
+    part.columns.reserve(count)
     out = kernels.FusionOutput(
         group=np.empty(len(touched), np.int32),
         start=np.empty(len(touched), np.int64),
@@ -198,8 +205,16 @@ def fuse_columns(store: Store, columns: list[NDArray[Any]], view: int) -> Fused:
         views.scanned,
     )  # fmt: skip
     old = kernels.SegmentTable(segments.start[: segments.count], segments.box[: segments.count])
-    store.columns.count, added, agreed = kernels.fuse_blocks(
-        batch, index.arrays, store.columns.arrays, len(store), source, _rules(store), old, out
+    rules = kernels.FusionRules(
+        cosine_same=float(np.cos(np.radians(options.merge_angle_deg))),
+        min_detail_ratio=options.min_detail_ratio,
+        capacity=options.observations_per_voxel,
+        weight_cap=options.weight_cap,
+        inverse_edge=1.0 / store.voxel,
+        top=index.top,
+    )
+    part.columns.count, added, agreed = kernels.fuse_blocks(
+        batch, index.arrays, part.columns.arrays, len(part), source, rules, old, out
     )
     index.voxels += int(out.report[kernels.NEW_VOXELS])
     segments.append(
@@ -208,7 +223,7 @@ def fuse_columns(store: Store, columns: list[NDArray[Any]], view: int) -> Fused:
     )  # fmt: skip
     if agreed:
         rows, weights = out.agreed_row[:agreed].copy(), out.agreed_weight[:agreed].copy()
-        store.agree(rows, weights, round=round_)
+        part.agree(rows, weights, round=round_)
     report = FuseReport(
         added=int(out.report[kernels.ADDED]),
         merged=int(out.report[kernels.MERGED_POINTS]),
@@ -217,16 +232,4 @@ def fuse_columns(store: Store, columns: list[NDArray[Any]], view: int) -> Fused:
         agreed=int(out.report[kernels.AGREED]),
     )
     changed = int(out.report[kernels.FIRST_SEGMENT])
-    return Fused(report, order[starts[out.group[:added]]], changed)
-
-
-def _rules(store: Store) -> kernels.FusionRules:
-    options = store.options
-    return kernels.FusionRules(
-        cosine_same=float(np.cos(np.radians(options.merge_angle_deg))),
-        min_detail_ratio=options.min_detail_ratio,
-        capacity=options.observations_per_voxel,
-        weight_cap=options.weight_cap,
-        inverse_edge=1.0 / store.voxel,
-        top=store.index.top,
-    )
+    return _Fused(report, order[starts[out.group[:added]]], changed)

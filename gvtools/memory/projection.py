@@ -22,10 +22,10 @@ from gvtools.errors import OptionError, ShapeError
 from gvtools.guidance import Guidance, concatenate
 from gvtools.kernels import in_threads
 from gvtools.memory import culling
-from gvtools.memory.occluders import segments_in_front
-from gvtools.memory.occlusion import in_free_space
-from gvtools.memory.splat.api import ONE_PIXEL, FrameBuffers, SplatOptions, Splatter
+from gvtools.memory.occlusion import in_free_space, stacked
+from gvtools.memory.splat.api import ONE_PIXEL, FrameBuffers, SplatOptions, SplatRequest, Splatter
 from gvtools.memory.store.store import Store
+from gvtools.memory.store.views import FreeGrid
 
 # Points nearer than this share of the typical depth, and than a voxel, are behind or inside the
 # camera.
@@ -77,7 +77,7 @@ def project(
     check_usable(cameras)
     options = options or SplatOptions()
     if options.backend in ONE_PIXEL:
-        if store.tiles is not None:
+        if not store.in_ram:
             raise OptionError(
                 f"splat.backend {options.backend}: does not project a memory in tiles; choose cpu "
                 "or torch, or a greater memory.budget"
@@ -149,10 +149,6 @@ def observed_of(store: Store, camera: Cameras, *, options: SplatOptions) -> Obse
 
 
 def _splatter(store: Store, options: SplatOptions) -> Splatter:
-    if store.tiles is not None:
-        from gvtools.memory.splat.paged import PagedSplatter
-
-        return PagedSplatter(store, options)
     if options.backend == "torch":
         from gvtools.memory.splat.torch_splatter import TorchSplatter
 
@@ -335,9 +331,7 @@ class _Projection:
         beyond = np.maximum(self.distance - self.distance[members].min(), 0)
         weight = np.exp(-self.options.view_weight * beyond).astype(np.float32)
         writable = open_ if few else None
-        self.splatter.splat(
-            self.target, chosen, limit, weight=weight, writable=writable, blend=True
-        )
+        self.splatter.splat(SplatRequest(self.target, chosen, limit, weight, writable))
         views, target = self.store.views, self.target
         before = np.where(target.valid, target.depth, np.float32(0))
         self.splatter.resolve(target, open_, generated=bool(views.generated[members[0]]))
@@ -357,18 +351,12 @@ class _Projection:
             return
         grids = store.observed_grids(np.flatnonzero(self.tier == 0))
         tolerance = store.options.free_space_tolerance
-        hit = segments_in_front(
-            store, later, target, z_range=self.z_range, grids=grids,
-            margin=2 * self.options.depth_band,
-        )  # fmt: skip
-        if not hit.any():
+        chosen = self._in_front(later, grids)
+        if not len(chosen):
             return
-        chosen = later[hit]
         limit = target.depth * np.float32(1 - 2 * self.options.depth_band)
         none = np.zeros(len(store.views), np.float32)
-        zbuffer = self.splatter.splat(
-            target, chosen, limit, weight=none, writable=None, blend=False
-        )
+        zbuffer = self.splatter.splat(SplatRequest(target, chosen, limit, none, blend=False))
         front = zbuffer < limit
         front[front] = ~in_free_space(self._lifted(zbuffer, front), grids, tolerance=tolerance)
         # Slivers along silhouettes are what an error of a pixel in a pose looks like.
@@ -378,6 +366,28 @@ class _Projection:
             limit = np.where(front, limit, np.float32(0))
             scanned = bool(store.views.scanned[view[0]])
             self._write(chosen, limit, front, members=self.ranked, few=True, scanned=scanned)
+
+    def _in_front(self, later: NDArray[np.int64], grids: list[FreeGrid]) -> NDArray[np.int64]:
+        """Those of some segments that hold something clearly nearer than the depth written so far.
+
+        What the views with free-space ``grids`` saw to be free does not count.
+        """
+        store, target, margin = self.store, self.target, 2 * self.options.depth_band
+        near = np.zeros(len(later), np.bool_)
+        in_threads(
+            culling.may_be_in_front, len(later), later, target.rect, self.z_range,
+            culling.tile_farthest(target.depth), margin, near,
+        )  # fmt: skip
+        later, free = later[near], stacked(grids)
+        hit = np.zeros(len(later), np.bool_)
+        for part in store.tiles.split(store.segments, later):
+            rows = store.tiles.gather(store.segments, later[part])
+            in_threads(
+                culling.in_front, len(rows.chosen), rows.chosen, rows.start, rows.length,
+                rows.columns.positions, target.cam_from_local, self.K, target.depth, margin, *free,
+                store.options.free_space_tolerance, hit[part],
+            )  # fmt: skip
+        return later[hit]
 
     def _lifted(self, depth: NDArray[np.float32], where: NDArray[np.bool_]) -> NDArray[np.float32]:
         """(N, 3) points of the pixels ``where`` (H, W), in the memory's frame."""

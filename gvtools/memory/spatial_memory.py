@@ -7,20 +7,25 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from gvtools.cameras import Cameras
-from gvtools.errors import DegenerateError, GvError, MemoryFileError, ShapeError
+from gvtools.errors import DegenerateError, GvError, MemoryFileError, OptionError, ShapeError
 from gvtools.memory import fusion
 from gvtools.memory.back_projection import BackProjectionOptions, back_project
 from gvtools.memory.fusion import FuseReport
 from gvtools.memory.occlusion import behind_free_space
+from gvtools.memory.store.columns import LAYOUT
 from gvtools.memory.store.local_frame import LocalFrame
-from gvtools.memory.store.points import PointSet
+from gvtools.memory.store.observations import rows_of
 from gvtools.memory.store.store import MemoryOptions, Store
+from gvtools.memory.store.thinned_copies import DOUBLINGS
+from gvtools.memory.store.tile import COLUMNS, of_views
+from gvtools.memory.store.tile_set import IN_RAM
+from gvtools.memory.store.views import PointSet
 from gvtools.memory.store.voxel_index import rounded_origin
 
-__all__ = ["FuseReport", "MemoryOptions", "SpatialMemory"]
+__all__ = ["FuseReport", "MemoryOptions", "SpatialMemory", "TiledMemory"]
 
 if TYPE_CHECKING:
     import open3d as o3d
@@ -32,6 +37,8 @@ if TYPE_CHECKING:
 NEIGHBOUR_SAMPLES = 20_000
 # How far float colours may leave 0 to 1.
 COLOR_SLACK = 0.01
+# RAM for an observation: columns, index, its share of segments and of the log of agreements.
+OBSERVATION_BYTES = 64
 
 
 class SpatialMemory(Store):
@@ -42,8 +49,8 @@ class SpatialMemory(Store):
     Space is divided into voxels, wider ones (``MemoryOptions.voxels_per_footprint``) where it was
     seen coarsely; a voxel keeps several observations, each of which remembers the view it came
     from. Observations are appended and, once their round is over, never changed but for the
-    confidence that later rounds add, so that a round can be forgotten exactly. See Store for the
-    arguments.
+    confidence that later rounds add, so that a round can be forgotten exactly. With a budget, see
+    TiledMemory, observations may lie in tiles on disk. See Store for the arguments.
     """
 
     def observe(
@@ -132,6 +139,7 @@ class SpatialMemory(Store):
         Raises:
             OptionError: ``round`` lies before the last one or out of range.
             ShapeError: the points are in another frame.
+            ProjectError: the disk is full; what was there before is intact.
         """
         return fusion.fuse(self, points, round=round, generated=generated, scanned=scanned)
 
@@ -142,17 +150,63 @@ class SpatialMemory(Store):
         return project(self, cameras, options=options)
 
     def overview(self, most: int | None = None) -> SpatialMemory:
-        """A memory in RAM for what works on a whole memory; this one is there already.
+        """A memory in RAM for what works on a whole memory; this one if it is there already.
+
+        If all observations fit, it equals this memory without tiles, to the bit except for the
+        order of agreements within a round. Otherwise it is made of thinned copies, in which each
+        view keeps one observation for each cube of 4, or of 16, voxels a side; confidence that
+        later rounds added to these stays if such a round is forgotten.
 
         Args:
-            most: observations of a memory in tiles, see TiledMemory.overview.
+            most: observations of a memory in tiles; None: as many as half of the budget holds.
         """
-        return self
+        if self.in_ram:
+            return self
+        if most is None:
+            most = int(IN_RAM * (self.tiles.budget or 0)) // OBSERVATION_BYTES
+        out = self.blank()
+        for view in self.views:
+            out.views.append(view)
+        with self.tiles.lock:
+            if len(self) <= most:
+                columns, length = self._all_columns(out), self.segments.rows()["length"]
+            else:
+                columns, length = self._thinned_columns(most)
+        columns |= of_views(columns["view"], self.views)
+        out.columns.replace(int(length.sum(dtype=np.int64)), columns.__getitem__)
+        rows = self.segments.rows()
+        out.segments.follow(length, rows["view"], rows["box"])
+        out.whole.rebuild_index()
+        return out
 
-    def close(self) -> None:
-        """Remove what a memory in tiles keeps on disk beside what was saved; nothing in RAM."""
-        if self.tiles is not None:
-            self.tiles.close()
+    def _all_columns(self, out: SpatialMemory) -> dict[str, NDArray[Any]]:
+        """Every column in the order of the table; agreements go to ``out``."""
+        columns: dict[str, NDArray[Any]] = {}
+        for name in COLUMNS:
+            kind, width = LAYOUT[name]
+            columns[name] = np.empty((len(self), width) if width > 1 else len(self), kind)
+        for tile in self.tiles.each():
+            length = self.segments.length[tile.segments].astype(np.int64)
+            at = rows_of(self.segments.start[tile.segments], length)
+            for name, column in columns.items():
+                column[at] = tile.column(name)
+            for round_, (rows, weights, before) in tile.agreements():
+                entry = (at[rows].astype(np.int32), weights, before)
+                out.agreements.setdefault(round_, []).append(entry)
+        return columns
+
+    def _thinned_columns(self, most: int) -> tuple[dict[str, NDArray[Any]], NDArray[np.int32]]:
+        """Columns of the finest thinned copies that fit, else of the coarsest; and (n,) lengths."""
+        tiles, n = self.tiles, self.segments.count
+        for doublings in DOUBLINGS:
+            if sum(int(tile.thinned(doublings).start[-1]) for tile in tiles.each()) <= most:
+                break
+        kind = np.full(n, doublings, np.uint8)
+        found = tiles.gather(self.segments, np.arange(n), doublings=kind)
+        columns: dict[str, NDArray[Any]] = found.columns._asdict()
+        columns["view"] = np.repeat(self.segments.view[:n], found.length)
+        columns["level"] = np.repeat(tiles.places.level[:n], found.length)
+        return columns, found.length
 
     def blank(self) -> SpatialMemory:
         """An empty memory in RAM of the same voxels, frame and options."""
@@ -160,7 +214,21 @@ class SpatialMemory(Store):
         return SpatialMemory(self.voxel, origin=frame.origin, axes=frame.axes, options=self.options)
 
     def save(self, path: Path | str) -> Path:
-        """Write the memory and return where it is; see gvtools.memory.io.npz."""
+        """Write the memory: a file, see gvtools.memory.io.npz, or a folder of tiles.
+
+        Tiles go to the folder of the same name with the suffix ``.tiles``.
+
+        Returns:
+            Where it is.
+
+        Raises:
+            ProjectError: the disk is full or the folder cannot be written; what was there before
+                is intact.
+        """
+        if not self.in_ram:
+            from gvtools.memory.io.tile_folder import save_tiles, tile_folder
+
+            return save_tiles(self, tile_folder(Path(path)))
         from gvtools.memory.io.npz import save_memory
 
         save_memory(self, Path(path))
@@ -168,7 +236,7 @@ class SpatialMemory(Store):
 
     @classmethod
     def load(cls, path: Path | str) -> SpatialMemory:
-        """Read a memory; see gvtools.memory.io.npz."""
+        """Read a memory's file; see gvtools.memory.io.npz."""
         from gvtools.memory.io.npz import load_memory
 
         return load_memory(Path(path), cls)
@@ -272,6 +340,75 @@ class SpatialMemory(Store):
                 spacing[rows], camera, self.frame, None, {},
             )  # fmt: skip
             self.fuse(points, round=number, generated=bool(made), scanned=bool(by_scan))
+
+
+class TiledMemory(SpatialMemory):
+    """A SpatialMemory with a budget of RAM: what outgrows it is kept in tiles on disk.
+
+    It begins like any memory, wholly in RAM; once it takes more than half of its budget, its
+    observations move to tiles, which cover cubes of space. Observations are the same to the bit,
+    whatever the budget. Pictures are, too, unless a block (16 voxels a side) of wide voxels is
+    larger than its tile; then colours are summed in another order there.
+
+    Args:
+        voxel: see Store, as the others.
+        origin: see Store.
+        axes: see Store.
+        options: with a ``budget``.
+        scratch: folder for the files of tiles that are not in RAM; None takes the system's for
+            temporary files. They are deleted with the memory; ``save`` keeps them.
+
+    >>> memory = TiledMemory(voxel=0.05, options=MemoryOptions(budget="400MB"))
+    >>> len(memory), memory.in_ram
+    (0, True)
+
+    Raises:
+        OptionError: no budget.
+    """
+
+    def __init__(
+        self,
+        voxel: float,
+        *,
+        origin: ArrayLike = (0.0, 0.0, 0.0),
+        axes: ArrayLike | None = None,
+        options: MemoryOptions | None = None,
+        scratch: Path | None = None,
+    ) -> None:
+        super().__init__(voxel, origin=origin, axes=axes, options=options)
+        _check_budget(self.options)
+        self.tiles.budget, self.tiles.scratch = self.options.budget, scratch
+
+    @classmethod
+    def load(
+        cls, path: Path | str, *, budget: int | None = None, scratch: Path | None = None
+    ) -> TiledMemory:
+        """Read a memory that was saved as a file or as tiles.
+
+        Args:
+            path: the path given to ``save``, or the folder of tiles.
+            budget: bytes; None takes the budget saved with tiles.
+            scratch: see TiledMemory; if given, the saved folder may be removed afterwards.
+
+        Raises:
+            MemoryFileError: absent, truncated, altered, of another kind or version.
+            OptionError: no budget for a memory that was saved as a file.
+        """
+        from gvtools.memory.io.npz import load_memory
+        from gvtools.memory.io.tile_folder import load_tiles, tile_folder
+
+        folder = tile_folder(Path(path))
+        if folder.is_dir():
+            return load_tiles(cls, folder, budget=budget, scratch=scratch)
+        _check_budget(MemoryOptions(budget=budget))
+        memory = load_memory(Path(path), cls, budget=budget, scratch=scratch)
+        memory.page_if_large()
+        return memory
+
+
+def _check_budget(options: MemoryOptions) -> None:
+    if options.budget is None:
+        raise OptionError("memory.budget none; expected bytes, such as 4GB; use SpatialMemory")
 
 
 def to_uint8(colors: NDArray[Any], name: str) -> NDArray[np.uint8]:

@@ -31,8 +31,7 @@ def load_memory(path: Path, *, up_to: int | None = None) -> SpatialMemory:
             gives that of its last complete round.
         up_to: forget the rounds after this one; None keeps all.
     """
-    from gvtools.memory.spatial_memory import SpatialMemory
-    from gvtools.memory.tiled_memory import TiledMemory
+    from gvtools.memory.spatial_memory import SpatialMemory, TiledMemory
 
     memory: SpatialMemory
     if path.suffix.lower() == ".ply":

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
 from gvtools.memory.spatial_memory import FuseReport, SpatialMemory
-from gvtools.memory.store.points import PointSet
+from gvtools.memory.store.views import PointSet
 from gvtools.scans.points import Scan
 from gvtools.scans.registration import Placement
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
 from gvtools.memory.store.local_frame import LocalFrame
-from gvtools.memory.store.points import PointSet
+from gvtools.memory.store.views import PointSet
 
 Float64 = NDArray[np.float64]
 

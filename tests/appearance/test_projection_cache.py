@@ -90,9 +90,10 @@ def test_observed_views_are_splatted_once(memory, monkeypatch):
     splatted: list[int] = []
     original = CpuSplatter.splat
 
-    def counted(self, target, chosen, limit, **options):
-        splatted.append(int((~memory.views.generated[memory.segments.view[chosen]]).sum()))
-        return original(self, target, chosen, limit, **options)
+    def counted(self, request):
+        view = memory.segments.view[request.chosen]
+        splatted.append(int((~memory.views.generated[view]).sum()))
+        return original(self, request)
 
     monkeypatch.setattr(CpuSplatter, "splat", counted)
     options = SplatOptions(occluders=False)

@@ -40,7 +40,7 @@ def test_points_on_borders_belong_to_one_voxel_and_stay_there(edge, corner, step
     assert memory.voxels == len(memory) == len(expected)
     # Neither a second arrival nor a rebuilt index finds another voxel.
     assert memory.fuse(points(where, spacing=edge), round=0).added == 0
-    memory.rebuild_index()
+    memory.whole.rebuild_index()
     assert memory.voxels == len(expected)
     assert memory.fuse(points(where, spacing=edge), round=0).added == 0
     np.testing.assert_array_equal(np.unique(_cells(memory), axis=0), expected)

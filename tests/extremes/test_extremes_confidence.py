@@ -17,7 +17,7 @@ from gvtools.memory.back_projection import back_project
 from gvtools.memory.io.ply import export_memory_ply
 from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory
 from gvtools.memory.splat.api import SplatOptions
-from gvtools.memory.splat.cpu_kernels import FAINTEST
+from gvtools.memory.splat.cpu import FAINTEST
 from gvtools.ply import read_ply, write_ply
 
 BACKENDS = ("cpu", "torch", "nearest")
@@ -227,7 +227,7 @@ def test_many_agreements_of_later_rounds_add_up():
     memory.fuse(points([(0.5, 0.5, 2.5)], confidence=1e-4), round=0)
     row = np.zeros(1, np.int32)
     for _ in range(10_000):
-        memory.agree(row, np.full(1, 1e-2, np.float32), round=1)
+        memory.whole.agree(row, np.full(1, 1e-2, np.float32), round=1)
     assert memory.confidence[0] == pytest.approx(100, rel=0.01)
-    memory.agree(row, np.full(1, LARGEST, np.float32), round=1)
+    memory.whole.agree(row, np.full(1, LARGEST, np.float32), round=1)
     assert memory.confidence[0] == 100

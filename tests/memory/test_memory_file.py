@@ -47,7 +47,7 @@ def test_what_is_loaded_is_what_was_saved(seed, tmp_path):
         np.testing.assert_array_equal(
             getattr(loaded.columns, name), getattr(memory.columns, name), err_msg=name
         )
-    for name in memory.segments.ARRAYS:
+    for name in memory.segments.LAYOUT:
         one, two = (getattr(m.segments, name)[: m.segments.count] for m in (loaded, memory))
         np.testing.assert_array_equal(one, two, err_msg=name)
     for i in range(len(memory.views)):

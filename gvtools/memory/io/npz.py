@@ -1,4 +1,4 @@
-"""The memory on disk: a zip of .npy members, versioned, checksummed, without pickle.
+"""A memory's file: a zip of .npy members, versioned, checksummed, without pickle.
 
 Every member carries the zip's CRC-32, and ``header.json`` lists each array's type and shape, so a
 file that was cut short, altered or written by another version is refused by name. Saving the same
@@ -21,6 +21,7 @@ from gvtools.cameras import Cameras, check_usable
 from gvtools.errors import GvError, MemoryFileError
 from gvtools.files import ZIP_EPOCH, replaced_when_written
 from gvtools.memory.store.store import MemoryOptions, Store
+from gvtools.memory.store.tile import fill, observation_arrays
 from gvtools.memory.store.views import SourceView, ViewTable
 from gvtools.memory.store.voxel_index import MOST_LEVEL
 from gvtools.untrusted import parse_json, read_array, regular
@@ -30,9 +31,6 @@ S = TypeVar("S", bound=Store)
 FORMAT = "gvtools memory"
 VERSION = 4
 CONVENTION = "OpenCV axes (x right, y down, z forward); first pixel's centre at (0.5, 0.5)"
-# Types and shapes of an observation's arrays; ``round`` and ``generated`` follow from ``view``.
-_COLUMNS = ("positions", "colors", "confidence", "spacing", "view", "level")
-_SEGMENT_ARRAYS = ("start", "length", "view", "box")
 
 
 def save_memory(memory: Store, path: Path) -> None:
@@ -68,23 +66,29 @@ def description(memory: Store) -> dict[str, Any]:
     }
 
 
-def load_memory(path: Path, kind: type[S]) -> S:
-    """Read a memory of a class; every byte is checked."""
+def load_memory(path: Path, kind: Callable[..., S], **more: Any) -> S:
+    """Read a memory of a class, see ``described``; every byte is checked."""
     header, arrays = _read(path)
     try:
-        return _assembled(header, arrays, kind)
+        _check_consistency(arrays, len(header["names"]))
+        empty = described(header, kind, **more)
+        append_views(empty.views, header["names"], arrays)
+        fill(empty.whole, arrays, empty.views)
+        start = arrays["agreement_start"]
+        for i, round_ in enumerate(arrays["agreement_round"].tolist()):
+            rows = slice(int(start[i]), int(start[i + 1]))
+            empty.whole.agree(
+                arrays["agreement_row"][rows].copy(), arrays["agreement_weight"][rows].copy(),
+                round=round_,
+            )  # fmt: skip
+        empty.whole.rebuild_index()
     except (GvError, IndexError, KeyError, TypeError, ValueError) as error:
         raise MemoryFileError(f"{path}: the memory's parts do not fit together ({error})") from None
+    return empty
 
 
 def described(header: dict[str, Any], kind: Callable[..., S], **more: Any) -> S:
-    """An empty memory as a header describes it.
-
-    Args:
-        header: see ``description``.
-        kind: its class.
-        more: further options of the memory, and arguments of the class.
-    """
+    """An empty memory of a class as a header describes it; ``more``: options and arguments."""
     options = {k: more.pop(k) for k in list(more) if k in MemoryOptions.model_fields}
     return kind(
         float.fromhex(header["voxel"]),
@@ -95,52 +99,13 @@ def described(header: dict[str, Any], kind: Callable[..., S], **more: Any) -> S:
     )
 
 
-def _assembled(header: dict[str, Any], arrays: dict[str, NDArray[Any]], kind: type[S]) -> S:
-    memory = described(header, kind)
-    _check_consistency(arrays, len(header["names"]))
-    memory.views = ViewTable(memory.frame, views_of(header["names"], arrays))
-    view = arrays["view"]
-    columns = {
-        **{name: arrays[name] for name in _COLUMNS},
-        "round": memory.views.round[view],
-        "generated": memory.views.generated[view],
-        "next": np.full(len(view), -1),
-    }
-    memory.columns.replace(len(view), columns.__getitem__)
-    start, length, view_rows, box = (arrays[f"segment_{name}"] for name in _SEGMENT_ARRAYS)
-    memory.segments.append(start, length, view_rows, box=box)
-    start = arrays["agreement_start"]
-    for i, round_ in enumerate(arrays["agreement_round"].tolist()):
-        rows = slice(int(start[i]), int(start[i + 1]))
-        memory.agree(
-            arrays["agreement_row"][rows].copy(),
-            arrays["agreement_weight"][rows].copy(),
-            round=round_,
-        )
-    memory.rebuild_index()
-    return memory
-
-
 def _arrays(memory: Store) -> dict[str, NDArray[Any]]:
-    segments = memory.segments
-    arrays: dict[str, NDArray[Any]] = {name: getattr(memory.columns, name) for name in _COLUMNS}
-    # Loading adds again what later rounds agreed.
+    """Observations, with the confidence that loading adds again left out, and views."""
+    arrays = observation_arrays(memory.whole)
+    agreements = {name: arrays.pop(name) for name in list(arrays) if name.startswith("agreement_")}
+    del agreements["agreement_before"]
     arrays["confidence"] = memory.own_confidence()
-    for name in _SEGMENT_ARRAYS:
-        arrays[f"segment_{name}"] = getattr(segments, name)[: segments.count]
-    arrays.update(view_arrays(memory.views))
-    logs = [(r, entry) for r in sorted(memory.agreements) for entry in memory.agreements[r]]
-    arrays["agreement_round"] = np.array([r for r, _ in logs], np.int32)
-    lengths = [len(entry[0]) for _, entry in logs]
-    arrays["agreement_start"] = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
-    empty = np.zeros(0)
-    arrays["agreement_row"] = np.concatenate(
-        [empty.astype(np.int32), *(entry[0] for _, entry in logs)]
-    )
-    arrays["agreement_weight"] = np.concatenate(
-        [empty.astype(np.float32), *(entry[1] for _, entry in logs)]
-    )
-    return arrays
+    return arrays | view_arrays(memory.views) | agreements
 
 
 def view_arrays(views: ViewTable) -> dict[str, NDArray[Any]]:
@@ -162,27 +127,22 @@ def view_arrays(views: ViewTable) -> dict[str, NDArray[Any]]:
     }
 
 
-def views_of(names: list[str], arrays: dict[str, NDArray[Any]]) -> list[SourceView]:
-    """The views of ``view_arrays``."""
-    views = []
+def append_views(table: ViewTable, names: list[str], arrays: dict[str, NDArray[Any]]) -> None:
+    """Add the views of ``view_arrays`` to an empty table."""
     at = 0
     for i, name in enumerate(names):
         rows = slice(i, i + 1)
         camera = Cameras(
-            arrays["view_K"][rows],
-            arrays["view_cam_from_world"][rows],
-            arrays["view_size"][rows, 0],
-            arrays["view_size"][rows, 1],
-            (name,),
-        )
+            arrays["view_K"][rows], arrays["view_cam_from_world"][rows],
+            arrays["view_size"][rows, 0], arrays["view_size"][rows, 1], (name,),
+        )  # fmt: skip
         check_usable(camera)
         height, width = arrays["grid_shape"][i].tolist()
         grid = arrays["grid_depth"][at : at + height * width].reshape(height, width).copy()
         at += height * width
         generated = bool(arrays["view_generated"][i])
         scanned = "view_scanned" in arrays and bool(arrays["view_scanned"][i])
-        views.append(SourceView(camera, int(arrays["view_round"][i]), generated, grid, scanned))
-    return views
+        table.append(SourceView(camera, int(arrays["view_round"][i]), generated, grid, scanned))
 
 
 def _write(archive: zipfile.ZipFile, name: str, data: bytes) -> None:

@@ -17,7 +17,7 @@ from gvtools.ply import read_ply, write_ply
 if TYPE_CHECKING:
     import open3d as o3d
 
-    from gvtools.memory.tiles.tile import Tile
+    from gvtools.memory.store.tile import Tile
 
 
 def read_point_cloud(path: Path) -> o3d.t.geometry.PointCloud:
@@ -56,70 +56,64 @@ def export_memory_ply(
     Returns:
         Points written, and the voxel edge they were thinned to (0 when all were kept).
     """
-    if memory.tiles is not None and max_points is None:
-        return _export_tiles(memory, path, observed=observed), 0.0
-    among = ~memory.generated if observed else np.ones(len(memory), np.bool_)
-    rows, edge = np.flatnonzero(among), 0.0
-    if observed and not len(rows):
+    count = len(memory) - (memory.generated_count if observed else 0)
+    if observed and not count:
         raise OptionError(f"{path}: the memory holds nothing that was observed")
-    if max_points is not None and len(rows) > max_points:
-        thin = thinned(memory, max_points, among=among)
-        rows, edge = thin.rows, thin.edge
-    reach = float(np.abs(memory.positions[rows]).max(initial=0))
-    columns = {name: getattr(memory.columns, name)[rows] for name in _COLUMNS}
-    vertices = _vertices(memory, columns, reach=reach)
-    write_ply(path, vertices, comments=_COMMENTS)
-    return len(rows), edge
+    if max_points is not None and count > max_points:
+        thin = thinned(memory, max_points, among=~memory.generated if observed else None)
+        columns = {name: getattr(memory.columns, name)[thin.rows] for name in _COLUMNS}
+        kind = _vertex_type(memory, _reach(memory, columns["positions"]))
+        write_ply(path, _vertices(memory, columns, kind), comments=_COMMENTS)
+        return len(thin.rows), thin.edge
+
+    def columns_of(tile: Tile) -> dict[str, NDArray[Any]]:
+        columns = {name: tile.column(name) for name in _COLUMNS}
+        if observed:
+            rows = ~memory.views.generated[columns["view"]]
+            columns = {name: column[rows] for name, column in columns.items()}
+        return columns
+
+    box = memory.segments.rows()["box"]
+    kind = _vertex_type(memory, _reach(memory, box[:, :6].reshape(-1, 3)))
+    if kind["x"] == np.float64:
+        # Corners of boxes may lie farther out than what these hold.
+        tiles = memory.tiles.each()
+        reach = max(_reach(memory, columns_of(tile)["positions"]) for tile in tiles)
+        kind = _vertex_type(memory, reach)
+    parts = (_vertices(memory, columns_of(tile), kind) for tile in memory.tiles.each())
+    write_ply(path, np.empty(0, kind), more=parts, count=count, comments=_COMMENTS)
+    return count, 0.0
 
 
-_COLUMNS = ("positions", "colors", "confidence", "spacing", "round", "view", "generated")
+_COLUMNS = ("positions", "colors", "confidence", "spacing", "view")
 _COMMENTS = ("gvtools memory, input world frame, scene units",)
 
 
-def _vertices(
-    memory: Store, columns: Mapping[str, NDArray[Any]], *, reach: float
-) -> NDArray[np.void]:
-    """Observations as vertices; ``reach`` is the greatest coordinate of all."""
+def _reach(memory: Store, positions: NDArray[np.float32]) -> float:
+    """The greatest coordinate in the world."""
+    return float(np.abs(memory.frame.to_world(positions)).max(initial=0))
+
+
+def _vertex_type(memory: Store, reach: float) -> np.dtype[np.void]:
     coordinate = "<f8" if reach * 2.0**-24 > 0.1 * memory.voxel else "<f4"
-    positions = memory.frame.to_world(columns["positions"])
-    vertices = np.empty(
-        len(positions),
+    return np.dtype(
         [("x", coordinate), ("y", coordinate), ("z", coordinate), ("red", "u1"), ("green", "u1"),
          ("blue", "u1"), ("confidence", "<f4"), ("spacing", "<f4"), ("round", "<i4"),
          ("view", "<i4"), ("generated", "u1"), ("scanned", "u1")],
     )  # fmt: skip
+
+
+def _vertices(
+    memory: Store, columns: Mapping[str, NDArray[Any]], kind: np.dtype[np.void]
+) -> NDArray[np.void]:
+    """Observations as vertices."""
+    positions, view = memory.frame.to_world(columns["positions"]), columns["view"]
+    vertices = np.empty(len(positions), kind)
     for k, (axis, color) in enumerate(zip("xyz", ("red", "green", "blue"), strict=True)):
         vertices[axis] = positions[:, k]
         vertices[color] = columns["colors"][:, k]
-    for name in _COLUMNS[2:]:
+    for name in ("confidence", "spacing", "view"):
         vertices[name] = columns[name]
-    vertices["scanned"] = memory.views.scanned[columns["view"]]
+    for name in ("round", "generated", "scanned"):
+        vertices[name] = getattr(memory.views, name)[view]
     return vertices
-
-
-def _export_tiles(memory: Store, path: Path, *, observed: bool) -> int:
-    """Write the observations tile by tile; returns how many."""
-    tiles, segments, n = memory.tiles, memory.segments, memory.segments.count
-    assert tiles is not None
-    box = segments.box[:n]
-    corners = np.concatenate([box[:, :3], box[:, 3:6]])
-    reach = float(np.abs(memory.frame.to_world(corners)).max(initial=0))
-    count = len(memory) - (memory.generated_count if observed else 0)
-    if not count:
-        raise OptionError(f"{path}: the memory holds nothing that was observed")
-
-    def part(tile: Tile) -> NDArray[np.void]:
-        columns = {name: tile.column(name) for name in (*_COLUMNS[:4], "view")}
-        view = columns["view"]
-        columns["round"], made = memory.views.round[view], memory.views.generated[view]
-        columns["generated"] = made
-        if observed:
-            columns = {name: column[~made] for name, column in columns.items()}
-        return _vertices(memory, columns, reach=reach)
-
-    none = {name: np.empty((0, 3) if name in _COLUMNS[:2] else 0, int) for name in _COLUMNS}
-    write_ply(
-        path, _vertices(memory, none, reach=reach), count=count, comments=_COMMENTS,
-        more=(part(tile) for tile in tiles.each()),
-    )  # fmt: skip
-    return count

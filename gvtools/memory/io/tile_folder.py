@@ -15,16 +15,15 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gvtools.errors import GvError, MemoryFileError, ProjectError
 from gvtools.files import flush_file, folder_replaced_when_written, recover_folder
-from gvtools.memory.io.npz import VERSION, described, description, view_arrays, views_of
+from gvtools.memory.io.npz import VERSION, append_views, described, description, view_arrays
+from gvtools.memory.store.array_file import ArrayFile, write_arrays
 from gvtools.memory.store.store import Store
-from gvtools.memory.store.views import ViewTable
+from gvtools.memory.store.tile import Tile, check, check_segments, read_segments
 from gvtools.memory.store.voxel_index import MOST_LEVEL
-from gvtools.memory.tiles.array_file import ArrayFile, write_arrays
-from gvtools.memory.tiles.tile import Tile, check, check_segments, read_segments
-from gvtools.memory.tiles.tile_set import TileSet
 
 S = TypeVar("S", bound=Store)
 
@@ -36,8 +35,9 @@ def tile_folder(path: Path) -> Path:
     return path if path.suffix == SUFFIX else path.with_suffix(SUFFIX)
 
 
-def save_tiles(memory: Store, tiles: TileSet, folder: Path) -> Path:
+def save_tiles(memory: Store, folder: Path) -> Path:
     """Write a memory in tiles."""
+    tiles = memory.tiles
     with tiles.lock, _replaced(folder) as new:
         table = []
         for number, tile in tiles:
@@ -59,14 +59,14 @@ def save_tiles(memory: Store, tiles: TileSet, folder: Path) -> Path:
         }
         numbers = np.full(len(tiles.tiles), -1, np.int32)
         numbers[[number for number, _ in tiles]] = np.arange(len(table))
-        places = tiles.places
+        places = tiles.places.rows()
         write_arrays(
             new / INDEX, meta,
             {
                 **view_arrays(memory.views),
-                "segment_tile": numbers[places.tile[: places.count]],
-                "segment_local": places.local[: places.count],
-                "segment_level": places.level[: places.count],
+                "segment_tile": numbers[places["tile"]],
+                "segment_local": places["local"],
+                "segment_level": places["level"],
             },
         )  # fmt: skip
     # What only the earlier state had.
@@ -80,14 +80,10 @@ def save_tiles(memory: Store, tiles: TileSet, folder: Path) -> Path:
 def load_tiles(
     kind: type[S], folder: Path, *, budget: int | None = None, scratch: Path | None = None
 ) -> S:
-    """Read a memory in tiles: the table of its segments; tiles when they are used.
+    """Read a memory of a class in tiles: the table of its segments; tiles when they are used.
 
-    Args:
-        kind: class of the memory.
-        folder: of the tiles.
-        budget: bytes; None takes that it was saved with.
-        scratch: where tiles that change are written; if given, tiles are linked into it at once,
-            so that the folder may be removed.
+    Tiles that change are written to ``scratch``; if it is given, all are linked into it at once, so
+    that the folder may be removed. A ``budget`` of None is that it was saved with.
     """
     recover_folder(folder)
     index = ArrayFile(folder / INDEX)
@@ -102,8 +98,9 @@ def load_tiles(
             meta, kind, budget=meta["budget"] if budget is None else budget, scratch=scratch
         )
         arrays = {name: index.array(name) for name in index.names}
-        memory.views = ViewTable(memory.frame, views_of(meta["names"], arrays))
-        return _filled(memory, folder, index, scratch=scratch)
+        append_views(memory.views, meta["names"], arrays)
+        _add_tiles(memory, folder, meta, arrays=arrays, scratch=scratch)
+        return memory
     except MemoryFileError:
         raise
     except (AttributeError, GvError, IndexError, KeyError, TypeError, ValueError) as error:
@@ -112,15 +109,12 @@ def load_tiles(
         ) from None
 
 
-def _filled(
-    memory: Any,
-    folder: Path,
-    index: ArrayFile,
-    *,
-    scratch: Path | None,
-) -> Any:
-    meta, arrays = index.meta, {name: index.array(name) for name in index.names}
-    tiles = memory.begin_tiles()
+def _add_tiles(
+    memory: Store, folder: Path, meta: dict[str, Any],
+    *, arrays: dict[str, NDArray[Any]], scratch: Path | None,
+) -> None:  # fmt: skip
+    tiles = memory.tiles
+    tiles.clear()
     tiles.octree.divided = {tuple(node) for node in meta["divided"]}
     of_tile, local = arrays["segment_tile"], arrays["segment_local"]
     unknown = len(of_tile) and not 0 <= of_tile.min() <= of_tile.max() < len(meta["tiles"])
@@ -159,9 +153,7 @@ def _filled(
         )  # fmt: skip
         tiles.add(tile)
     tiles.places.append(of_tile, local, start, level=arrays["segment_level"])
-    memory.segments.append(np.cumsum(length, dtype=np.int64) - length, length, view, box=box)
-    memory.columns.count = int(length.sum(dtype=np.int64))
-    return memory
+    memory.segments.follow(length, view, box)
 
 
 def copy_tiles(source: Path, target: Path) -> None:

@@ -1,19 +1,20 @@
-"""Splatting: its options, the images that are being written, and what a back end has to do.
-
-Which points go into which pixels is decided in ``projection``.
-"""
+"""Splatting: its options, requests, image buffers and back ends."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import TYPE_CHECKING, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
 from gvtools.cameras import Cameras
+from gvtools.memory.store.thinned_copies import DOUBLINGS
 from gvtools.settings import Settings
+
+if TYPE_CHECKING:
+    from gvtools.memory.store.store import Store
 
 # Back ends without blending.
 ONE_PIXEL = ("nearest", "open3d")
@@ -54,27 +55,18 @@ class SplatOptions(Settings):
 
 @dataclass(eq=False)
 class FrameBuffers:
-    """One target camera and the images being written.
+    """One target camera and the images being written."""
 
-    Attributes:
-        camera: a batch of one.
-        cam_from_local: (4, 4) float64, from the memory's frame.
-        rect: (R, 4) int32, image rectangle of each segment, see culling.cull_segments.
-        z_near: what is nearer is behind or inside the camera, scene units.
-        unit: a power of two near the typical depth, scene units, that depths are summed in.
-        rgb: (H, W, 3) float32 in [0, 1].
-        depth: (H, W) float32, scene units.
-        valid: (H, W) bool.
-        confidence: (H, W) float32.
-        generated: (H, W) bool.
-        scanned: (H, W) bool.
-    """
-
+    # A batch of one, and its (4, 4) pose from the memory's frame.
     camera: Cameras
     cam_from_local: NDArray[np.float64]
+    # (R, 4) image rectangle of each segment, see culling.cull_segments.
     rect: NDArray[np.int32]
+    # What is nearer is behind or inside the camera, scene units.
     z_near: np.float32
+    # A power of two near the typical depth, scene units, that depths are summed in.
     unit: np.float32
+    # (H, W, 3) in [0, 1], and (H, W); depth in scene units.
     rgb: NDArray[np.float32]
     depth: NDArray[np.float32]
     valid: NDArray[np.bool_]
@@ -88,31 +80,31 @@ class FrameBuffers:
         return int(self.camera.height[0]), int(self.camera.width[0])
 
 
+@dataclass(frozen=True, eq=False)
+class SplatRequest:
+    """Segments to be splatted into a target camera, and the pixels that they may write."""
+
+    target: FrameBuffers
+    # (n,) rows of the memory's segments.
+    chosen: NDArray[np.int64]
+    # (H, W): only what is nearer is written; 0 shuts a pixel.
+    limit: NDArray[np.float32]
+    # (views,) view weights.
+    weight: NDArray[np.float32]
+    # (H, W) the pixels to be written, where these are few; None for most.
+    writable: NDArray[np.bool_] | None = None
+    # False stops after the depth pass.
+    blend: bool = True
+
+
 class Splatter(Protocol):
     """A back end: splats segments of one memory, with one set of options, into targets."""
 
-    def splat(
-        self,
-        target: FrameBuffers,
-        chosen: NDArray[np.int64],
-        limit: NDArray[np.float32],
-        *,
-        weight: NDArray[np.float32],
-        writable: NDArray[np.bool_] | None,
-        blend: bool,
-    ) -> NDArray[np.float32]:
-        """Splat the segments ``chosen`` and keep the sums until ``resolve``.
-
-        Args:
-            target: the camera.
-            chosen: (n,) rows of the memory's segments.
-            limit: (H, W), only what is nearer is written; 0 shuts a pixel.
-            weight: (views,) view weight.
-            writable: (H, W), the pixels to be written, where these are few; None for most.
-            blend: False stops after the depth pass.
+    def splat(self, request: SplatRequest) -> NDArray[np.float32]:
+        """Splat segments and keep the sums until ``resolve``.
 
         Returns:
-            (H, W) float32 nearest depth, ``limit`` where nothing is nearer.
+            (H, W) nearest depth, ``limit`` where nothing is nearer.
         """
 
     def resolve(self, target: FrameBuffers, open_: NDArray[np.bool_], *, generated: bool) -> None:
@@ -121,3 +113,23 @@ class Splatter(Protocol):
         The confidence is the mean of the observations' confidence x view weight; ``generated`` says
         what kind the splatted observations are.
         """
+
+
+def thinning(
+    store: Store, target: FrameBuffers, chosen: NDArray[np.int64], *, px: float
+) -> NDArray[np.uint8] | None:
+    """(n,) thinned copies of segments whose cubes are at most ``px`` pixels wide; None in RAM."""
+    if store.in_ram or not px:
+        return None
+    box, M = store.segments.box[chosen].astype(np.float64), target.cam_from_local
+    K = target.camera.K[0]
+    nearest = np.full(len(chosen), M[2, 3])
+    for k in range(3):
+        nearest += np.minimum(M[2, k] * box[:, k], M[2, k] * box[:, 3 + k])
+    edge = store.voxel * np.ldexp(1.0, store.tiles.places.level[chosen].astype(np.int32))
+    with np.errstate(divide="ignore"):
+        wide = np.where(nearest > 0, edge * max(K[0, 0], K[1, 1]) / nearest, np.inf)
+    out = np.zeros(len(chosen), np.uint8)
+    for doublings in DOUBLINGS:
+        out[wide * 2**doublings <= px] = doublings
+    return out

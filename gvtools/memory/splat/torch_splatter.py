@@ -1,4 +1,4 @@
-"""The torch back end of projection, for CUDA: every (observation, pixel) pair as one row.
+"""The torch back end of projection, for CUDA: every (observation, pixel) pair is a row.
 
 Depth is a scatter with ``amin``, blending an indexed sum, so the result is the compiled back end's
 but for rounding. Sums are added in the order of the rows on the CPU and, through the sorting form
@@ -17,7 +17,9 @@ from numpy.typing import NDArray
 
 from gvtools.errors import OptionError
 from gvtools.memory.culling import summed_area
-from gvtools.memory.splat.cpu_kernels import CHANNELS, FAINTEST, SMALLEST
+from gvtools.memory.splat.api import SplatRequest, thinning
+from gvtools.memory.splat.cpu import CHANNELS, FAINTEST, SMALLEST
+from gvtools.memory.store.columns import SplatColumns
 
 if TYPE_CHECKING:
     from gvtools.memory.splat.api import FrameBuffers, SplatOptions
@@ -36,44 +38,50 @@ def torch_device(name: str) -> torch.device:
 
 
 class TorchSplatter:
-    """Splats segments of a memory on one device; see gvtools.memory.splat.api.Splatter."""
+    """Splats segments of a memory on one device; see splat.api.Splatter."""
 
     def __init__(self, store: Store, options: SplatOptions) -> None:
-        self.options = options
+        self.store, self.options = store, options
         self.device = torch_device(options.device)
-        segments = store.segments
-        self.start = self._tensor(segments.start[: segments.count])
-        self.length = self._tensor(segments.length[: segments.count].astype(np.int64))
-        self.segment_view = self._tensor(segments.view[: segments.count].astype(np.int64))
-        self.xyz = self._column(store, "positions")
-        self.color = self._column(store, "colors")
-        self.confidence = self._column(store, "confidence")[:, 0]
-        self.spacing = self._column(store, "spacing")[:, 0]
+        if store.in_ram:
+            # In the store's own memory where that is on this device.
+            columns, shared = store.columns, torch.utils.dlpack.from_dlpack
+            xyz, color, confidence, spacing = (
+                shared(columns.tensor(name).to_dlpack()).to(self.device)
+                if len(store)
+                else self._tensor(columns.tensor(name).cpu().numpy())
+                for name in SplatColumns._fields
+            )
+            self._take((xyz, color, confidence[:, 0], spacing[:, 0]), **store.segments.rows())
         self.total = torch.empty(0)
 
-    def _column(self, store: Store, name: str) -> torch.Tensor:
-        """A column of the store; in the store's own memory where that is on this device."""
-        column = store.columns.tensor(name)
-        if not len(store):
-            return self._tensor(column.cpu().numpy())
-        return torch.utils.dlpack.from_dlpack(column.to_dlpack()).to(self.device)
+    def _take(
+        self, columns: tuple[torch.Tensor, ...], *, start: NDArray, length: NDArray, view: NDArray,
+        **_: NDArray,
+    ) -> None:  # fmt: skip
+        """The observations, and the table of their segments."""
+        self.xyz, self.color, self.confidence, self.spacing = columns
+        self.start, self.length = self._tensor(start), self._tensor(length.astype(np.int64))
+        self.segment_view = self._tensor(view.astype(np.int64))
 
     def _tensor(self, array: NDArray) -> torch.Tensor:
         return torch.from_numpy(np.ascontiguousarray(array)).to(self.device)
 
-    def splat(
-        self,
-        target: FrameBuffers,
-        chosen: NDArray[np.int64],
-        limit: NDArray[np.float32],
-        *,
-        weight: NDArray[np.float32],
-        writable: NDArray[np.bool_] | None,
-        blend: bool,
-    ) -> NDArray[np.float32]:
-        """See gvtools.memory.splat.api.Splatter."""
+    def splat(self, request: SplatRequest) -> NDArray[np.float32]:
+        """See splat.api.Splatter."""
+        target, chosen, limit = request.target, request.chosen, request.limit
+        if not self.store.in_ram:
+            segments = self.store.segments
+            detail = thinning(self.store, target, chosen, px=self.options.far_detail_px)
+            found = self.store.tiles.gather(segments, chosen, doublings=detail)
+            self._take(
+                tuple(self._tensor(column) for column in found.columns), start=found.start,
+                length=found.length, view=found.of(segments.view),
+            )  # fmt: skip
+            chosen = found.chosen
         height, width = target.shape
         limits = self._tensor(limit.reshape(-1))
+        writable = request.writable
         sums = None if writable is None else self._tensor(summed_area(writable))
         zbuffer = limits.clone()
         rows, view = self._observations(chosen)
@@ -86,9 +94,9 @@ class TorchSplatter:
             cell = row * width + col
             use = z[i] < limits[cell]
             zbuffer.scatter_reduce_(0, cell[use], z[i[use]], "amin")
-        if blend:
+        if request.blend:
             farthest = zbuffer * (1 + self.options.depth_band)
-            scale = self.confidence[rows] * self._tensor(weight)[view]
+            scale = self.confidence[rows] * self._tensor(request.weight)[view]
             scale = scale.clamp(min=float(FAINTEST))
             self.total = torch.zeros((height * width, CHANNELS), device=self.device)
             reach = self.options.blend_reach * size
@@ -102,7 +110,7 @@ class TorchSplatter:
         return zbuffer.reshape(height, width).cpu().numpy()
 
     def resolve(self, target: FrameBuffers, open_: NDArray[np.bool_], *, generated: bool) -> None:
-        """See gvtools.memory.splat.api.Splatter."""
+        """See splat.api.Splatter."""
         kernel, weight = self.total[:, 5], self.total[:, 3]
         done = self._tensor(open_.reshape(-1)) & (kernel >= self.options.support)
         done &= weight >= float(SMALLEST)

@@ -1,10 +1,9 @@
-"""The memory's observations as Open3D tensors, and the segments of them that culling works on."""
+"""Columns of observations as Open3D tensors, and the table of their segments."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,21 +48,24 @@ class ColumnArrays(NamedTuple):
     next: NDArray[np.int32]
 
 
+class SplatColumns(NamedTuple):
+    """The columns that splatting reads, as in ColumnArrays."""
+
+    positions: NDArray[np.float32]
+    colors: NDArray[np.uint8]
+    confidence: NDArray[np.float32]
+    spacing: NDArray[np.float32]
+
+
 class Columns:
-    """Observations as parallel Open3D tensors with spare capacity.
+    """Observations as parallel Open3D tensors with spare capacity, on "cpu" or "cuda:0".
 
-    The first ``count`` rows are in use. Attributes named as in LAYOUT give these rows: (N, 3)
-    ``positions`` float32, scene units, in the memory's frame, and ``colors`` uint8; (N,)
-    ``confidence`` float32, what later rounds added included; ``spacing`` float32, scene units;
-    ``round`` uint16; ``view`` int32, row of the view table; ``generated`` uint8; ``level`` uint8,
-    of the voxel; ``next`` int32, the next observation of the same voxel, -1 at the end. They share
-    the tensors' memory as long as these are on the CPU.
-
-    Positions are contiguous rows of three, as Open3D's own: of strided ones its projection would
-    read the wrong numbers.
-
-    Args:
-        device: of the tensors, such as "cpu" or "cuda:0".
+    The first ``count`` rows are in use. Attributes named as in LAYOUT give these rows, (N, 3) or
+    (N,); they share the tensors' memory as long as these are on the CPU. Lengths are in scene
+    units, ``positions`` in the memory's frame. ``confidence`` includes what later rounds added,
+    ``view`` is a row of the view table, ``next`` the next observation of the same voxel, -1 at the
+    end. Positions are contiguous rows of three: of strided ones Open3D's own projection would read
+    the wrong numbers.
     """
 
     positions: NDArray[np.float32]
@@ -105,13 +107,23 @@ class Columns:
     def arrays(self) -> ColumnArrays:
         """Views of the tensors for kernels, which run on the CPU."""
         if self._arrays is None:
-            if not self._tensors["positions"].is_cpu:
-                raise OptionError(
-                    f"the memory is on {self.device}; fusing, forgetting and the cpu and one-pixel "
-                    "back ends need it on 'cpu'; use memory.to('cpu')"
-                )
+            self.require_cpu()
             self._arrays = ColumnArrays(*(_flat(self._tensors[name]) for name in LAYOUT))
         return self._arrays
+
+    def require_cpu(self) -> None:
+        """Refuse tensors on another device."""
+        if self.device != "cpu":
+            raise OptionError(
+                f"the memory is on {self.device}; fusing, forgetting and the cpu and one-pixel "
+                "back ends need it on 'cpu'; use memory.to('cpu')"
+            )
+
+    @property
+    def splat(self) -> SplatColumns:
+        """What splatting reads; spare rows included, where no copy to the CPU is needed."""
+        of = self if self.device != "cpu" else self.arrays
+        return SplatColumns(*(getattr(of, name) for name in SplatColumns._fields))
 
     def __getattr__(self, name: str) -> NDArray[Any]:
         if name not in LAYOUT:
@@ -141,15 +153,6 @@ class Columns:
         for name, array in zip(LAYOUT, arrays, strict=True):
             array[:count] = values(name)
         self._tensors, self._arrays, self.count = fresh._tensors, fresh._arrays, count
-
-    def take_drawn(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Hold other rows, in these arrays themselves; columns that are not given have none."""
-        import open3d as o3d
-
-        self.count, self._arrays = len(arrays["positions"]), None
-        for name, array in arrays.items():
-            column = array.reshape(self.count, LAYOUT[name][1])
-            self._tensors[name] = o3d.core.Tensor.from_numpy(column)
 
     def to(self, device: str) -> Columns:
         """A copy of the rows in use on a device."""
@@ -198,33 +201,59 @@ def _flat(tensor: o3d.core.Tensor) -> NDArray[Any]:
     return array if array.shape[1] == 3 else array.reshape(-1)
 
 
-@dataclass(eq=False)
-class Segments:
-    """Contiguous observations of one block and one view: the unit of culling.
+class Table:
+    """Parallel arrays with spare capacity; the first ``count`` rows are in use."""
 
-    Attributes:
-        count: rows in use.
-        start: (C,) int64, first observation.
-        length: (C,) int32, observations.
-        view: (C,) int32, row of the view table.
-        box: (C, 7) float32, scene units: bounding box of the positions (min xyz, max xyz) and the
-            largest spacing.
-        groups: rows of ``group_box`` in use.
-        group_box: (D, 7) float32, the box around each GROUP consecutive segments.
-    """
+    # Type and width of each array.
+    LAYOUT: ClassVar[dict[str, tuple[Any, int]]]
 
-    count: int = 0
-    start: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
-    length: NDArray[np.int32] = field(default_factory=lambda: np.empty(0, np.int32))
-    view: NDArray[np.int32] = field(default_factory=lambda: np.empty(0, np.int32))
-    box: NDArray[np.float32] = field(default_factory=lambda: np.empty((0, 7), np.float32))
-    groups: int = 0
-    group_box: NDArray[np.float32] = field(default_factory=lambda: np.empty((0, 7), np.float32))
+    def __init__(self) -> None:
+        self.count = 0
+        for name, (kind, width) in self.LAYOUT.items():
+            setattr(self, name, np.empty((0, width) if width > 1 else 0, kind))
 
-    ARRAYS = ("start", "length", "view", "box")
+    def rows(self) -> dict[str, NDArray[Any]]:
+        """The rows in use, by the arrays' names."""
+        return {name: getattr(self, name)[: self.count] for name in self.LAYOUT}
+
+    def _append(self, *columns: NDArray[Any]) -> None:
+        need = self.count + len(columns[0])
+        capacity = len(getattr(self, next(iter(self.LAYOUT))))
+        for name, rows in zip(self.LAYOUT, columns, strict=True):
+            if need > capacity:
+                longer = extended(getattr(self, name), max(need, 2 * capacity), self.count)
+                setattr(self, name, longer)
+            getattr(self, name)[self.count : need] = rows
+        self.count = need
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the rows in use."""
+        return sum(rows.nbytes for rows in self.rows().values())
+
+
+class Segments(Table):
+    """Contiguous observations of one block and one view: the unit of culling."""
+
+    LAYOUT: ClassVar[dict[str, tuple[Any, int]]] = {
+        "start": (np.int64, 1), "length": (np.int32, 1), "view": (np.int32, 1),
+        "box": (np.float32, 7),
+    }  # fmt: skip
+    # First observation, observations, row of the view table.
+    start: NDArray[np.int64]
+    length: NDArray[np.int32]
+    view: NDArray[np.int32]
+    # Bounding box of the positions (min xyz, max xyz) and the largest spacing, scene units.
+    box: NDArray[np.float32]
 
     # Consecutive segments lie near each other; culling asks groups of this many first.
     GROUP = 32
+
+    def __init__(self) -> None:
+        super().__init__()
+        # Groups in use, and the box around each, as of segments.
+        self.groups = 0
+        self.group_box: NDArray[np.float32] = np.empty((0, 7), np.float32)
 
     def append(
         self,
@@ -236,16 +265,25 @@ class Segments:
         changed: int | None = None,
     ) -> None:
         """Add rows of equal number; ``changed`` is the first earlier segment whose box grew."""
-        need = self.count + len(start)
-        if need > len(self.start):
-            size = max(need, 2 * len(self.start))
-            for name in self.ARRAYS:
-                setattr(self, name, extended(getattr(self, name), size, self.count))
-        for name, rows in zip(self.ARRAYS, (start, length, view, box), strict=True):
-            getattr(self, name)[self.count : need] = rows
         first = min(self.count if changed is None else changed, self.count) // self.GROUP
-        self.count = need
+        self._append(start, length, view, box)
         self._box_groups(first)
+
+    def follow(
+        self, length: NDArray[np.int32], view: NDArray[np.int32], box: NDArray[np.float32]
+    ) -> None:
+        """Add segments whose observations follow those of the segments there."""
+        ends = self.observations + np.cumsum(length, dtype=np.int64)
+        self.append(ends - length, length, view, box=box)
+
+    def without_views(self, keep_view: NDArray[np.bool_]) -> Segments:
+        """The segments of the views to be kept, (views,); each segment is one view's."""
+        rows = self.rows()
+        stays = keep_view[rows["view"]]
+        new_view = (np.cumsum(keep_view) - 1).astype(np.int32)
+        out = Segments()
+        out.follow(rows["length"][stays], new_view[rows["view"][stays]], rows["box"][stays])
+        return out
 
     def widen(self, rows: NDArray[np.int32], box: NDArray[np.float32]) -> None:
         """Give some segments boxes that hold their present ones."""
@@ -268,7 +306,44 @@ class Segments:
             rows[:, 3:] = np.maximum.reduceat(box[:, 3:], starts)
 
     @property
+    def observations(self) -> int:
+        """Their number: segments lie one behind the other."""
+        last = self.count - 1
+        return int(self.start[last]) + int(self.length[last]) if self.count else 0
+
+    @property
     def nbytes(self) -> int:
         """Bytes of the rows in use."""
-        rows = sum(getattr(self, name)[: self.count].nbytes for name in self.ARRAYS)
-        return rows + self.group_box[: self.groups].nbytes
+        return super().nbytes + self.group_box[: self.groups].nbytes
+
+
+class SegmentPlaces(Table):
+    """Where the segments of a memory's table lie in its tiles, and the level of their voxels."""
+
+    LAYOUT: ClassVar[dict[str, tuple[Any, int]]] = {
+        "tile": (np.int32, 1), "local": (np.int32, 1), "row": (np.int64, 1), "level": (np.uint8, 1),
+    }  # fmt: skip
+    # Number of the tile; row in the tile's own table; first observation in the tile.
+    tile: NDArray[np.int32]
+    local: NDArray[np.int32]
+    row: NDArray[np.int64]
+    level: NDArray[np.uint8]
+
+    def append(
+        self, tile: NDArray[np.int32], local: NDArray[np.int32], row: NDArray[np.int64],
+        *, level: NDArray[np.uint8],
+    ) -> None:  # fmt: skip
+        """Add rows of equal number."""
+        self._append(tile, local, row, level)
+
+    def move(self, which: NDArray[np.int32], tile: int, segments: Segments) -> None:
+        """Segments ``which`` are now all those of a tile, in this order."""
+        self.tile[which] = tile
+        self.local[which] = np.arange(len(which), dtype=np.int32)
+        self.row[which] = segments.start[: segments.count]
+
+    def select(self, keep: NDArray[np.bool_]) -> None:
+        """Keep some rows, in their order."""
+        for name, rows in self.rows().items():
+            setattr(self, name, rows[keep])
+        self.count = len(self.tile)

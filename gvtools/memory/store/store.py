@@ -1,9 +1,10 @@
-"""What a memory keeps: observations, their segments, the views and the voxel index."""
+"""A memory's state: its options, frame, views, and the tiles that hold its observations."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
-from copy import copy, deepcopy
+from copy import copy
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
@@ -11,24 +12,17 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, field_validator
 
 from gvtools.errors import OptionError
-from gvtools.memory.store.byte_sizes import bytes_of
-from gvtools.memory.store.columns import Columns, Segments
+from gvtools.memory.store.columns import Columns
 from gvtools.memory.store.local_frame import LocalFrame
+from gvtools.memory.store.observations import Agreement, Observations
+from gvtools.memory.store.tile_set import TileSet
 from gvtools.memory.store.views import FreeGrid, ViewTable
-from gvtools.memory.store.voxel_index import (
-    MAX_VOXEL,
-    VoxelIndex,
-    check_grid,
-    link_records,
-    voxel_keys,
-)
+from gvtools.memory.store.voxel_index import MAX_VOXEL, check_grid
 from gvtools.memory.store.voxel_levels import VoxelLevels
 from gvtools.settings import Settings
 
 if TYPE_CHECKING:
     import open3d as o3d
-
-    from gvtools.memory.tiles.tile_set import TileSet
 
 S = TypeVar("S", bound="Store")
 
@@ -67,10 +61,23 @@ class MemoryOptions(Settings):
         return bytes_of(value) if isinstance(value, str) else value
 
 
+def bytes_of(text: str) -> int:
+    """A number of bytes from text.
+
+    >>> bytes_of("4GB"), bytes_of("1.5 GiB"), bytes_of("1000000")
+    (4000000000, 1610612736, 1000000)
+    """
+    found = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(?:([KMGT])(I?))?B?", text.strip().upper())
+    if not found:
+        raise ValueError("a number of bytes such as 4GB, 400MB or 2GiB")
+    power = " KMGT".index(found[2]) if found[2] else 0
+    return round(float(found[1]) * (1024 if found[3] else 1000) ** power)
+
+
 class Store:
     """Observations in voxels, the views they come from, and the confidence that rounds added.
 
-    It grows, forgets and rebuilds its index; it knows nothing of fusion, projection or files.
+    It grows and forgets; it knows nothing of fusion, projection or files.
 
     Args:
         voxel: edge of the finest voxels, scene units.
@@ -82,21 +89,7 @@ class Store:
         device: where the tensors live, "cpu" or "cuda:0". What runs on the CPU (fusing, forgetting,
             the cpu and one-pixel back ends) needs them there, see ``to``; elsewhere the torch back
             end projects them and Open3D uses them.
-
-    Attributes:
-        columns: the observations.
-        segments: runs of consecutive observations of one view in one block (16 x 16 x 16 voxels).
-        views: the fused views: camera, round, whether generated, free-space grid.
-        index: which voxel holds which.
-        agreements: by round, one entry for each fused view that saw what was there already: (rows
-            (A,) of observations of earlier rounds, confidence added (A,), confidence before (A,)).
-        changes: how often something was fused or forgotten.
-        observed_changes: how often that touched observed content.
-        tiles: where the observations of a memory larger than RAM lie, instead of in ``columns``;
-            None in RAM.
     """
-
-    tiles: TileSet | None = None
 
     def __init__(
         self,
@@ -111,15 +104,43 @@ class Store:
         self.frame = LocalFrame.at(origin, axes)
         check_grid(self.voxel, self.origin)
         self.options = options or MemoryOptions()
-        self.columns = Columns(device)
-        self.segments = Segments()
         self.views = ViewTable(self.frame)
         self.levels = VoxelLevels(self.voxel, self.options.voxels_per_footprint)
-        self.index = VoxelIndex()
-        self.agreements: dict[
-            int, list[tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.float32]]]
-        ] = {}
+        # How often something was fused or forgotten, and how often that touched observed content.
         self.changes = self.observed_changes = 0
+        self.hold(Observations(self.voxel, self.options.weight_cap, device))
+
+    def hold(self, whole: Observations) -> None:
+        """Keep these observations, in one tile in RAM."""
+        self.tiles = TileSet(whole, self.views)
+        # Of all observations, in RAM.
+        self.segments = whole.segments
+
+    @property
+    def in_ram(self) -> bool:
+        """Whether all observations are in RAM, in one tile."""
+        return self.tiles.whole is not None
+
+    @property
+    def whole(self) -> Observations:
+        """All observations; refused where they are in tiles on disk."""
+        if self.tiles.whole is None:
+            raise OptionError(
+                f"the memory's {len(self):,} observations are in tiles on disk, larger than its "
+                "budget; take memory.overview(MOST) for at most so many of them in RAM, or raise "
+                "memory.budget"
+            )
+        return self.tiles.whole
+
+    @property
+    def columns(self) -> Columns:
+        """The observations as columns."""
+        return self.whole.columns
+
+    @property
+    def agreements(self) -> dict[int, list[Agreement]]:
+        """By round, what its views added to the confidence of earlier rounds' observations."""
+        return self.whole.agreements
 
     @property
     def origin(self) -> NDArray[np.float64]:
@@ -139,7 +160,7 @@ class Store:
     @property
     def voxels(self) -> int:
         """Number of occupied voxels."""
-        return self.index.voxels
+        return self.tiles.voxels
 
     @property
     def cloud(self) -> o3d.t.geometry.PointCloud:
@@ -181,9 +202,8 @@ class Store:
 
     @property
     def stored_bytes(self) -> int:
-        """Bytes of the observations, their segments and index, and what was agreed."""
-        agreed = sum(array.nbytes for log in self.agreements.values() for e in log for array in e)
-        return self.columns.nbytes + self.segments.nbytes + self.index.nbytes + agreed
+        """Bytes of the observations, their segments, index and agreements, in RAM or not."""
+        return self.tiles.size + (0 if self.in_ram else self.segments.nbytes)
 
     @property
     def generated_count(self) -> int:
@@ -197,17 +217,18 @@ class Store:
 
     def _count_of(self, kind: NDArray[np.bool_]) -> int:
         """Number of observations of the views that are of a kind, (views,)."""
-        segments, n = self.segments, self.segments.count
-        return int(segments.length[:n][kind[segments.view[:n]]].sum(dtype=np.int64))
+        rows = self.segments.rows()
+        return int(rows["length"][kind[rows["view"]]].sum(dtype=np.int64))
 
     def __len__(self) -> int:
         """Number of stored observations."""
-        return self.columns.count
+        return self.segments.observations
 
     def __repr__(self) -> str:
         generated, scanned = self.generated_count, self.scanned_count
         apart = f"{generated:,} generated" + (f", {scanned:,} scanned" if scanned else "")
-        where = "" if self.columns.device == "cpu" else f" on {self.columns.device}"
+        device = self.columns.device if self.in_ram else "cpu"
+        where = "" if device == "cpu" else f" on {device}"
         return (
             f"{type(self).__name__}({len(self):,} observations ({apart}) in "
             f"{self.voxels:,} voxels of {self.voxel:g}, {len(self.views)} views, "
@@ -223,21 +244,9 @@ class Store:
             if not views.generated[i]
         ]
 
-    def agree(self, rows: NDArray[np.int32], weights: NDArray[np.float32], *, round: int) -> None:
-        """Raise the confidence of ``rows``, each once, up to the cap; ``forget`` can undo it."""
-        confidence = self.columns.arrays.confidence
-        before = confidence[rows]
-        with np.errstate(over="ignore"):
-            confidence[rows] = np.minimum(before + weights, np.float32(self.options.weight_cap))
-        self.agreements.setdefault(round, []).append((rows, weights, before))
-
     def own_confidence(self) -> NDArray[np.float32]:
         """(N,) float32, a copy: confidence without what later rounds added."""
-        own = self.columns.confidence.copy()
-        for round_ in sorted(self.agreements, reverse=True):
-            for rows, _, before in reversed(self.agreements[round_]):
-                own[rows] = before
-        return own
+        return self.whole.own_confidence()
 
     def forget(self, *, round: int) -> int:
         """Undo a round: its views, its observations and the confidence it added elsewhere.
@@ -252,56 +261,43 @@ class Store:
             raise OptionError(f"round {round} is not in the memory; it has rounds {self.rounds}")
         self.changes += 1
         self.observed_changes += 1
-        keep = self.views.round != round
-        kept = ViewTable(self.frame, [self.views[int(i)] for i in np.flatnonzero(keep)])
-        return self.drop_views(keep, kept, round=round)
+        before, keep = len(self), self.views.round != round
+        if self.in_ram:
+            self.whole.drop_views(keep, round=round)
+            self.segments = self.whole.segments
+        else:
+            self.tiles.drop_views(self.segments, keep, round=round)
+            self.segments = self.segments.without_views(keep)
+        self.views.select(keep)
+        return before - len(self)
 
-    def drop_views(self, keep_view: NDArray[np.bool_], kept: ViewTable, *, round: int) -> int:
-        """Remove the views that are not kept, all those of a round; see ``forget``.
+    def page_if_large(self) -> None:
+        """Move to tiles if half of the budget is used."""
+        if self.tiles.outgrown():
+            self.segments = self.tiles.page()
 
-        Args:
-            keep_view: (views,) bool.
-            kept: the table of those that are kept.
-            round: number of the round.
-        """
-        columns, count = self.columns, len(self)
-        new_view = (np.cumsum(keep_view) - 1).astype(np.int32)
-        keep = keep_view[columns.view]
-        new_row = (np.cumsum(keep) - 1).astype(np.int32)
-        # Reset confidence to what each observation had in its own round, remove the round's rows
-        # and renumber the rest, then repeat what the other rounds added.
-        columns.arrays.confidence[:count] = self.own_confidence()
-        logs, self.agreements = self.agreements, {}
-        columns.replace(int(keep.sum()), lambda name: getattr(columns, name)[keep])
-        columns.view[:] = new_view[columns.view]
-        self.views = kept
-        for number in sorted(set(logs) - {round}):
-            for rows, weights, _ in logs[number]:
-                self.agree(new_row[rows[keep[rows]]], weights[keep[rows]], round=number)
-        # A segment holds one view's observations, so it stays or goes as a whole.
-        segments, n = self.segments, self.segments.count
-        stays = keep_view[segments.view[:n]]
-        self.segments = Segments()
-        self.segments.append(
-            new_row[segments.start[:n][stays]].astype(np.int64), segments.length[:n][stays],
-            new_view[segments.view[:n][stays]], box=segments.box[:n][stays],
-        )  # fmt: skip
-        self.rebuild_index()
-        return count - len(self)
+    def compact(self) -> int:
+        """Join small neighbouring tiles, as after ``forget``; returns how many fewer there are."""
+        with self.tiles.lock:
+            return self.tiles.join_small()
 
-    def rebuild_index(self) -> None:
-        """Make the voxel index anew from the observations (after loading or forgetting)."""
-        count, columns = len(self), self.columns
-        keys, locals_ = np.empty(count, np.int64), np.empty(count, np.uint16)
-        inverse = 1.0 / self.voxel
-        if voxel_keys(columns.positions, columns.level, inverse, keys, locals_):
-            raise OptionError(f"observations lie beyond the reach of voxels of {self.voxel:g}")
-        self.index = VoxelIndex()
-        self.index.top = int(columns.level.max(initial=0))
-        blocks = self.index.block_numbers(keys)
-        self.index.reserve_voxels(count, np.unique(blocks))
-        link_records(locals_, self.index.arrays, blocks, columns.arrays.next)
-        self.index.voxels = int(self.index.block_count[: self.index.blocks].sum())
+    def close(self) -> None:
+        """Remove what a memory in tiles keeps on disk beside what was saved; nothing in RAM."""
+        self.tiles.close()
+
+    def _copy(self: S, whole: Observations | None = None) -> S:
+        """This memory with a view table of its own, and with other observations in RAM."""
+        other = copy(self)
+        other.views = ViewTable(self.frame, self.views)
+        if whole is None:
+            other.segments = copy(self.segments)
+        else:
+            other.hold(whole)
+            other.tiles.budget, other.tiles.scratch = self.tiles.budget, self.tiles.scratch
+        return other
+
+    def __deepcopy__(self: S, _: dict[int, Any]) -> S:
+        return self.to(self.columns.device)
 
     def snapshot(self: S) -> S:
         """A read-only view of this memory, for projecting observed content in another thread.
@@ -310,21 +306,14 @@ class Store:
         original and forget no round; never fuse into the snapshot. Its generated observations may
         change meanwhile, its observed ones do not.
         """
-        other = copy(self)
-        other.columns, other.segments = copy(self.columns), copy(self.segments)
-        other.views = ViewTable(self.frame, [self.views[i] for i in range(len(self.views))])
-        return other
+        return self._copy(self.whole.snapshot() if self.in_ram else None)
 
     def recolored(self: S, colors: NDArray[np.uint8]) -> S:
         """A snapshot with other colours (N, 3); nothing else is copied."""
-        other = self.snapshot()
-        other.columns = self.columns.with_colors(colors)
-        return other
+        whole = self.whole.snapshot()
+        whole.columns = self.columns.with_colors(colors)
+        return self._copy(whole)
 
     def to(self: S, device: str) -> S:
         """A copy of this memory, independent of it, whose tensors live on a device."""
-        other = self.snapshot()
-        other.columns = self.columns.to(device)
-        other.segments, other.index = deepcopy(self.segments), deepcopy(self.index)
-        other.agreements = {round_: list(log) for round_, log in self.agreements.items()}
-        return other
+        return self._copy(self.whole.to(device))

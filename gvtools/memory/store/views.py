@@ -1,4 +1,4 @@
-"""From where the memory's observations were seen."""
+"""Views of a memory: points on their way in, the cameras that saw them, and their table."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras, concatenate
+from gvtools.errors import ShapeError
 from gvtools.memory.store.local_frame import LocalFrame
 
 # K (3, 3), cam_from_world (4, 4) and free-space grid (h, w) of one view (see PointSet).
@@ -16,21 +17,48 @@ FreeGrid = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float32]]
 
 
 @dataclass(frozen=True, eq=False)
-class SourceView:
-    """One fused view.
+class PointSet:
+    """N points seen by one camera, a batch of one, in ``frame``."""
 
-    Attributes:
-        camera: a batch of one, in the world frame.
-        round: the round it was fused in.
-        generated: True when a completer made it.
-        free_depth: (h, w) float32, see PointSet; (0, 0) when unknown.
-        scanned: True for a station of a scan, which has no photograph.
-    """
+    positions: NDArray[np.float32]
+    colors: NDArray[np.uint8]
+    # > 0.
+    confidence: NDArray[np.float32]
+    # The width of the surface patch that a point stands for, scene units.
+    spacing: NDArray[np.float32]
+    camera: Cameras
+    frame: LocalFrame
+    # (h, w) scene units, a coarse grid over the camera's image: space nearer than this along a
+    # cell's rays was seen to be empty; 0 where nothing is known.
+    free_depth: NDArray[np.float32] | None
+    # How many pixels gave no point, by reason.
+    dropped: dict[str, int]
+
+    def __post_init__(self) -> None:
+        count = len(self.positions)
+        for name, array, shape in (
+            ("positions", self.positions, (count, 3)),
+            ("colors", self.colors, (count, 3)),
+            ("confidence", self.confidence, (count,)),
+            ("spacing", self.spacing, (count,)),
+        ):
+            if array.shape != shape:
+                raise ShapeError(f"points: {name} has shape {array.shape}; expected {shape}")
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+
+@dataclass(frozen=True, eq=False)
+class SourceView:
+    """One fused view: its camera is a batch of one, in the world frame."""
 
     camera: Cameras
     round: int
     generated: bool
+    # See PointSet; (0, 0) when unknown.
     free_depth: NDArray[np.float32]
+    # True for a station of a scan, which has no photograph.
     scanned: bool = False
 
 
@@ -89,6 +117,12 @@ class ViewTable:
         local = self.frame.cam_from_local(view.camera.cam_from_world)
         self.cam_from_local = np.concatenate([self.cam_from_local, local])
         return len(self._views) - 1
+
+    def select(self, keep: NDArray[np.bool_]) -> None:
+        """Keep some views, in their order."""
+        self._views = [view for view, stays in zip(self._views, keep, strict=True) if stays]
+        for name in ("round", "generated", "scanned", "centers", "cam_from_local"):
+            setattr(self, name, getattr(self, name)[keep])
 
 
 def _continues(last: SourceView, view: SourceView) -> bool:

@@ -11,8 +11,8 @@ from run_files import Killed
 from tiny_scan import write_scan
 
 from gvtools.errors import ProjectError
-from gvtools.memory.tiled_memory import TiledMemory
-from gvtools.memory.tiles import tile_set
+from gvtools.memory.spatial_memory import TiledMemory
+from gvtools.memory.store import tile_set
 from gvtools.runs.memory_file import load_memory
 from gvtools.runs.run import load_run
 from gvtools.scenes.project import open_project
@@ -103,7 +103,7 @@ def test_other_settings_still_belong_to_another_run(scan, tiled):
 
 def test_rounds_are_forgotten_when_a_run_is_read(tiled, in_ram):
     found, expected = (load_memory(path, up_to=1) for path in (tiled, in_ram))
-    assert isinstance(found, TiledMemory) and found.tiles is not None
+    assert isinstance(found, TiledMemory) and not found.in_ram
     assert (len(found), found.voxels, found.rounds) == (
         len(expected), expected.voxels, expected.rounds,
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""One tile: a store of its own while it is in RAM, a file of checksummed arrays otherwise."""
+"""One tile of a memory: observations in RAM, or a file of checksummed arrays."""
 
 from __future__ import annotations
 
@@ -10,49 +10,40 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.errors import MemoryFileError
-from gvtools.memory.store.columns import LAYOUT, Segments
-from gvtools.memory.store.store import Store
+from gvtools.memory.store.array_file import ArrayFile, write_arrays
+from gvtools.memory.store.columns import LAYOUT, Segments, SplatColumns
+from gvtools.memory.store.observations import Agreement, Observations
+from gvtools.memory.store.octree import Node
+from gvtools.memory.store.thinned_copies import DOUBLINGS, ThinnedCopy, thinned_copy
+from gvtools.memory.store.views import ViewTable
 from gvtools.memory.store.voxel_index import MOST_LEVEL
-from gvtools.memory.tiles.array_file import ArrayFile, write_arrays
-from gvtools.memory.tiles.octree import Node
-from gvtools.memory.tiles.thinned_copies import DOUBLINGS, Drawn, ThinnedCopy, thinned_copy
 
-SEGMENT_ARRAYS = ("start", "length", "view", "box")
+# ``round`` and ``generated`` follow from the view, ``next`` from the voxels.
 COLUMNS = ("positions", "colors", "confidence", "spacing", "view", "level")
 # Bytes of an observation that projection maps.
-DRAWN_BYTES = 23
-# Rows, confidence added and confidence before, of one view that agreed.
-Agreement = tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.float32]]
+SPLAT_BYTES = 23
 
 
 @dataclass(eq=False)
 class Tile:
-    """A cube of voxels.
-
-    Attributes:
-        node: the cube.
-        segments: (S,) int32, its segments by their row in the memory's table, in its own order.
-        store: its observations while they are in RAM.
-        file: where they lie otherwise; of an older state while ``dirty``.
-        owned: whether the file lies in the working folder, so that nobody else reads it.
-        dirty: whether ``store`` has changed since it was written.
-        size: bytes of its store, in RAM or not.
-        count: observations.
-        voxels: occupied ones.
-        agreed: rounds that added confidence here.
-        indivisible: bytes at which it was found not to divide; 0 otherwise.
-    """
+    """A cube of voxels."""
 
     node: Node
+    # (S,) its segments by their row in the memory's table, in its own order.
     segments: NDArray[np.int32] = field(default_factory=lambda: np.empty(0, np.int32))
-    store: Store | None = None
+    # Its observations while they are in RAM; where they lie otherwise, or an older state of them.
+    store: Observations | None = None
     file: Path | None = None
+    # Whether the file lies in the working folder, so that nobody else reads it.
     owned: bool = True
+    # Whether ``store`` has changed since it was written.
     dirty: bool = False
+    # Bytes, observations, occupied voxels, and rounds that added confidence here; in RAM or not.
     size: int = 0
     count: int = 0
     voxels: int = 0
     agreed: tuple[int, ...] = ()
+    # Bytes at which it was found not to divide; 0 otherwise.
     indivisible: int = 0
     mapped: ArrayFile | None = None
     _copies: dict[int, ThinnedCopy] = field(default_factory=dict)
@@ -62,10 +53,10 @@ class Tile:
         """Bytes that it takes in RAM now."""
         total = 0
         if self.store is not None:
-            total += self.store.stored_bytes
+            total += self.store.nbytes
             total += sum(sum(c.nbytes for c in copy.rows) for copy in self._copies.values())
         if self.mapped is not None:
-            total += DRAWN_BYTES * int(self.mapped.meta["count"])
+            total += SPLAT_BYTES * int(self.mapped.meta["count"])
         return total
 
     def changed(self) -> None:
@@ -74,29 +65,28 @@ class Tile:
         self.dirty = True
         self._copies.clear()
         self.mapped = None
-        self.size, self.count = self.store.stored_bytes, len(self.store)
-        self.voxels = self.store.voxels
+        self.size, self.count = self.store.nbytes, len(self.store)
+        self.voxels = self.store.index.voxels
         self.agreed = tuple(sorted(self.store.agreements))
 
-    def drawn(self) -> Drawn:
+    def splat_columns(self) -> SplatColumns:
         """All observations, as splatting reads them."""
         if self.store is not None:
-            arrays = self.store.columns.arrays
-            return Drawn(arrays.positions, arrays.colors, arrays.confidence, arrays.spacing)
+            return self.store.columns.splat
         file = self._open()
-        rows = Drawn(*(file.array(name) for name in Drawn._fields))
-        check(file, _numbers(rows))
+        rows = SplatColumns(*(file.array(name) for name in SplatColumns._fields))
+        check(file, _finite(rows))
         return rows
 
     def thinned(self, doublings: int) -> ThinnedCopy:
         """The thinned copy whose cubes are 2**doublings voxels wide."""
         if self.store is None:
             file, head = self._open(), f"thinned{doublings}_"
-            rows = Drawn(*(file.array(f"{head}{name}") for name in Drawn._fields))
+            rows = SplatColumns(*(file.array(f"{head}{name}") for name in SplatColumns._fields))
             start = file.array(f"{head}start")
             check(file, len(start) == len(self.segments) + 1 and _alike(file, head, rows))
             check(file, start[0] == 0 and start[-1] == len(rows.spacing))
-            check(file, bool((np.diff(start) >= 0).all()) and _numbers(rows))
+            check(file, bool((np.diff(start) >= 0).all()) and _finite(rows))
             return ThinnedCopy(start, rows)
         if doublings not in self._copies:
             self._copies[doublings] = thinned_copy(self.store, doublings)
@@ -114,26 +104,14 @@ class Tile:
     def agreements(self) -> list[tuple[int, Agreement]]:
         """(round, (rows, confidence added, confidence before)) of each view that agreed here."""
         if self.store is not None:
-            log = self.store.agreements
-            return [(number, entry) for number in sorted(log) for entry in log[number]]
+            return self.store.agreement_log()
         return read_agreements(self._open())
 
     def write(self, path: Path) -> None:
         """Write its store to a file, which it is then read from."""
         store = self.store
         assert store is not None
-        columns, segments = store.columns, store.segments
-        arrays: dict[str, NDArray[Any]] = {name: getattr(columns, name) for name in COLUMNS}
-        for name in SEGMENT_ARRAYS:
-            arrays[f"segment_{name}"] = getattr(segments, name)[: segments.count]
-        entries = self.agreements()
-        lengths = [len(entry[0]) for _, entry in entries]
-        arrays["agreement_round"] = np.array([number for number, _ in entries], np.int32)
-        arrays["agreement_start"] = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
-        kinds = {"row": np.int32, "weight": np.float32, "before": np.float32}
-        for k, (name, kind) in enumerate(kinds.items()):
-            parts = [np.empty(0, kind), *(entry[k] for _, entry in entries)]
-            arrays[f"agreement_{name}"] = np.concatenate(parts)
+        arrays = observation_arrays(store)
         for doublings in DOUBLINGS:
             copy = self.thinned(doublings)
             arrays[f"thinned{doublings}_start"] = copy.start
@@ -147,15 +125,18 @@ class Tile:
         self.store = self.mapped = None
         self._copies.clear()
 
-    def load(self, empty: Store) -> None:
-        """Bring its store into RAM; ``empty``, which knows the views, is filled."""
+    def load(self, empty: Observations, views: ViewTable) -> None:
+        """Bring its observations into RAM; ``empty`` is filled."""
         if self.file is not None:
             file = self._open()
             self.mapped = None
-            _check(file, len(empty.views))
-            fill_store(empty, file)
-            for number, (rows, weights, before) in read_agreements(file):
-                empty.agreements.setdefault(number, []).append((rows, weights, before))
+            _check(file, len(views))
+            arrays = {name: file.array(name) for name in COLUMNS}
+            arrays |= {f"segment_{name}": file.array(f"segment_{name}") for name in Segments.LAYOUT}
+            fill(empty, arrays, views)
+            for number, entry in read_agreements(file):
+                empty.agreements.setdefault(number, []).append(entry)
+            empty.rebuild_index()
         self.store = empty
 
     def _open(self) -> ArrayFile:
@@ -166,18 +147,39 @@ class Tile:
         return self.mapped
 
 
-def fill_store(store: Store, file: ArrayFile) -> None:
-    """Columns, segments and index of a tile's store from its file."""
-    view, views = file.array("view"), store.views
-    made = {"round": views.round[view], "generated": views.generated[view]}
-    made["next"] = np.full(len(view), -1)
-    store.columns.replace(len(view), lambda name: made[name] if name in made else file.array(name))
-    store.segments = read_segments(file)
-    store.rebuild_index()
+def observation_arrays(observations: Observations) -> dict[str, NDArray[Any]]:
+    """Columns, segments and agreements as files hold them."""
+    columns = observations.columns
+    arrays: dict[str, NDArray[Any]] = {name: getattr(columns, name) for name in COLUMNS}
+    arrays |= {f"segment_{k}": rows for k, rows in observations.segments.rows().items()}
+    log = observations.agreement_log()
+    lengths = [len(entry[0]) for _, entry in log]
+    arrays["agreement_round"] = np.array([number for number, _ in log], np.int32)
+    arrays["agreement_start"] = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
+    kinds = {"row": np.int32, "weight": np.float32, "before": np.float32}
+    for k, (name, kind) in enumerate(kinds.items()):
+        parts = [np.empty(0, kind), *(entry[k] for _, entry in log)]
+        arrays[f"agreement_{name}"] = np.concatenate(parts)
+    return arrays
+
+
+def fill(empty: Observations, arrays: dict[str, NDArray[Any]], views: ViewTable) -> None:
+    """Take columns and segments of ``observation_arrays``; the index is to be built."""
+    view = arrays["view"]
+    columns = {name: arrays[name] for name in COLUMNS} | of_views(view, views)
+    empty.columns.replace(len(view), columns.__getitem__)
+    empty.segments.append(*(arrays[f"segment_{k}"] for k in ("start", "length", "view")),
+                          box=arrays["segment_box"])  # fmt: skip
+
+
+def of_views(view: NDArray[np.int32], views: ViewTable) -> dict[str, NDArray[Any]]:
+    """The columns that follow from the view: round, generated, and empty chains."""
+    none = np.full(len(view), -1, np.int32)
+    return {"round": views.round[view], "generated": views.generated[view], "next": none}
 
 
 def read_agreements(file: ArrayFile) -> list[tuple[int, Agreement]]:
-    """See ``Tile.agreements``."""
+    """The agreements in a tile's file, see ``Observations.agreement_log``."""
     ends = file.array("agreement_start").tolist()
     row, weight, before = (file.array(f"agreement_{name}") for name in ("row", "weight", "before"))
     return [
@@ -191,7 +193,7 @@ def read_agreements(file: ArrayFile) -> list[tuple[int, Agreement]]:
 def read_segments(file: ArrayFile) -> Segments:
     """The segments of a tile's file."""
     segments = Segments()
-    start, length, view, box = (file.array(f"segment_{name}") for name in SEGMENT_ARRAYS)
+    start, length, view, box = (file.array(f"segment_{name}") for name in Segments.LAYOUT)
     segments.append(start, length, view, box=box)
     return segments
 
@@ -213,18 +215,13 @@ def check_shapes(file: ArrayFile) -> None:
 
 def check_segments(file: ArrayFile, segments: Segments, views: int) -> None:
     """Whether segments cover the observations, one behind the other."""
-    n = segments.count
-    start, length, view = (
-        segments.start[:n],
-        segments.length[:n].astype(np.int64),
-        segments.view[:n],
-    )
-    ends = np.cumsum(length)
+    start, length, view, box = segments.rows().values()
+    ends = np.cumsum(length, dtype=np.int64)
     check(file, bool((length > 0).all()) and np.array_equal(start, ends - length))
-    check(file, (int(ends[-1]) if n else 0) == file.meta.get("count"))
+    check(file, segments.observations == file.meta.get("count"))
     # A box of nothing is infinite.
-    check(file, not np.isnan(segments.box[:n]).any())
-    check(file, not n or bool(0 <= view.min() <= view.max() < views))
+    check(file, not np.isnan(box).any())
+    check(file, not len(view) or bool(0 <= view.min() <= view.max() < views))
 
 
 def _check(file: ArrayFile, views: int) -> None:
@@ -235,9 +232,9 @@ def _check(file: ArrayFile, views: int) -> None:
     check(file, int(level.max(initial=0)) <= MOST_LEVEL)
     check(file, not len(row) or bool(0 <= row.min() <= row.max() < count))
     check_segments(file, read_segments(file), views)
-    drawn = Drawn(*(file.array(name) for name in Drawn._fields))
-    check(file, _numbers(drawn) and bool((drawn.confidence >= 0).all()))
-    check(file, bool((drawn.spacing >= 0).all()))
+    splat = SplatColumns(*(file.array(name) for name in SplatColumns._fields))
+    check(file, _finite(splat) and bool((splat.confidence >= 0).all()))
+    check(file, bool((splat.spacing >= 0).all()))
     number, start = file.array("agreement_round"), file.array("agreement_start")
     check(file, start.shape == (len(number) + 1,) and int(start[0]) == 0)
     check(file, int(start[-1]) == len(row) and bool((np.diff(start) >= 0).all()))
@@ -246,12 +243,12 @@ def _check(file: ArrayFile, views: int) -> None:
         check(file, values.shape == row.shape and bool(np.isfinite(values).all()))
 
 
-def _numbers(rows: Drawn) -> bool:
+def _finite(rows: SplatColumns) -> bool:
     """Whether the values of observations are finite."""
     return bool(all(np.isfinite(column).all() for column in rows if column.dtype.kind == "f"))
 
 
-def _alike(file: ArrayFile, head: str, rows: Drawn) -> bool:
+def _alike(file: ArrayFile, head: str, rows: SplatColumns) -> bool:
     """Whether a thinned copy's columns have one length and their types."""
     count = len(rows.spacing)
     return all(

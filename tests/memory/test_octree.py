@@ -2,9 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gvtools.memory.store.voxel_index import voxel_keys
-from gvtools.memory.store.voxel_levels import VoxelLevels
-from gvtools.memory.tiles.octree import (
+from gvtools.memory.store.octree import (
     FAR,
     ROOT,
     WHOLE,
@@ -13,6 +11,8 @@ from gvtools.memory.tiles.octree import (
     cell_keys,
     parent,
 )
+from gvtools.memory.store.voxel_index import voxel_keys
+from gvtools.memory.store.voxel_levels import VoxelLevels
 
 VOXEL = 0.01
 

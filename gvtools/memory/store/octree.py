@@ -1,4 +1,4 @@
-"""Which tile a point belongs to: cubes of an octree over cells that are 128 finest voxels wide.
+"""An octree of tiles' cubes over cells that are 128 finest voxels wide.
 
 The widest voxel is one cell wide, so a voxel of any level lies in one tile, and each tile can be
 fused by itself.
@@ -47,19 +47,13 @@ def cell_coordinates(keys: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 class Octree:
-    """An octree whose leaves are the cubes of tiles.
-
-    The tile of each cell is cached until its cube is divided or joined.
-
-    Attributes:
-        leaves: tile numbers by cube.
-        divided: cubes that are divided into smaller ones.
-        usual: expected level of a tile that holds only the finest voxels, from the last division.
-    """
+    """An octree whose leaves are the cubes of tiles; the tile of each cell is cached."""
 
     def __init__(self) -> None:
+        # Tile numbers by cube, and cubes that are divided into smaller ones.
         self.leaves: dict[Node, int] = {}
         self.divided: set[Node] = set()
+        # Expected level of a tile that holds only the finest voxels, from the last division.
         self.usual = ROOT
         self._cells = VoxelIndex()
         self._keys: list[int] = []

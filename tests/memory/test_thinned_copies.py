@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 from memory_scenes import camera, plane_view, random_points
 
-from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory
+from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory, TiledMemory
 from gvtools.memory.splat.api import SplatOptions
-from gvtools.memory.splat.paged import PagedSplatter
-from gvtools.memory.tiled_memory import TiledMemory
-from gvtools.memory.tiles import tile_set
-from gvtools.memory.tiles.thinned_copies import DOUBLINGS, thinned_copy
+from gvtools.memory.store import tile_set
+from gvtools.memory.store.thinned_copies import DOUBLINGS, thinned_copy
+from gvtools.memory.store.tile_set import TileSet
 
 
 @pytest.mark.parametrize("doublings", DOUBLINGS)
@@ -21,7 +20,7 @@ def test_each_segment_keeps_one_observation_a_cube(doublings):
     memory = SpatialMemory(0.02)
     for i in range(3):
         memory.fuse(random_points(np.random.default_rng(i), 800, name=f"{i}"), round=0)
-    copy = thinned_copy(memory, doublings)
+    copy = thinned_copy(memory.whole, doublings)
     columns, segments = memory.columns, memory.segments
     assert copy.start[-1] == len(copy.rows.positions) < len(memory)
     for s in range(segments.count):
@@ -52,16 +51,16 @@ def test_far_tiles_are_drawn_from_thinned_copies(tmp_path, monkeypatch):
     for x in (-0.5, 0.0, 0.5):
         near = camera(width=160, height=120, focal=150, center=(x, 0, 0))
         memory.fuse(plane_view(near, 2.0, color=color), round=0)
-    assert memory.tiles is not None
+    assert not memory.in_ram
     drawn = []
-    gathered = PagedSplatter._gathered
+    gathered = TileSet.gather
 
-    def counted(self, target, part):
-        found = gathered(self, target, part)
-        drawn.append(len(found.rows.positions))
+    def counted(self, segments, chosen, **options):
+        found = gathered(self, segments, chosen, **options)
+        drawn.append(len(found.columns.positions))
         return found
 
-    monkeypatch.setattr(PagedSplatter, "_gathered", counted)
+    monkeypatch.setattr(TileSet, "gather", counted)
     far = camera(width=160, height=120, focal=150, center=(0, 0, -8))
     whole = memory.project(far)
     every, drawn[:] = sum(drawn), []

@@ -13,11 +13,10 @@ from memory_scenes import random_camera, random_points
 from gvtools.errors import MemoryFileError, OptionError, ProjectError
 from gvtools.guidance import IMAGES
 from gvtools.memory.io.ply import export_memory_ply
-from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory
+from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory, TiledMemory
 from gvtools.memory.splat.api import SplatOptions
+from gvtools.memory.store import array_file, tile_set
 from gvtools.memory.store.columns import ATTRIBUTES
-from gvtools.memory.tiled_memory import TiledMemory
-from gvtools.memory.tiles import array_file, gathering, tile_set
 from gvtools.ply import read_ply
 
 VOXEL, ORIGIN, VIEWS, BUDGET = 0.01, (1.0, 2.0, 3.0), 10, 1_000_000
@@ -63,7 +62,7 @@ def tiled(tmp_path, small_tiles):
 
 def assert_same(memory, expected, *, order=True):
     """Same observations, segments, agreements and pictures."""
-    assert memory.tiles is not None
+    assert not memory.in_ram
     assert (len(memory), memory.voxels) == (len(expected), expected.voxels)
     whole = memory.overview(10**9)
     rows, other = (
@@ -101,7 +100,7 @@ def test_observations_reports_and_pictures_are_those_of_a_memory_in_ram(tiled, e
 
 def test_it_stays_in_ram_while_it_fits(expected, tmp_path):
     memory, _ = in_tiles(tmp_path, budget=100_000_000)
-    assert memory.tiles is None
+    assert memory.in_ram
     assert memory.save(tmp_path / "m.npz").read_bytes() == saved(expected[0], tmp_path / "r.npz")
     assert not list(tmp_path.glob("gvtools-tiles-*"))
 
@@ -111,7 +110,7 @@ def saved(memory, path):
 
 
 def test_pictures_gathered_in_parts_are_the_same(tiled, expected, monkeypatch):
-    monkeypatch.setattr(gathering, "SHARE", 1e-9)
+    monkeypatch.setattr(tile_set, "GATHERED", 1e-9)
     for camera in CAMERAS[:1]:
         found, wanted = tiled[0].project(camera), expected[0].project(camera)
         for name in IMAGES:
@@ -228,7 +227,7 @@ def test_a_full_disk_loses_nothing(tmp_path, expected, monkeypatch):
         raise ProjectError("no space") from OSError(errno.ENOSPC, "no space")
 
     with monkeypatch.context() as patch:
-        patch.setattr("gvtools.memory.tiles.tile.write_arrays", full)
+        patch.setattr("gvtools.memory.store.tile.write_arrays", full)
         with pytest.raises(ProjectError, match="no space"):
             for number, tile in list(memory.tiles):
                 tile.dirty = True
@@ -254,7 +253,7 @@ def test_what_was_saved_is_read_back(tiled, expected, tmp_path):
     assert again.save(folder) == folder
     assert_same(TiledMemory.load(folder), more)
     names = {path.name for path in folder.glob("*.tile")}
-    assert again.tiles is not None and len(names) == len(list(again.tiles))
+    assert not again.in_ram and len(names) == len(list(again.tiles))
     assert {path.name for path in folder.iterdir()} == {*names, "memory.index"}
 
 

@@ -1,8 +1,4 @@
-"""Level of detail: thinned copies of a tile's segments, for distant cameras.
-
-In a copy, the observations of a segment that lie in one cube of 4, or of 16, voxels a side become
-one, their mean weighted by confidence. So a copy's segments have the same block and view.
-"""
+"""Thinned copies of observations for distant cameras, and copies of whole segments."""
 
 # mypy: no-check-untyped-defs
 
@@ -14,52 +10,44 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.kernels import compiled
-from gvtools.memory.store.store import Store
+from gvtools.memory.store.columns import SplatColumns
+from gvtools.memory.store.observations import Observations
 from gvtools.memory.store.voxel_index import LOCAL_MASK
 
-# The cubes of the copies are 2**2 and 2**4 voxels wide.
+# In a copy, the observations of a segment that lie in one cube of 2**2, or of 2**4, voxels a side
+# become one, their mean weighted by confidence. So its segments have the same block and view.
 DOUBLINGS = (2, 4)
-
-
-class Drawn(NamedTuple):
-    """The columns that splatting reads: (N, 3), (N, 3), (N,) and (N,), see ColumnArrays."""
-
-    positions: NDArray[np.float32]
-    colors: NDArray[np.uint8]
-    confidence: NDArray[np.float32]
-    spacing: NDArray[np.float32]
 
 
 class ThinnedCopy(NamedTuple):
     """One copy: the observations, and where each segment's begin, (S + 1,) int32."""
 
     start: NDArray[np.int32]
-    rows: Drawn
+    rows: SplatColumns
 
 
-def drawn(count: int) -> Drawn:
+def empty_columns(count: int) -> SplatColumns:
     """Uninitialised columns for ``count`` observations."""
     single = np.float32
-    return Drawn(
+    return SplatColumns(
         np.empty((count, 3), single), np.empty((count, 3), np.uint8),
         np.empty(count, single), np.empty(count, single),
     )  # fmt: skip
 
 
-def thinned_copy(store: Store, doublings: int) -> ThinnedCopy:
-    """The copy of a tile whose cubes are 2**doublings voxels wide."""
-    segments, arrays = store.segments, store.columns.arrays
-    rows = drawn(len(store))
+def thinned_copy(observations: Observations, doublings: int) -> ThinnedCopy:
+    """The copy whose cubes are 2**doublings voxels wide."""
+    segments, arrays = observations.segments, observations.columns.arrays
+    rows = empty_columns(len(observations))
     start = np.zeros(segments.count + 1, np.int32)
     n = _thin(
-        segments.start[: segments.count], segments.length, arrays.positions, arrays.colors,
-        arrays.confidence, arrays.spacing, arrays.level, 1.0 / store.voxel, doublings, start, *rows,
+        segments.start[: segments.count], segments.length, *observations.columns.splat,
+        arrays.level, 1.0 / observations.voxel, doublings, start, *rows,
     )  # fmt: skip
-    kept = Drawn(
+    return ThinnedCopy(start, SplatColumns(
         rows.positions[:n].copy(), rows.colors[:n].copy(),
         rows.confidence[:n].copy(), rows.spacing[:n].copy(),
-    )  # fmt: skip
-    return ThinnedCopy(start, kept)
+    ))  # fmt: skip
 
 
 @compiled()
@@ -109,18 +97,7 @@ def _thin(
 
 @compiled()
 def copy_rows(begin, end, which, start, length, source, at, target):
-    """Copy segments ``which[begin:end]`` into ``target``.
-
-    Args:
-        begin: of the part, see ``in_threads``.
-        end: likewise.
-        which: (n,) int64, the segments.
-        start: (n,) int64, where each begins in ``source``.
-        length: (n,) int64.
-        source: Drawn.
-        at: (n,) int64, where each begins in ``target``.
-        target: Drawn, is written.
-    """
+    """Copy segments ``which[begin:end]`` from ``start`` in ``source`` to ``at`` in ``target``."""
     for i in range(begin, end):
         j = which[i]
         a, b, n = start[j], at[j], length[j]

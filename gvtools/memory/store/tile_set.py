@@ -1,0 +1,476 @@
+"""The container of a memory's observations: one tile in RAM, or many of which some are in files."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import threading
+import weakref
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.errors import ProjectError
+from gvtools.kernels import in_threads
+from gvtools.memory.store.columns import SegmentPlaces, Segments, SplatColumns
+from gvtools.memory.store.observations import Observations
+from gvtools.memory.store.octree import (
+    FAR,
+    FAR_KEY,
+    WHOLE,
+    Node,
+    Octree,
+    cell_coordinates,
+    cell_keys,
+)
+from gvtools.memory.store.thinned_copies import copy_rows, empty_columns
+from gvtools.memory.store.tile import SPLAT_BYTES, Tile
+from gvtools.memory.store.views import ViewTable
+from gvtools.memory.store.voxel_index import group_by_block
+from gvtools.memory.store.voxel_levels import VoxelLevels
+
+# Level of the voxels whose blocks are as wide as a cell, see octree.
+BLOCK_LEVEL = 3
+# A memory moves to tiles when it takes more than this share of its budget.
+IN_RAM = 0.5
+# Shares of the budget: all tiles in RAM together, the largest tile, and what is gathered at a time.
+CACHE, LARGEST, GATHERED = 0.6, 1 / 32, 1 / 8
+# Tiles of fewer bytes are not divided, which would give too many files.
+SMALLEST = 1 << 18
+
+
+class Gathered(NamedTuple):
+    """Observations of ``chosen`` segments, by the rows of ``start`` and ``length``.
+
+    ``table``: which segments these rows are, by the memory's table; None where they are all of it.
+    """
+
+    chosen: NDArray[np.int64]
+    start: NDArray[np.int64]
+    length: NDArray[np.int32]
+    columns: SplatColumns
+    table: NDArray[np.int64] | None
+
+    def of(self, array: NDArray) -> NDArray:
+        """What ``array`` holds of these rows, where it has one for each segment of the memory."""
+        return array if self.table is None else array[self.table]
+
+
+class TileSet:
+    """A memory's observations in tiles.
+
+    At first there is one, ``whole``, in RAM. Once it takes more than half of the budget (the rest
+    is room for copies while arrays grow), it is divided into cubes of space, each in RAM while it
+    is used and in a file otherwise; the least recently used ones are written to files.
+
+    The files of the working folder are scratch: ``save`` hard-links them elsewhere. A file is never
+    changed, as a saved memory may share it: a tile's next state gets another name.
+    """
+
+    def __init__(self, whole: Observations, views: ViewTable) -> None:
+        self.whole: Observations | None = whole
+        self._voxel, self._weight_cap = whole.voxel, whole.weight_cap
+        self.views = views
+        # Bytes; tiles in RAM may take the share CACHE of it. None keeps the whole in RAM.
+        self.budget: int | None = None
+        # Where the working folder is made; None: the system's folder for temporary files.
+        self.scratch: Path | None = None
+        # By number; None for a tile that was divided or joined.
+        self.tiles: list[Tile | None] = [Tile(WHOLE, store=whole)]
+        self.octree = Octree()
+        self.places = SegmentPlaces()
+        # Held while tiles are read, written or moved.
+        self.lock = threading.RLock()
+        # Bytes of a tile that is being divided, so that its parts find room beside it.
+        self.reserved = 0
+        self._recent: OrderedDict[int, int] = OrderedDict()
+        self._resident = 0
+        self._folder: Path | None = None
+        self._remove: Callable[[], object] = lambda: None
+        self._writes = 0
+
+    def clear(self) -> None:
+        """Begin with no tile, in files."""
+        self.whole, self.tiles = None, []
+
+    def outgrown(self) -> bool:
+        """Whether the whole is to be divided."""
+        return (
+            self.budget is not None
+            and self.whole is not None
+            and self.whole.nbytes > IN_RAM * self.budget
+        )
+
+    def page(self) -> Segments:
+        """Divide the whole into tiles; returns the table of all segments, which stays in RAM."""
+        whole = self.whole
+        assert whole is not None
+        self.clear()
+        rows = np.arange(whole.segments.count, dtype=np.int32)
+        first = whole.segments.start[: len(rows)]
+        self.places.append(np.zeros(len(rows), np.int32), rows, first,
+                           level=whole.columns.level[first])  # fmt: skip
+        table = Segments()
+        table.follow(*(whole.segments.rows()[name] for name in ("length", "view", "box")))
+        tile = Tile(WHOLE, rows, whole)
+        tile.changed()
+        self.divide_large([self.add(tile)])
+        self.shrink()
+        return table
+
+    def __iter__(self) -> Iterator[tuple[int, Tile]]:
+        return ((i, tile) for i, tile in enumerate(self.tiles) if tile is not None)
+
+    def __getitem__(self, number: int) -> Tile:
+        tile = self.tiles[number]
+        assert tile is not None
+        return tile
+
+    def each(self) -> Iterator[Tile]:
+        """Every tile, to be read one by one; earlier ones are evicted if RAM is needed."""
+        for number, tile in list(self):
+            with self.lock:
+                yield tile
+                self.touch(number)
+                self.shrink(keep=number)
+
+    @property
+    def size(self) -> int:
+        """Bytes of all tiles, in RAM or in files."""
+        if self.whole is not None:
+            return self.whole.nbytes
+        return sum(tile.size for _, tile in self)
+
+    @property
+    def voxels(self) -> int:
+        """Number of occupied voxels."""
+        if self.whole is not None:
+            return self.whole.index.voxels
+        return sum(tile.voxels for _, tile in self)
+
+    @property
+    def largest(self) -> int:
+        """Bytes above which a tile is divided."""
+        return max(SMALLEST, int(LARGEST * self._budget))
+
+    @property
+    def _budget(self) -> int:
+        assert self.budget is not None
+        return self.budget
+
+    @property
+    def resident(self) -> int:
+        """Bytes that tiles take in RAM."""
+        return self._resident
+
+    @property
+    def folder(self) -> Path:
+        """The working folder, made when first needed and deleted with the memory."""
+        if self._folder is None:
+            try:
+                ours = self.scratch if self.scratch and not self.scratch.exists() else None
+                if ours:
+                    ours.mkdir(parents=True)
+                self._folder = Path(tempfile.mkdtemp(prefix="gvtools-tiles-", dir=self.scratch))
+            except OSError as error:
+                raise ProjectError(
+                    f"{self.scratch}: no folder for tiles can be made ({error.strerror}); expected "
+                    "one that can be written"
+                ) from None
+            self._remove = weakref.finalize(self, _remove_scratch, self._folder, ours)
+        return self._folder
+
+    def close(self) -> None:
+        """Remove the working folder, and with it everything that was not saved."""
+        self._remove()
+
+    def add(self, tile: Tile) -> int:
+        """Add a tile; returns its number."""
+        self.tiles.append(tile)
+        number = len(self.tiles) - 1
+        self.octree.leaves[tile.node] = number
+        self.touch(number)
+        return number
+
+    def load(self, number: int) -> Observations:
+        """A tile's observations, read into RAM if they are not there."""
+        tile = self[number]
+        if tile.store is None:
+            tile.load(self._empty(), self.views)
+            self.touch(number)
+            self.shrink(keep=number)
+        assert tile.store is not None
+        return tile.store
+
+    def _empty(self) -> Observations:
+        return Observations(self._voxel, self._weight_cap)
+
+    def touch(self, number: int) -> None:
+        """Note that a tile was used, and how many bytes it takes in RAM now."""
+        self._resident += self[number].resident - self._recent.pop(number, 0)
+        self._recent[number] = self[number].resident
+
+    def shrink(self, *, keep: int = -1) -> None:
+        """Write tiles, but for ``keep``, to files, the least recently used first, until all fit."""
+        if self.whole is not None:
+            return
+        limit = CACHE * self._budget - self.reserved - self.places.nbytes
+        for number in list(self._recent):
+            if self._resident <= max(limit, 0):
+                return
+            if number != keep and self._recent[number]:
+                self.evict(number)
+
+    def evict(self, number: int) -> None:
+        """Take a tile out of RAM; if it has changed, it is written first."""
+        tile = self[number]
+        if tile.dirty:
+            self.write(number)
+        tile.release()
+        self._resident -= self._recent.pop(number, 0)
+
+    def write(self, number: int) -> None:
+        """Write a changed tile to a file of a new name, and drop the older one."""
+        tile, old = self[number], self[number].file
+        owned = tile.owned
+        self._writes += 1
+        tile.write(self.folder / f"{number:05d}.{self._writes:06d}.tile")
+        if owned and old is not None:
+            old.unlink(missing_ok=True)
+
+    def write_after(self, name: str) -> None:
+        """Number later files after an existing one, so that none gets its name."""
+        with suppress(IndexError, ValueError):
+            self._writes = max(self._writes, int(name.split(".")[1]))
+
+    def drop(self, number: int) -> None:
+        """Remove a tile that was divided or joined."""
+        tile = self[number]
+        self._resident -= self._recent.pop(number, 0)
+        if tile.owned and tile.file is not None:
+            tile.file.unlink(missing_ok=True)
+        self.tiles[number] = None
+
+    def of_points(
+        self, positions: NDArray[np.float32], spacing: NDArray[np.float32], levels: VoxelLevels
+    ) -> list[tuple[int, NDArray[np.int64]]]:
+        """Numbers of the tiles that points (N,) belong to, with their points; new ones are made."""
+        numbers, nodes = self.octree.tiles_of(positions, spacing, levels, free=len(self.tiles))
+        for node in nodes:
+            self.tiles.append(Tile(node, store=self._empty()))
+            self.touch(len(self.tiles) - 1)
+        touched, starts, order = group_by_block(numbers, len(self.tiles))
+        return [
+            (number, order[starts[g] : starts[g + 1]]) for g, number in enumerate(touched.tolist())
+        ]
+
+    def changed(self, number: int) -> None:
+        """Note that a tile in RAM has changed."""
+        self[number].changed()
+        self.touch(number)
+        self.shrink(keep=number)
+
+    def split(self, segments: Segments, chosen: NDArray[np.int64]) -> Iterator[slice]:
+        """Parts of ``chosen`` rows of the memory's table, in order, that are gathered at a time."""
+        if self.whole is not None:
+            yield slice(None)
+            return
+        length = segments.length[chosen]
+        ends = np.cumsum(length, dtype=np.int64)
+        most = int(GATHERED * self._budget) // SPLAT_BYTES
+        first = 0
+        while first < len(length) or not first:
+            done = int(ends[first - 1]) if first else 0
+            last = max(int(np.searchsorted(ends, done + most, side="right")), first + 1)
+            yield slice(first, last)
+            first = last
+
+    def gather(
+        self,
+        segments: Segments,
+        chosen: NDArray[np.int64],
+        *,
+        doublings: NDArray[np.uint8] | None = None,
+    ) -> Gathered:
+        """Observations of ``chosen`` (n,) rows of the memory's table, in this order.
+
+        From files they are copied; tiles that hold none of them are not touched. ``doublings`` (n,)
+        says which thinned copy of its tile a segment is taken from, 0 = every observation.
+        """
+        if self.whole is not None:
+            columns = self.whole.columns.splat
+            return Gathered(chosen, segments.start, segments.length, columns, None)
+        with self.lock:
+            places = self.places
+            tile, start = places.tile[chosen], places.row[chosen]
+            count = segments.length[chosen].astype(np.int64)
+            kind = np.zeros(len(chosen), np.uint8) if doublings is None else doublings
+            groups = []
+            key = tile.astype(np.int64) * 16 + kind
+            order = np.argsort(key, kind="stable")
+            ends = np.flatnonzero(np.diff(key[order])) + 1
+            for which in np.split(order, ends) if len(order) else ():
+                number, twice = int(tile[which[0]]), int(kind[which[0]])
+                groups.append((number, twice, which))
+                if twice:
+                    thinned = self[number].thinned(twice)
+                    local = places.local[chosen[which]]
+                    start[which] = thinned.start[local]
+                    count[which] = thinned.start[local + 1] - thinned.start[local]
+            ends = np.cumsum(count)
+            rows = empty_columns(int(ends[-1]) if len(ends) else 0)
+            at = ends - count
+            for number, twice, which in groups:
+                of_tile = self[number]
+                source = of_tile.thinned(twice).rows if twice else of_tile.splat_columns()
+                in_threads(copy_rows, len(which), which, start, count, source, at, rows)
+                self.touch(number)
+                self.shrink(keep=number)
+        return Gathered(np.arange(len(chosen)), at, count.astype(np.int32), rows, chosen)
+
+    def drop_views(self, table: Segments, keep_view: NDArray[np.bool_], *, round: int) -> None:
+        """Remove the views of a round from tiles, see ``Observations.drop_views``.
+
+        ``table`` has all segments as they were before.
+        """
+        view = table.rows()["view"]
+        stays = keep_view[view]
+        # Views after the first removed one get new rows, so their tiles change, too.
+        first = int(np.argmin(keep_view))
+        touched = set(np.unique(self.places.rows()["tile"][view >= first]).tolist())
+        touched |= {number for number, tile in self if round in tile.agreed}
+        new_row = (np.cumsum(stays) - 1).astype(np.int32)
+        with self.lock:
+            self.places.select(stays)
+            for number, tile in list(self):
+                tile.segments = new_row[tile.segments[stays[tile.segments]]]
+                if number in touched:
+                    observations = self.load(number)
+                    observations.drop_views(keep_view, round=round)
+                    self.places.move(tile.segments, number, observations.segments)
+                    self.changed(number)
+
+    def divide_large(self, numbers: Sequence[int]) -> None:
+        """Divide the given tiles that have grown too large, and their parts if need be."""
+        left = list(numbers)
+        while left:
+            number = left.pop()
+            tile = self[number]
+            if tile.size > self.largest:
+                left += self._divide(number)
+
+    def _divide(self, number: int) -> list[int]:
+        """Divide a tile; returns its parts' numbers, none if only whole blocks are left."""
+        tile = self[number]
+        size = tile.size
+        if size <= 2 * tile.indivisible or tile.node == FAR:
+            return []
+        store = self.load(number)
+        segments = store.segments
+        first = store.columns.positions[segments.start[: segments.count]]
+        keys = cell_keys(first, store.voxel)
+        cells = cell_coordinates(keys)
+        # A part is no smaller than the widest block, so that segments stay whole.
+        least = max(0, store.index.top - BLOCK_LEVEL)
+        weight = segments.length[: segments.count].astype(np.float64) * (size / len(store))
+        levels, inner = part_levels(cells, weight, tile.node[0], least=least, largest=self.largest)
+        nodes = np.column_stack([levels, cells >> levels[:, None]])
+        nodes[keys == FAR_KEY] = FAR
+        parts, which = np.unique(nodes, axis=0, return_inverse=True)
+        if len(parts) == 1:
+            tile.indivisible = size
+            return []
+        self.octree.divide(tile.node)
+        self.octree.divided.update(inner)
+        voxel_level = int(np.median(self.places.level[tile.segments]))
+        self.octree.usual = int(np.median(levels)) - voxel_level
+        self.reserved += size
+        out = []
+        for i, node in enumerate(parts.tolist()):
+            rows = np.flatnonzero(which.reshape(-1) == i)
+            observations = store.part(rows)
+            part = Tile(tuple(node), tile.segments[rows], observations)
+            part.changed()
+            out.append(self.add(part))
+            self.places.move(part.segments, out[-1], observations.segments)
+            self.shrink(keep=number)
+        self.reserved -= size
+        self.drop(number)
+        return out
+
+    def join_small(self) -> int:
+        """Join small parts of divided cubes; returns how many fewer tiles there are."""
+        less = 0
+        while True:
+            small = [
+                (node, parts)
+                for node, parts in self.octree.families().items()
+                if node != WHOLE
+                and sum(self[self.octree.leaves[part]].size for part in parts) < self.largest // 4
+            ]
+            if not small:
+                return less
+            for node, parts in small:
+                self._join(node, parts)
+                less += len(parts) - 1
+
+    def _join(self, node: Node, parts: list[Node]) -> None:
+        numbers = [self.octree.leaves[part] for part in parts]
+        stores = [self.load(number) for number in numbers]
+        rows = np.concatenate([self[number].segments for number in numbers])
+        whole = Observations.concatenate(stores)
+        tile = Tile(node, rows, whole)
+        tile.changed()
+        self.octree.join(node, parts, len(self.tiles))
+        number = self.add(tile)
+        self.places.move(rows, number, whole.segments)
+        for old in numbers:
+            self.drop(old)
+        self.shrink(keep=number)
+
+
+def part_levels(
+    cells: NDArray[np.int64],
+    weight: NDArray[np.float64],
+    level: int,
+    *,
+    least: int,
+    largest: float,
+) -> tuple[NDArray[np.int64], list[Node]]:
+    """Levels of the parts of a cube that is divided until each part is small enough.
+
+    Args:
+        cells: (S, 3) cell coordinates of the segments.
+        weight: (S,) bytes of the segments.
+        level: of the cube, 2**level cells wide.
+        least: smallest level that a part may have.
+        largest: bytes that a part may have.
+
+    Returns:
+        (S,) the level of each segment's part, and the cubes that were divided.
+    """
+    levels = np.full(len(cells), level)
+    inner: list[Node] = []
+    active = np.arange(len(cells))
+    while level > least and len(active):
+        cubes, which = np.unique(cells[active] >> level, axis=0, return_inverse=True)
+        which = which.reshape(-1)
+        heavy = np.bincount(which, weight[active]) > largest
+        inner += [(level, x, y, z) for x, y, z in cubes[heavy].tolist()]
+        active = active[heavy[which]]
+        level -= 1
+        levels[active] = level
+    return levels, inner
+
+
+def _remove_scratch(folder: Path, scratch: Path | None) -> None:
+    """Remove a working folder, and ``scratch`` around it if it was made for it."""
+    shutil.rmtree(folder, ignore_errors=True)
+    if scratch is not None:
+        with suppress(OSError):
+            scratch.rmdir()

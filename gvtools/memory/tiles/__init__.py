@@ -1,1 +1,0 @@
-"""A memory larger than RAM: tiles of voxels in files, some of them in RAM."""
