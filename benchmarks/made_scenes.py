@@ -18,7 +18,7 @@ from gvtools.procedural.builder import Light, ProceduralScene, SceneBuilder
 from gvtools.procedural.furnished_room import furnished_room
 from gvtools.procedural.layouts import add_clutter
 from gvtools.procedural.ray_cast import BALL, BOX, TUBE
-from gvtools.procedural.room_sample import photographed
+from gvtools.procedural.room_sample import photograph_room
 from gvtools.procedural.sample_workspace import SampleContent, write_sample
 from gvtools.procedural.textures import photograph_names
 from gvtools.trajectories import look_at
@@ -64,7 +64,7 @@ def write_place(folder: Path, place: Place) -> None:
         np.repeat(K[None], count, axis=0), poses, np.full(count, width), np.full(count, height),
         tuple(f"{number:03d}.png" for number in range(count)),
     )  # fmt: skip
-    shot = photographed(scene, cameras, rng, per_view=place.points)
+    shot = photograph_room(scene, cameras, rng, per_view=place.points)
     images = [
         _exposed(image, np.exp(rng.normal(0, place.exposure))) if place.exposure else image
         for image in shot.images

@@ -33,7 +33,7 @@ from gvtools.evaluation.tables import Table
 from gvtools.files import write_json
 from gvtools.networks.config_json import to_json
 from gvtools.settings import with_texts
-from gvtools.training.distributed import started
+from gvtools.training.distributed import join_processes
 from gvtools.training.options import TrainingSettings, shipped_or_read
 from gvtools.training.run import StageRun
 from pipelines.console import Console
@@ -136,7 +136,7 @@ def _trained(variant: Variant, options: ExperimentOptions) -> Path:
 
 
 def _train(config: TrainingSettings, out: Path, start: Path) -> None:
-    with started("auto") as processes:
+    with join_processes("auto") as processes:
         stage = StageRun(config, "denoiser", out, processes=processes, model_folder=out, init=start)
         stage.train(resume=True, say=Console().line)
 

@@ -13,7 +13,7 @@ from gvtools.completers.base import ContextView
 from gvtools.guidance import Guidance
 
 if TYPE_CHECKING:
-    from gvtools.training.dataset import Given
+    from gvtools.training.dataset import SampleInputs
 
 Float32 = NDArray[np.float32]
 # Of the pictures, px: the shipped model's own.
@@ -68,22 +68,22 @@ def held_out_cases(
         yield case_of(data.given(index), f"held-out {index}")
 
 
-def case_of(given: Given, name: str) -> Case:
+def case_of(given: SampleInputs, name: str) -> Case:
     """Views that are not given are the targets; the context gets its faults.
 
     Args:
         given: true views, and which of them are given; its generator is used up.
         name: of the case.
     """
-    from gvtools.training.hints import observed, projected
+    from gvtools.training.sample import observe_context, project_observation
 
     truth = given.clip
     targets = [view for view in range(len(truth)) if view not in given.context]
-    observation = observed(truth, given.context, given.strength, rng=given.rng)
+    observation = observe_context(truth, given.context, given.strength, rng=given.rng)
     return Case(
         name,
         observation.views,
-        projected(observation, truth.cameras[targets]),
+        project_observation(observation, truth.cameras[targets]),
         (truth.rgb[targets] / np.float32(255)).astype(np.float32),
         truth.depth[targets],
     )

@@ -13,10 +13,9 @@ from benchmarks.experiments.level_render import LevelScene
 from benchmarks.experiments.level_textures import Pictures
 from benchmarks.experiments.quake_levels import Archives, read_level
 from gvtools.cameras import Cameras
-from gvtools.training.context_choice import ContextChoice
-from gvtools.training.corruption import CorruptionOptions, drawn
-from gvtools.training.dataset import Given
-from gvtools.training.hints import Clip
+from gvtools.training.corruption import CorruptionOptions, draw_strengths
+from gvtools.training.dataset import ContextChoice, SampleInputs
+from gvtools.training.sample import Clip
 
 Float64 = NDArray[np.float64]
 ATTEMPTS = 60
@@ -68,9 +67,9 @@ def level_cases(
         clip = walk(scene, rng, size=size, views=views)
         if clip is None:
             continue
-        strength = drawn(rng, CorruptionOptions())
+        strength = draw_strengths(rng, CorruptionOptions())
         context = choice.chosen(rng, views, int(rng.integers(1, choice.most + 1)))
-        yield case_of(Given(clip, context, strength, rng), Path(name).stem)
+        yield case_of(SampleInputs(clip, context, strength, rng), Path(name).stem)
 
 
 def walk(

@@ -24,7 +24,7 @@ from gvtools.evaluation.pose_probe import Located, PoseProbe
 from gvtools.evaluation.posed_picture import PosedPicture
 from gvtools.evaluation.tables import Column, Table
 from gvtools.memory.spatial_memory import SpatialMemory
-from gvtools.training.hints import Clip
+from gvtools.training.sample import Clip
 from pipelines.reconstruction.rounds import CachedProjection, Clock, complete_targets
 from pipelines.reconstruction.settings import RunSettings
 

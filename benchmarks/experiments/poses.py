@@ -23,10 +23,9 @@ from gvtools.evaluation.tables import Column, Table
 from gvtools.networks.depth_anything.geometry_head import Geometry
 from gvtools.networks.depth_anything.rays import poses_least_squares
 from gvtools.training.batch import TrainingBatch
-from gvtools.training.context_choice import ContextChoice
-from gvtools.training.dataset import ProceduralViews
+from gvtools.training.dataset import ContextChoice, ProceduralViews
 from gvtools.training.encoder_stage import scene_unit
-from gvtools.training.view_sample import collated
+from gvtools.training.sample import collate
 
 READS = ("weights", "scenes", "size", "seed")
 
@@ -63,7 +62,7 @@ def run(options: ExperimentOptions) -> tuple[dict[str, Any], list[Table]]:
         )
     errors: dict[str, list[Tensor]] = {name: [] for name in sources}
     for index in range(options.scenes):
-        batch = collated([data.sample(index)]).to(device)
+        batch = collate([data.sample(index)]).to(device)
         other[:] = [data.sample(index + options.scenes).images[None].to(device)]
         for name, source in sources.items():
             errors[name].append(_errors(source(model, batch), batch))

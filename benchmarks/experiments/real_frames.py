@@ -21,7 +21,7 @@ from gvtools.errors import OptionError
 from gvtools.evaluation.tables import Table
 from gvtools.scenes.scene import Scene, View
 from gvtools.scenes.selection import select
-from gvtools.training.hints import Observation, projected
+from gvtools.training.sample import Observation, project_observation
 
 READS = ("weights", "tuned", "project", "context", "targets", "seed", "pictures")
 
@@ -74,7 +74,7 @@ def _cases(scene: Scene, given: str, judged: str) -> Iterator[Case]:
     context = [_observed(scene[name]) for name in select(names, given)]
     cameras = tuple(view.camera for view in context)
     targets = [scene[name] for name in select(names, judged)]
-    guidance = projected(
+    guidance = project_observation(
         Observation(tuple(context), cameras), concatenate([view.camera for view in targets])
     )
     for index, view in enumerate(targets):

@@ -18,7 +18,7 @@ from gvtools.completers.base import ContextView
 from gvtools.depth.choice import choose_source
 from gvtools.errors import OptionError
 from gvtools.scenes.scene import Frame, Scene
-from gvtools.training.hints import Observation, projected
+from gvtools.training.sample import Observation, project_observation
 
 CONTEXT, TARGETS = 5, 25
 
@@ -82,7 +82,7 @@ def scan_cases(scene: Scene, *, context: int = CONTEXT, targets: int = TARGETS) 
             given.append(ContextView(view.name, view.camera, _picture(frame), _known(depth)))
         memory = Observation(tuple(given), tuple(view.camera for view in given))
         views = [scene[names[index]] for index in split.targets]
-        guidance = projected(memory, concatenate([view.camera for view in views]))
+        guidance = project_observation(memory, concatenate([view.camera for view in views]))
         for index, view in enumerate(views):
             frame = view.load()
             holes = ~guidance.valid[index]

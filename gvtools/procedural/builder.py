@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gvtools.procedural.ray_cast import BOX, Geometry
+from gvtools.procedural.ray_cast import BOX, RoomGeometry
 from gvtools.procedural.render import Look
-from gvtools.procedural.textures import level_starts, picture, stacked, texture
+from gvtools.procedural.textures import level_starts, picture, stack_levels, texture
 
 Float64 = NDArray[np.float64]
 
@@ -31,32 +31,20 @@ class Light:
 
 @dataclass(frozen=True, eq=False)
 class ProceduralScene:
-    """A scene to be rendered.
+    """A scene to be rendered."""
 
-    Attributes:
-        kind: which layout it is.
-        geometry: what rays meet.
-        look: materials and light.
-        key: what the mean of the pictures shall be, linear light.
-    """
-
-    kind: str
-    geometry: Geometry
-    look: Look
-    key: float
+    kind: str  # which layout it is
+    geometry: RoomGeometry  # what rays meet
+    look: Look  # materials and light
+    key: float  # what the mean of the pictures shall be, linear light
 
 
 @dataclass(eq=False)
 class SceneBuilder:
-    """What a scene consists of so far; ``rng`` draws what comes next.
+    """What a scene consists of so far; ``rng`` draws what comes next."""
 
-    Attributes:
-        rng: of layout and materials.
-        photographs: names that textures may be cut from.
-    """
-
-    rng: np.random.Generator
-    photographs: Sequence[str]
+    rng: np.random.Generator  # of layout and materials
+    photographs: Sequence[str]  # names that textures may be cut from
     rooms: list[tuple[Float64, Float64]] = field(default_factory=list)
     room_material: list[list[int]] = field(default_factory=list)
     solids: list[tuple[int, Float64, Float64, Float64, int, bool]] = field(default_factory=list)
@@ -69,19 +57,14 @@ class SceneBuilder:
         self,
         tile: float | tuple[float, float] | None = None,
         *,
-        only: str | None = None,
-        gain: ArrayLike = 1.0,
-        offset: ArrayLike | None = None,
+        only: str | None = None,  # "picture" for a photograph, where there is one
+        gain: ArrayLike = 1.0,  # factor on the texture's linear light
+        offset: ArrayLike | None = None,  # of the texture's corner, metres; None draws it
         emission: float = 0.0,
     ) -> int:
         """A material with a texture of its own.
 
-        Args:
-            tile: metres that one copy covers; None draws 0.5 to 4.
-            only: "picture" for a photograph, where there is one.
-            gain: factor on the texture's linear light.
-            offset: of the texture's corner, metres; None draws it.
-            emission: light of its own.
+        ``tile``: metres that one copy covers; None draws 0.5 to 4.
         """
         rng = self.rng
         photographic = only == "picture" and len(self.photographs)
@@ -123,11 +106,11 @@ class SceneBuilder:
     def solid(
         self,
         kind: int,
-        centre: ArrayLike,
-        half: ArrayLike,
+        centre: ArrayLike,  # (3,) world frame
+        half: ArrayLike,  # (3,) half extents
         *,
         material: int,
-        yaw: float = 0.0,
+        yaw: float = 0.0,  # about the vertical, radians
         tilt: float = 0.0,
         cuts: Sequence[tuple[ArrayLike, ArrayLike]] = (),
         cut_material: int | None = None,
@@ -135,16 +118,7 @@ class SceneBuilder:
     ) -> None:
         """A solid, and boxes of its own frame that are cut out of it.
 
-        Args:
-            kind: BOX, BALL or TUBE.
-            centre: (3,) world frame.
-            half: (3,) half extents.
-            material: of its surface.
-            yaw: about the vertical, radians.
-            tilt: about its own first axis, before the yaw.
-            cuts: lowest and highest corners.
-            cut_material: of the surfaces that cutting makes; None for ``material``.
-            shades: whether it keeps a lamp's light away.
+        ``cut_material``: of the surfaces that cutting makes; None for ``material``.
         """
         c, s = np.cos(yaw), np.sin(yaw)
         turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
@@ -169,7 +143,7 @@ class SceneBuilder:
         low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)
         self.solid(BOX, (low + high) / 2, (high - low) / 2, material=material)
 
-    def geometry(self) -> Geometry:
+    def geometry(self) -> RoomGeometry:
         """Everything put in so far, for rays."""
         count = len(self.solids)
         boxes = [box for boxes in self.cutters for box in boxes]
@@ -177,7 +151,7 @@ class SceneBuilder:
             zip(*self.solids, strict=True) if count else ((),) * 6
         )
         ends = np.cumsum([0, *(len(boxes) for boxes in self.cutters)])
-        return Geometry(
+        return RoomGeometry(
             np.array(self.rooms, np.float64),
             np.array(self.room_material, np.int64),
             np.array(kind, np.int64),
@@ -201,7 +175,7 @@ class SceneBuilder:
             np.array(offset, np.float64),
             np.array(gain, np.float64),
             np.array(emission, np.float64),
-            stacked(self.textures),
+            stack_levels(self.textures),
             level_starts(side),
             side,
             light.ambient,

@@ -57,11 +57,8 @@ def globe(name: str) -> UInt8:
 def tiled(name: str, color: Color, *, contrast: float = 0.22, turned: bool = False) -> UInt8:
     """The relief of a photograph of a material in an sRGB tint.
 
-    Args:
-        name: of the photograph.
-        color: sRGB in [0, 1], the mean.
-        contrast: standard deviation of the brightness, share of the mean.
-        turned: by 90 degrees.
+    ``color``: sRGB in [0, 1], the mean. ``contrast``: standard deviation of the brightness, share
+    of the mean. ``turned``: by 90 degrees.
     """
     relief = np.rot90(_relief(name)) if turned else _relief(name)
     return _tinted(1 + contrast * relief, color)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.procedural.builder import CEILING, Light, ProceduralScene, SceneBuilder
-from gvtools.procedural.ray_cast import BALL, BOX, TUBE, Geometry, clearance
+from gvtools.procedural.ray_cast import BALL, BOX, TUBE, RoomGeometry, clearance
 from gvtools.procedural.textures import photograph_names
 
 Float64 = NDArray[np.float64]
@@ -25,13 +25,8 @@ def add_clutter(
 ) -> None:
     """Put things on the floor of a room.
 
-    Args:
-        build: gets them.
-        low: (3,) lowest corner of the room.
-        high: (3,) highest corner.
-        count: how many.
-        scale: typical size of a thing, metres.
-        palette: how many different materials they share.
+    ``low``: (3,) lowest corner of the room. ``high``: (3,) highest corner. ``scale``: typical size
+    of a thing, metres. ``palette``: how many different materials they share.
     """
     rng = build.rng
     materials = [build.material(scale * np.exp(rng.uniform(-0.7, 0.9))) for _ in range(palette)]
@@ -224,25 +219,15 @@ OVERLAP = 0.02  # by which an opening reaches into its room, metres
 
 def add_openings(
     build: SceneBuilder,
-    low: Float64,
-    high: Float64,
+    low: Float64,  # (3,) lowest corner of the room
+    high: Float64,  # (3,) highest corner
     skin: Sequence[int],
     count: int,
     *,
     walls: Sequence[int] = (0, 1, 2, 3),
-    scale: float = 1.0,
+    scale: float = 1.0,  # of the openings; 1 for a living room
 ) -> None:
-    """Niches and windows in the walls of a room, at most one a wall.
-
-    Args:
-        build: gets them.
-        low: (3,) lowest corner of the room.
-        high: (3,) highest corner.
-        skin: the room's six materials.
-        count: how many.
-        walls: which may be opened, numbered as materials are.
-        scale: of the openings; 1 for a living room.
-    """
+    """Niches and windows in the walls of a room, at most one a wall."""
     rng = build.rng
     for wall in rng.permutation(walls)[:count]:
         length = high[1 - wall // 2] - low[1 - wall // 2]
@@ -267,22 +252,13 @@ def add_openings(
 
 def add_side_room(
     build: SceneBuilder,
-    low: Float64,
-    high: Float64,
+    low: Float64,  # (3,) lowest corner of the room
+    high: Float64,  # (3,) highest corner
     skin: Sequence[int],
     wall: int,
-    size: Float64,
+    size: Float64,  # (3,) of the side room
 ) -> tuple[Float64, Float64]:
-    """A room behind a wall and the door that leads to it; returns the side room's corners.
-
-    Args:
-        build: gets them.
-        low: (3,) lowest corner of the room.
-        high: (3,) highest corner.
-        skin: the room's six materials.
-        wall: which wall, numbered as materials are.
-        size: (3,) of the side room.
-    """
+    """A room behind a wall and the door that leads to it; returns the side room's corners."""
     rng = build.rng
     across = 1 - wall // 2
     length = high[across] - low[across]
@@ -312,23 +288,14 @@ def add_side_room(
 
 def add_frames(
     build: SceneBuilder,
-    low: Float64,
-    high: Float64,
+    low: Float64,  # (3,) lowest corner of the room
+    high: Float64,  # (3,) highest corner
     count: int,
     *,
     walls: Sequence[int] = (0, 1, 2, 3),
-    scale: float = 1.0,
+    scale: float = 1.0,  # of the pictures; 1 for a living room
 ) -> None:
-    """Pictures on the walls: thin boxes with a photograph each.
-
-    Args:
-        build: gets them.
-        low: (3,) lowest corner of the room.
-        high: (3,) highest corner.
-        count: how many.
-        walls: which may have one, numbered as materials are.
-        scale: of the pictures; 1 for a living room.
-    """
+    """Pictures on the walls: thin boxes with a photograph each."""
     rng = build.rng
     for _ in range(count):
         wall = int(walls[int(rng.integers(len(walls)))])
@@ -371,25 +338,15 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True, kw_only=True)
 class LayoutStyle:
-    """Ranges that scenes are drawn from; lengths in metres.
+    """Ranges that scenes are drawn from; lengths in metres."""
 
-    Attributes:
-        kinds: chances of room, corridor, corner, suite, hall and close-up.
-        side: of a room.
-        height: of a room.
-        things: on the floor of a room of 15 square metres.
-        size: of a thing.
-        openings: most recesses in the walls.
-        key: mean of the pictures, linear light.
-    """
-
-    kinds: tuple[float, ...]
-    side: Range
-    height: Range
-    things: Range
-    size: Range
-    openings: int
-    key: Range
+    kinds: tuple[float, ...]  # chances of room, corridor, corner, suite, hall and close-up
+    side: Range  # of a room
+    height: Range  # of a room
+    things: Range  # on the floor of a room of 15 square metres
+    size: Range  # of a thing
+    openings: int  # most recesses in the walls
+    key: Range  # mean of the pictures, linear light
 
 
 STYLES = {
@@ -417,9 +374,7 @@ STYLES = {
 def scene(rng: np.random.Generator, split: str) -> ProceduralScene:
     """A scene.
 
-    Args:
-        rng: decides everything.
-        split: "train" or "held-out".
+    ``split``: "train" or "held-out".
     """
     build = SceneBuilder(rng, photograph_names(split))
     style = STYLES[split]
@@ -547,7 +502,7 @@ _LAYOUTS: tuple[Callable[[SceneBuilder, LayoutStyle], None], ...] = (
 )
 
 
-def _light(rng: np.random.Generator, geometry: Geometry) -> Light:
+def _light(rng: np.random.Generator, geometry: RoomGeometry) -> Light:
     """Light from above and below, a direction, and a lamp in the first room."""
     warmth = np.array([rng.uniform(0.9, 1.15), 1.0, rng.uniform(0.8, 1.1)])
     ambient = np.stack([rng.uniform(0.35, 0.9) * warmth, rng.uniform(0.15, 0.5) * np.ones(3)])

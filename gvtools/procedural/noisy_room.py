@@ -26,7 +26,7 @@ from scipy.special import ndtr
 from gvtools.cameras import Cameras, invert_rigid
 from gvtools.procedural.builder import ProceduralScene
 from gvtools.procedural.ray_cast import BOX, cast
-from gvtools.procedural.render import Look, developed, radiance
+from gvtools.procedural.render import Look, radiance, to_srgb
 from gvtools.procedural.room_sample import RoomSample, check_options, room_views
 from gvtools.procedural.sample_workspace import is_written, written_whole
 from gvtools.scenes.calibration import INTRINSICS
@@ -52,19 +52,12 @@ MIRROR, GRAZING = 0.97, 0.5  # cosines beyond which a glossy surface dazzles, or
 
 @dataclass(frozen=True, eq=False)
 class SensorView:
-    """What the rays through the pixels' centres meet.
+    """What the rays through the pixels' centres meet."""
 
-    Attributes:
-        depth: (H, W) float32, exact z-depth, metres.
-        albedo: (H, W) float32 in [0, 1], the share of light that comes back.
-        glossy: (H, W) bool.
-        rays: (H, W, 3) float64, camera-frame points at z-depth 1.
-    """
-
-    depth: Float32
-    albedo: Float32
-    glossy: Mask
-    rays: Float64
+    depth: Float32  # (H, W) float32, exact z-depth, metres
+    albedo: Float32  # (H, W) float32 in [0, 1], the share of light that comes back
+    glossy: Mask  # (H, W) bool
+    rays: Float64  # (H, W, 3) float64, camera-frame points at z-depth 1
 
 
 def range_noise(depth: Float32) -> Float32:
@@ -187,7 +180,7 @@ def write_noisy_room(
     exposure[:count] = np.exp(rng.normal(0, EXPOSURE, count))
     poses = cameras.world_from_cam
     true = cameras.cam_from_world[:count]
-    off = jittered(true, rng)
+    off = jitter_poses(true, rng)
     poses[:count] = invert_rigid(off @ align_poses(off, true))
     depth[:count] = _measured(room, cameras[:count], depth[:count], rng)
     key = room.key / float(light.mean())
@@ -196,19 +189,17 @@ def write_noisy_room(
     with written_whole(folder, record) as partial:
         np.savetxt(partial / INTRINSICS, K, fmt="%.9g")
         for i, stem in enumerate(stems):
-            _save(partial / f"{stem}.color.png", developed(light[i], key * exposure[i]))
+            _save(partial / f"{stem}.color.png", to_srgb(light[i], key * exposure[i]))
             millimetres = np.rint(depth[i] / MILLIMETRES).astype(np.uint16)
             _save(partial / f"{stem}.depth.png", millimetres)
             np.savetxt(partial / f"{stem}.pose.txt", poses[i], fmt="%.12g")
     return sample
 
 
-def jittered(cam_from_world: Float64, rng: np.random.Generator) -> Float64:
+def jitter_poses(cam_from_world: Float64, rng: np.random.Generator) -> Float64:
     """(V, 4, 4) poses with the errors of a tracker: half of the variance drifts, half jumps.
 
-    Args:
-        cam_from_world: (V, 4, 4) rigid, metres, in the order of recording.
-        rng: decides everything.
+    ``cam_from_world``: (V, 4, 4) rigid, metres, in the order of recording.
     """
     from scipy.ndimage import gaussian_filter1d
     from scipy.spatial.transform import Rotation

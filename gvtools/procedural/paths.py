@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
-from gvtools.procedural.ray_cast import Geometry, cast, clearance
+from gvtools.procedural.ray_cast import RoomGeometry, cast, clearance
 
 Float64 = NDArray[np.float64]
 
@@ -30,19 +30,12 @@ NEAREST = 0.08  # least z-depth of a pixel
 
 def camera_path(
     rng: np.random.Generator,
-    geometry: Geometry,
+    geometry: RoomGeometry,
     *,
     views: int,
-    size: tuple[int, int],
+    size: tuple[int, int],  # (H, W) of the pictures
 ) -> Cameras:
-    """The cameras, in order, of a path through the free space of a scene.
-
-    Args:
-        rng: decides everything.
-        geometry: of the scene.
-        views: number of cameras.
-        size: (H, W) of the pictures.
-    """
+    """The cameras, in order, of a path through the free space of a scene."""
     K = _intrinsics(rng, size)
     start, forward, depth = _start(rng, geometry, K, size)
     for attempt in range(ATTEMPTS):
@@ -84,7 +77,7 @@ def _intrinsics(rng: np.random.Generator, size: tuple[int, int]) -> Float64:
 
 
 def _start(
-    rng: np.random.Generator, geometry: Geometry, K: Float64, size: tuple[int, int]
+    rng: np.random.Generator, geometry: RoomGeometry, K: Float64, size: tuple[int, int]
 ) -> tuple[Float64, Float64, float]:
     """A free place, a direction in which there is something to see, and the mean depth there."""
     volume = np.prod(geometry.rooms[:, 1] - geometry.rooms[:, 0], axis=1)
@@ -110,7 +103,7 @@ def _start(
     return places[best], forward[pick], float(mean[pick])
 
 
-def _is_free(geometry: Geometry, cameras: Cameras, depth: float) -> bool:
+def _is_free(geometry: RoomGeometry, cameras: Cameras, depth: float) -> bool:
     if clearance(geometry, cameras.centers).min() < CLEARANCE * depth:
         return False
     seen = cast(geometry, cameras.resized(PROBE, PROBE)).depth

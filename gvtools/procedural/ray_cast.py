@@ -26,34 +26,20 @@ BOX, BALL, TUBE = 0, 1, 2
 ROUND, SIDE = 3, 4
 
 
-class Geometry(NamedTuple):
-    """What rays meet. World frame: z up, metres.
+class RoomGeometry(NamedTuple):
+    """What rays meet. World frame: z up, metres."""
 
-    Attributes:
-        rooms: (R, 2, 3) lowest and highest corner of each room.
-        room_material: (R, 6) of the walls -x, +x, -y, +y, of the floor and of the ceiling.
-        kind: (N,) BOX, BALL or TUBE (along its z axis).
-        rotation: (N, 3, 3) local_from_world.
-        centre: (N, 3).
-        half: (N, 3) half extents along the local axes.
-        material: (N,).
-        shades: (N,) bool, whether it keeps a lamp's light away.
-        first_cutter: (N + 1,) where each solid's cutters start.
-        cutter: (M, 2, 3) lowest and highest corner, frame of their solid.
-        cutter_material: (M,) of the surfaces that cutting makes.
-    """
-
-    rooms: Float64
-    room_material: Int64
-    kind: Int64
-    rotation: Float64
-    centre: Float64
-    half: Float64
-    material: Int64
-    shades: NDArray[np.bool_]
-    first_cutter: Int64
-    cutter: Float64
-    cutter_material: Int64
+    rooms: Float64  # (R, 2, 3) lowest and highest corner of each room
+    room_material: Int64  # (R, 6) of the walls -x, +x, -y, +y, of the floor and of the ceiling
+    kind: Int64  # (N,) BOX, BALL or TUBE (along its z axis)
+    rotation: Float64  # (N, 3, 3) local_from_world
+    centre: Float64  # (N, 3)
+    half: Float64  # (N, 3) half extents along the local axes
+    material: Int64  # (N,)
+    shades: NDArray[np.bool_]  # (N,) bool, whether it keeps a lamp's light away
+    first_cutter: Int64  # (N + 1,) where each solid's cutters start
+    cutter: Float64  # (M, 2, 3) lowest and highest corner, frame of their solid
+    cutter_material: Int64  # (M,) of the surfaces that cutting makes
 
 
 @compiled()
@@ -274,18 +260,13 @@ FLOATS, CODES = 10, 4
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:
-    """What the rays through pixel centres of V views meet.
+    """What the rays through pixel centres of V views meet."""
 
-    Attributes:
-        depth: (V, H, W) float64 z-depth, metres; 0 for a camera that stands in no room.
-        solid: (V, H, W) int64, -1 for a wall.
-    """
-
-    depth: Float64
-    solid: Int64
+    depth: Float64  # (V, H, W) float64 z-depth, metres; 0 for a camera that stands in no room
+    solid: Int64  # (V, H, W) int64, -1 for a wall
 
 
-def cast(geometry: Geometry, cameras: Cameras) -> Surfaces:
+def cast(geometry: RoomGeometry, cameras: Cameras) -> Surfaces:
     """The surfaces at the pixel centres of cameras of one size."""
     shape = (len(cameras), int(cameras.height[0]), int(cameras.width[0]))
     out = Surfaces(np.empty(shape), np.empty(shape, np.int64))
@@ -301,7 +282,7 @@ def world_rays(cameras: Cameras) -> Float64:
     return np.swapaxes(cameras.cam_from_world[:, :3, :3], 1, 2) @ np.linalg.inv(cameras.K)
 
 
-def rectangles(geometry: Geometry, cameras: Cameras) -> Int64:
+def rectangles(geometry: RoomGeometry, cameras: Cameras) -> Int64:
     """(V, N, 4) first and last row, first and last column that each solid's hull can cover."""
     signs = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij"), -1).reshape(8, 3)
     corners = (geometry.half[:, None] * signs) @ geometry.rotation + geometry.centre[:, None]

@@ -17,7 +17,7 @@ from gvtools.procedural.ray_cast import (
     CODES,
     FLOATS,
     SAME,
-    Geometry,
+    RoomGeometry,
     cast,
     enter_solid,
     leave_rooms,
@@ -52,37 +52,22 @@ Int64 = NDArray[np.int64]
 
 
 class Look(NamedTuple):
-    """Materials and light. Colours are linear light.
+    """Materials and light. Colours are linear light."""
 
-    Attributes:
-        texture: (P,) row of ``texels``.
-        tile: (P, 2) length that one copy of the texture covers, metres.
-        offset: (P, 2) of the texture's corner, metres.
-        gain: (P, 3) factor on the texture.
-        emission: (P,) light of the surface's own, for what lies outside windows.
-        texels: (T, texels, 3) float32, see ``textures.stacked``.
-        starts: (levels + 1,), see ``textures.level_starts``.
-        side: texels along a side of the finest level.
-        ambient: (2, 3) light from above and from below.
-        sun: (2, 3) direction towards it (unit length), and its light.
-        lamps: (L, 2, 3) position, and its light on a surface that faces it from half its reach.
-        reach: metres; a lamp's light falls off as 1 / (1 + (distance / reach)²).
-        shadows: whether solids and walls keep the lamps' light away.
-    """
-
-    texture: Int64
-    tile: Float64
-    offset: Float64
-    gain: Float64
-    emission: Float64
-    texels: Float32
-    starts: Int64
-    side: int
-    ambient: Float64
-    sun: Float64
+    texture: Int64  # (P,) row of ``texels``
+    tile: Float64  # (P, 2) length that one copy of the texture covers, metres
+    offset: Float64  # (P, 2) of the texture's corner, metres
+    gain: Float64  # (P, 3) factor on the texture
+    emission: Float64  # (P,) light of the surface's own, for what lies outside windows
+    texels: Float32  # (T, texels, 3) float32, see ``textures.stacked``
+    starts: Int64  # (levels + 1,), see ``textures.level_starts``
+    side: int  # texels along a side of the finest level
+    ambient: Float64  # (2, 3) light from above and from below
+    sun: Float64  # (2, 3) direction towards it (unit length), and its light
+    # (L, 2, 3) position, and its light on a surface that faces it from half its reach
     lamps: Float64
-    reach: float
-    shadows: bool
+    reach: float  # metres; a lamp's light falls off as 1 / (1 + (distance / reach)²)
+    shadows: bool  # whether solids and walls keep the lamps' light away
 
 
 @compiled(fastmath=FAST)
@@ -353,15 +338,9 @@ BRIGHTEST = 4.0
 
 
 def radiance(
-    geometry: Geometry, look: Look, cameras: Cameras, *, supersample: int = SUPERSAMPLE
+    geometry: RoomGeometry, look: Look, cameras: Cameras, *, supersample: int = SUPERSAMPLE
 ) -> tuple[Float32, Float32]:
     """Linear light and depth that cameras of one size see.
-
-    Args:
-        geometry: of the scene.
-        look: of the scene.
-        cameras: V of them.
-        supersample: rays along a pixel's side, for the colour.
 
     Returns:
         (V, H, W, 3) and (V, H, W) float32.
@@ -376,7 +355,7 @@ def radiance(
     return color, cast(geometry, cameras).depth.astype(np.float32)
 
 
-def developed(light: Float32, exposure: float) -> NDArray[np.uint8]:
+def to_srgb(light: Float32, exposure: float) -> NDArray[np.uint8]:
     """(..., 3) linear light to 8-bit sRGB by the tone curve of ``color.encode_srgb``."""
     out = np.empty(light.shape, np.uint8)
     develop(light.reshape(-1), np.float32(exposure * (STEPS - 1) / BRIGHTEST), _TONES, out.ravel())

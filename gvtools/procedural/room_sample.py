@@ -18,7 +18,7 @@ from gvtools.errors import OptionError
 from gvtools.kernels import KernelSet
 from gvtools.procedural.builder import ProceduralScene
 from gvtools.procedural.furnished_room import furnished_room
-from gvtools.procedural.render import develop, developed, radiance
+from gvtools.procedural.render import develop, radiance, to_srgb
 from gvtools.procedural.sample_workspace import SampleContent, is_written, write_sample
 from gvtools.trajectories import look_at
 
@@ -35,22 +35,16 @@ SAME_SURFACE = 0.005  # relative z-depth by which a point may differ from the pi
 
 @dataclass(frozen=True)
 class RoomSample:
-    """A written room.
+    """A written room."""
 
-    Attributes:
-        folder: the COLMAP workspace.
-        context: names of the views to reconstruct from; they leave parts of the room unseen.
-        targets: names of the views to predict, along a path that leads away from the context.
-            Their own images and depth maps are the truth.
-        depth_truth: names of the views with a true depth map: all of them.
-        seed: which room.
-    """
-
-    folder: Path
+    folder: Path  # the COLMAP workspace
+    # names of the views to reconstruct from; they leave parts of the room unseen
     context: tuple[str, ...]
+    # names of the views to predict, along a path that leads away from the context. Their own images
+    # and depth maps are the truth.
     targets: tuple[str, ...]
-    depth_truth: tuple[str, ...]
-    seed: int
+    depth_truth: tuple[str, ...]  # names of the views with a true depth map: all of them
+    seed: int  # which room
 
 
 def write_room(
@@ -83,7 +77,7 @@ def write_room(
     if is_written(folder, record):
         return sample
     room, cameras, rng = room_views(seed, views, width=width, height=height)
-    write_sample(folder, photographed(room, cameras, rng), record=record)
+    write_sample(folder, photograph_room(room, cameras, rng), record=record)
     return sample
 
 
@@ -120,7 +114,7 @@ def compile_kernels() -> None:
         room.geometry.rooms[0, 1], ("a",), ("b",), width=16, height=16, rng=np.random.default_rng(0)
     )
     light, _ = radiance(room.geometry, room.look, cameras)
-    developed(light, 1.0)
+    to_srgb(light, 1.0)
 
 
 KERNELS = KernelSet("renderer", compile_kernels, develop)
@@ -163,7 +157,7 @@ def _path(
     )
 
 
-def photographed(
+def photograph_room(
     room: ProceduralScene,
     cameras: Cameras,
     rng: np.random.Generator,
@@ -172,7 +166,7 @@ def photographed(
 ) -> SampleContent:
     """Pictures, depth, and noisy detections of surface points in them, ``per_view`` or fewer."""
     light, depth = radiance(room.geometry, room.look, cameras)
-    images = developed(light, room.key / float(light.mean()))
+    images = to_srgb(light, room.key / float(light.mean()))
     points, colors = _detected(cameras, images, depth, rng, per_view=per_view)
     point_index, view_index, xy = _tracks(cameras, depth, points)
     xy += rng.normal(0, DETECTION_NOISE, xy.shape)

@@ -112,10 +112,7 @@ def color(rng: np.random.Generator) -> Float32:
 def noise(rng: np.random.Generator, side: int, *, coarsest: int | None = None) -> Float32:
     """(side, side) float32 in [0, 1]: value noise, each octave finer and weaker than the last.
 
-    Args:
-        rng: decides octaves and values.
-        side: pixels.
-        coarsest: cells along a side of the first octave; None draws it.
+    ``side``: pixels. ``coarsest``: cells along a side of the first octave; None draws it.
     """
     from PIL import Image
 
@@ -287,7 +284,7 @@ def level_starts(side: int) -> NDArray[np.int64]:
     return np.cumsum([0, *sizes]).astype(np.int64)
 
 
-def stacked(images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:
+def stack_levels(images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float32]:
     """(T, texels, 3) float32 linear light: every texture at all its levels, row by row.
 
     Textures are square, of one size, and their side is a power of two.

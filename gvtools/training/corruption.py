@@ -64,13 +64,8 @@ NOTHING = CorruptionOptions(
 )
 
 
-def drawn(rng: np.random.Generator, options: CorruptionOptions) -> CorruptionOptions:
-    """The strengths of one sample's faults.
-
-    Args:
-        rng: draws the same number of values whatever the options are.
-        options: the largest strengths.
-    """
+def draw_strengths(rng: np.random.Generator, options: CorruptionOptions) -> CorruptionOptions:
+    """The strengths of one sample's faults."""
     perfect = rng.random() < options.clean
     strengths = {}
     for name in CorruptionOptions.model_fields:
@@ -123,11 +118,7 @@ def corrupted_camera(
 ) -> Cameras:
     """A camera that is turned and shifted a little.
 
-    Args:
-        rng: draws how.
-        camera: a batch of one.
-        unit: mean depth, scene units.
-        strength: of the faults.
+    ``unit``: mean depth, scene units.
     """
     from scipy.spatial.transform import Rotation
 

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.errors import OptionError
-from gvtools.training.stage import Stage
+from gvtools.training.stages import Stage
 
 # More rounds than a group has threads.
 SETTLING_ROUNDS = 4
@@ -30,17 +30,11 @@ SETTLING_SECONDS = 0.1
 
 @dataclass(frozen=True)
 class Processes:
-    """The group that ``torchrun`` started, or one process alone.
+    """The group that ``torchrun`` started, or one process alone."""
 
-    Attributes:
-        rank: number of this process.
-        count: how many there are.
-        device: of this process.
-    """
-
-    rank: int
-    count: int
-    device: torch.device
+    rank: int  # number of this process
+    count: int  # how many there are
+    device: torch.device  # of this process
 
     @property
     def first(self) -> bool:
@@ -112,7 +106,7 @@ class Processes:
 
 
 @contextmanager
-def started(device: str = "auto") -> Iterator[Processes]:
+def join_processes(device: str = "auto") -> Iterator[Processes]:
     """The processes of this training; joins the group that ``torchrun`` describes.
 
     Args:
@@ -152,12 +146,7 @@ def _settle() -> None:
 
 
 class Replicated:
-    """All parameters, gradients, averages and moments on every process.
-
-    Args:
-        stage: the module in training; moved to the process's device with all that it uses.
-        processes: this process and the others.
-    """
+    """All parameters, gradients, averages and moments on every process."""
 
     # Whether all processes have to take part in whatever the model does.
     collective = False

@@ -1,8 +1,15 @@
-"""Stage 0: a small geometric encoder from scratch, with its geometry, ray, pose and RGB heads.
+"""Stages of a small model's encoder and heads; published encoders skip both.
 
-Published encoders skip this stage. The heads are trained on noisy features and without level 0 now
-and then, since generated features are noisy and a cascade may be left out. Depth, origins and
-camera centres are in units of the mean context depth, in the frame of the first view.
+Stage 0 trains a geometric encoder from scratch, with its geometry, ray, pose and RGB heads, on
+noisy features and without level 0 now and then, since generated features are noisy and a cascade
+may be left out. Depth, origins and camera centres are in units of the mean context depth, in the
+frame of the first view.
+
+After the denoisers the heads learn from what these, frozen, make. Colour and depth learn from
+completions, made in as many steps as in use: what is uncertain about generated features, and where
+their tokens meet, the encoder's stage could not know. Cameras are read off the rays, which that
+stage, with five more terms, leaves before they are as good as its features allow. The layers that
+depth and rays share stay as they are.
 """
 
 from __future__ import annotations
@@ -13,15 +20,15 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor, nn
 
+from gvtools.completers.geoverse.composition import composed
 from gvtools.completers.geoverse.conditioning import ViewBatch, encode_views, filled
 from gvtools.completers.geoverse.model import GeoVerse
-from gvtools.completers.geoverse.objective import high_gradient_loss
+from gvtools.completers.geoverse.objective import high_gradient_loss, rgb_loss
 from gvtools.networks.depth_anything.encoder import encode_cameras, patch_rays
 from gvtools.networks.depth_anything.geometry_head import Geometry
-from gvtools.training.batch import TrainingBatch
-from gvtools.training.draws import Draws
+from gvtools.training.batch import Draws, TrainingBatch
 from gvtools.training.options import EncoderStageOptions, HeadsStageOptions
-from gvtools.training.stage import Stage
+from gvtools.training.stages import Stage
 
 # Pull of the confidence towards certainty against the error (DA3, VGGT).
 CONFIDENCE_REWARD = 0.2
@@ -41,8 +48,8 @@ class EncoderStage(Stage):
     def forward(self, batch: TrainingBatch, draws: Draws) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss, and its terms for the log."""
         model, options = self.model, self.options
-        features = noised_features(model, batch, draws, options=options)
-        geometry, rgb = decoded(model, features, batch)
+        features = noisy_features(model, batch, draws, options=options)
+        geometry, rgb = decode_heads(model, features, batch)
         unit = scene_unit(batch)
         depth = batch.depth[:, :, 0] / unit[:, None, None, None]
         terms = {
@@ -69,25 +76,20 @@ class EncoderStage(Stage):
 
 
 @dataclass(frozen=True)
-class Features:
-    """What the heads get.
+class HeadFeatures:
+    """What the heads get."""
 
-    Attributes:
-        levels: four (B, V, N, C), normed, without token 0.
-        token: (B, V, C) token 0 of the last one.
-    """
-
-    levels: list[Tensor]
-    token: Tensor
+    levels: list[Tensor]  # four (B, V, N, C), normed, without token 0
+    token: Tensor  # (B, V, C) token 0 of the last one
 
 
-def noised_features(
+def noisy_features(
     model: GeoVerse,
     batch: TrainingBatch,
     draws: Draws,
     *,
     options: EncoderStageOptions | HeadsStageOptions,
-) -> Features:
+) -> HeadFeatures:
     """Features of all views; noise on levels 0 and 1, level 0 of some samples at its mean."""
     views = _shown(model, batch, draws, share=options.hints)
     levels = encode_views(model.geometry, views, slice(None), config=model.config.hints)
@@ -103,15 +105,17 @@ def noised_features(
     return head_features(model, noisy, batch)
 
 
-def head_features(model: GeoVerse, levels: Sequence[Tensor], batch: TrainingBatch) -> Features:
+def head_features(model: GeoVerse, levels: Sequence[Tensor], batch: TrainingBatch) -> HeadFeatures:
     """What the heads get of levels 0 and 1, the deeper levels made of level 1."""
     encoder = model.geometry.encoder
     pyramid = [*levels, *encoder.propagate(levels[1], encoder.grid(*batch.views.size))]
     normed = [encoder.normed(level[:, :, 1:].float()) for level in pyramid]
-    return Features(normed, pyramid[-1][:, :, 0])
+    return HeadFeatures(normed, pyramid[-1][:, :, 0])
 
 
-def decoded(model: GeoVerse, features: Features, batch: TrainingBatch) -> tuple[Geometry, Tensor]:
+def decode_heads(
+    model: GeoVerse, features: HeadFeatures, batch: TrainingBatch
+) -> tuple[Geometry, Tensor]:
     """The geometry and the colour (B, V, 3, H, W) that the heads make of features."""
     grid = model.geometry.encoder.grid(*batch.views.size)
     rgb = model.rgb_head(torch.cat(features.levels, dim=-1).flatten(0, 1), grid)
@@ -150,11 +154,7 @@ def ray_error(
 ) -> Tensor:
     """L1 of directions and origins, and the confidence's loss.
 
-    Args:
-        ray: (B, V, h, w, 6).
-        confidence: (B, V, h, w).
-        batch: of the views.
-        origin: weight of the origins' error.
+    ``ray``: (B, V, h, w, 6). ``confidence``: (B, V, h, w).
     """
     error = (ray - true_rays(batch, scene_unit(batch), (ray.shape[-3], ray.shape[-2]))).abs()
     direction, place = error.split(3, dim=-1)
@@ -218,3 +218,85 @@ def measure_statistics(model: GeoVerse, batches: list[TrainingBatch]) -> None:
         mean = sums[index] / count
         statistics.mean.copy_(mean)
         statistics.var.copy_(squares[index] / count - mean.square())
+
+
+class HeadsStage(Stage):
+    """Loss of the heads; see the module."""
+
+    name = "heads"
+
+    options: HeadsStageOptions
+
+    def learning_parts(self) -> Iterable[nn.Module | None]:
+        """The heads that have a weight."""
+        model, options = self.model, self.options
+        rays = model.geometry.head.ray_chain() if options.ray else []
+        depth = model.geometry.head.depth_chain() if options.depth else []
+        return [*rays, model.rgb_head if options.rgb else None, *depth]
+
+    def forward(self, batch: TrainingBatch, draws: Draws) -> tuple[Tensor, dict[str, Tensor]]:
+        """The loss, and its terms for the log."""
+        options = self.options
+        total = batch.images.new_zeros(())
+        terms: dict[str, Tensor] = {}
+        if options.ray:
+            loss, terms = self._rays(batch, draws)
+            total = total + options.ray * loss
+        if options.rgb or options.depth:
+            found = self._completions(batch, draws)
+            color = found["rgb"] + options.hf * found["hf"] + options.decoded * found["rgb_decoded"]
+            length = found["depth"] + options.decoded * found["depth_decoded"]
+            total = total + options.rgb * color + options.depth * length
+            terms |= found
+        return total, terms
+
+    def _rays(self, batch: TrainingBatch, draws: Draws) -> tuple[Tensor, dict[str, Tensor]]:
+        model, options = self.model, self.options
+        with torch.no_grad():
+            levels = noisy_features(model, batch, draws, options=options).levels
+        found = model.geometry.head(levels, model.geometry.encoder.grid(*batch.views.size))
+        with torch.no_grad():
+            cells = (found.ray.shape[-3], found.ray.shape[-2])
+            error = (found.ray - true_rays(batch, scene_unit(batch), cells)).abs()
+        loss = ray_error(found.ray, found.ray_confidence, batch, origin=options.origin)
+        return loss, {"direction": error[..., :3].mean(), "origin": error[..., 3:].mean()}
+
+    def _completions(self, batch: TrainingBatch, draws: Draws) -> dict[str, Tensor]:
+        """Errors of the targets as inference makes them; gradients reach the heads alone."""
+        model, context = self.model, batch.views.context
+        with torch.no_grad():
+            prepared = model.prepare(batch.views, seed=draws.seeds("video", batch.images.shape[1]))
+            like = prepared.hints.level1
+            level1 = model.sample1(
+                prepared,
+                draws.normal("eps1", like.shape, like.device),
+                temperature=self.options.temperature,
+            )
+            level0 = model.sample0(prepared, level1, draws.normal("eps0", like.shape, like.device))
+        made = model.decode(prepared, level0, level1, targets_alone=True)
+        rgb, depth = batch.images[:, context:], batch.depth[:, context:, 0]
+        # Decoded depth is in units of the mean context depth, a correction's in the scene's.
+        scaled = depth / scene_unit(batch)[:, None, None, None]
+        hint, wanted, judged = None, scaled, torch.ones_like(depth, dtype=torch.bool)
+        if model.config.composition == "correction":
+            # What memory knows is kept as it is.
+            hint = model.decode(prepared, level0, prepared.hints.unmasked, targets_alone=True)
+            wanted, judged = depth, ~batch.views.valid[:, context:, 0]
+        image, length = composed(prepared.batch, made, hint)
+        return {
+            "rgb": rgb_loss(image, rgb, valid=judged).mean(),
+            "hf": high_gradient_loss(image, rgb, valid=judged).mean(),
+            "rgb_decoded": rgb_loss(made.rgb, rgb).mean(),
+            "depth": log_error(length, wanted, judged),
+            "depth_decoded": log_error(made.depth, scaled, depth > 0),
+        }
+
+
+def log_error(depth: Tensor, truth: Tensor, judged: Tensor) -> Tensor:
+    """L1 of log-depths where both are known: mean over samples of each one's mean, or 0.
+
+    ``depth``: (B, T, H, W); 0 = none. ``judged``: (B, T, H, W) bool, pixels that count.
+    """
+    judged = judged & (depth > 0) & (truth > 0)
+    error = torch.where(judged, depth, 1.0).log() - torch.where(judged, truth, 1.0).log()
+    return masked_mean(error.abs(), judged)

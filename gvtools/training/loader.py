@@ -1,24 +1,129 @@
-"""Batches of a data set in order, made ahead by other processes, which change nothing in them.
+"""Loading of samples: worker processes, and a pool of samples on disk.
 
-A sample follows from its number, so that there is no state to save.
+A sample follows from its number, so that there is no state to save. A pool is a limited number of
+samples that are seen again and again, since rendering takes a third of a small training's time;
+colours are kept with 8 bits and depths as float16, whether a sample comes from the disk or was just
+made, so that the files decide nothing.
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
 import multiprocessing
 import os
 import threading
+import zipfile
 from collections.abc import Generator, Iterable, Iterator
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numba
+import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gvtools.errors import GvError, ProjectError
+import gvtools
+from gvtools.errors import GvError, OptionError, ProjectError
+from gvtools.files import replaced_when_written
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.dataset import Samples
-from gvtools.training.view_sample import TENSORS, Sample, collated
+from gvtools.training.sample import TENSORS, TrainingSample, collate
+from gvtools.untrusted import load_arrays
+
+COLORS, DEPTHS = ("images", "hint"), ("depth", "hint_depth", "evidence")
+GREATEST = float(np.finfo(np.float16).max)
+
+
+@dataclass(frozen=True)
+class PooledViews:
+    """The first ``count`` samples of a data set, over and over."""
+
+    data: Samples  # the samples
+    count: int  # a multiple of the data set's group, so that a batch stays within one
+    # where they are kept, in a folder of their own named after what decides them, the code
+    # included; None makes them anew each time
+    folder: Path | None = None
+
+    def __post_init__(self) -> None:
+        if self.count % 8:
+            raise OptionError(
+                f"data.pool = {self.count}; expected a multiple of 8, such as "
+                f"{-(-self.count // 8) * 8}"
+            )
+
+    def sample(self, index: int) -> TrainingSample:
+        """The sample of a number, 0 or more; numbers ``count`` apart have the same."""
+        number = index % self.count
+        if self.folder is None:
+            return _sample(_packed(self.data.sample(number)))
+        path = self._place / f"{number:06d}.npz"
+        packed = _read(path) if path.exists() else None
+        if packed is None:
+            packed = _packed(self.data.sample(number))
+            # Without compression: reading is to cost nothing.
+            with replaced_when_written(path) as temporary, temporary.open("wb") as file:
+                np.savez(file, **packed)  # type: ignore[arg-type]
+        return _sample(packed)
+
+    def describe(self) -> dict[str, Any]:
+        """Everything that decides the samples, as plain data."""
+        return {"pool": self.count, **self.data.describe()}
+
+    @property
+    def _place(self) -> Path:
+        text = json.dumps(self.data.describe(), sort_keys=True, default=str)
+        assert self.folder is not None
+        return self.folder / hashlib.sha256(text.encode() + _code()).hexdigest()[:16]
+
+
+@cache
+def _code() -> bytes:
+    """Digest of the library's code, by which samples are made."""
+    digest = hashlib.sha256()
+    for file in sorted(Path(gvtools.__file__).parent.rglob("*.py")):
+        digest.update(file.read_bytes())
+    return digest.digest()
+
+
+def _packed(sample: TrainingSample) -> dict[str, NDArray[Any]]:
+    packed: dict[str, NDArray[Any]] = {
+        "context": np.array(sample.context),
+        "notes": np.array(sample.notes, str),
+    }
+    for name in TENSORS:
+        values = getattr(sample, name).numpy()
+        if name in COLORS:
+            values = np.rint(values * 255).astype(np.uint8)
+        elif name in DEPTHS:
+            values = np.clip(values, 0, GREATEST).astype(np.float16)
+        packed[name] = values
+    return packed
+
+
+def _sample(packed: dict[str, NDArray[Any]]) -> TrainingSample:
+    tensors: dict[str, Any] = {}
+    for name in TENSORS:
+        values = packed[name]
+        if name in COLORS:
+            tensors[name] = torch.from_numpy(values).float() / 255
+        elif name in DEPTHS:
+            tensors[name] = torch.from_numpy(values.astype(np.float32))
+        else:
+            tensors[name] = torch.from_numpy(values)
+    notes = tuple(packed["notes"].tolist())
+    return TrainingSample(**tensors, context=int(packed["context"]), notes=notes)
+
+
+def _read(path: Path) -> dict[str, NDArray[Any]] | None:
+    """What a file holds; None where it is damaged, and then it is made again."""
+    try:
+        return load_arrays(path)
+    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile):
+        return None
+
 
 # A sample on its way: its context views and notes, its tensors as arrays; or why there is none.
 _Made = tuple[int, tuple[str, ...], dict[str, NDArray[Any]]] | GvError
@@ -36,7 +141,7 @@ def batches(
     """
     if not workers:
         for part in parts:
-            yield collated([data.sample(number) for number in part])
+            yield collate([data.sample(number) for number in part])
         return
     loader: torch.utils.data.DataLoader[list[_Made]] = torch.utils.data.DataLoader(
         _Arrays(data),  # type: ignore[arg-type]
@@ -51,7 +156,7 @@ def batches(
     )
     stream = iter(loader)
     while (items := _next(stream)) is not None:
-        yield collated([_restored(item) for item in items])
+        yield collate([_restored(item) for item in items])
 
 
 def _next(stream: Iterator[list[_Made]]) -> list[_Made] | None:
@@ -86,12 +191,12 @@ class _Arrays:
         return sample.context, sample.notes, arrays
 
 
-def _restored(made: _Made) -> Sample:
+def _restored(made: _Made) -> TrainingSample:
     if isinstance(made, GvError):
         raise made
     context, notes, values = made
     tensors: dict[str, Any] = {name: torch.from_numpy(value) for name, value in values.items()}
-    return Sample(**tensors, context=context, notes=notes)
+    return TrainingSample(**tensors, context=context, notes=notes)
 
 
 def _unchanged(item: Any) -> Any:

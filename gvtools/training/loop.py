@@ -23,13 +23,17 @@ from torch import nn
 
 from gvtools.errors import OptionError
 from gvtools.networks.compute import autocast, training_type
-from gvtools.training.batch import TrainingBatch
+from gvtools.training.batch import Draws, TrainingBatch
 from gvtools.training.distributed import Replicated
-from gvtools.training.draws import Draws
-from gvtools.training.ema import AveragedWeights
 from gvtools.training.mixture import RESAMPLED
 from gvtools.training.options import OptimizerOptions
-from gvtools.training.state import Progress, StageState, load_state, save_state
+from gvtools.training.state import (
+    AveragedWeights,
+    StageState,
+    TrainingProgress,
+    load_state,
+    save_state,
+)
 
 Batches = Callable[[Iterable[range]], Generator[TrainingBatch, None, None]]
 Record = Callable[[int, dict[str, float]], None]
@@ -40,35 +44,18 @@ SAVING_SHARE = 20
 
 @dataclass(frozen=True)
 class Reporting:
-    """When and to whom the loop reports.
+    """When and to whom the loop reports."""
 
-    Attributes:
-        log_every: steps between records.
-        save_seconds: seconds between checkpoints; more where saving takes long.
-        sheet_every: steps between sample sheets.
-        record: gets (step, values), means over all processes.
-        sheet: gets the step, in every process; the averaged weights are in place meanwhile.
-    """
-
-    log_every: int = 20
-    save_seconds: float = 60.0
-    sheet_every: int = 0
-    record: Record | None = None
+    log_every: int = 20  # steps between records
+    save_seconds: float = 60.0  # seconds between checkpoints; more where saving takes long
+    sheet_every: int = 0  # steps between sample sheets
+    record: Record | None = None  # gets (step, values), means over all processes
+    # gets the step, in every process; the averaged weights are in place meanwhile
     sheet: Callable[[int], None] | None = None
 
 
 class Trainer:
-    """One stage in training.
-
-    Args:
-        distributed: what this process holds of a stage (see Stage); what it leaves trainable is
-            trained.
-        options: of the optimiser.
-        batches: gives the samples with these numbers, part by part.
-        folder: of the state.
-        seed: of the draws.
-        identity: what may not change when a training is continued.
-    """
+    """One stage in training."""
 
     def __init__(
         self,
@@ -96,7 +83,7 @@ class Trainer:
             betas=options.betas,
         )
         self.ema = AveragedWeights(self.parameters, options.ema)
-        self.progress = Progress()
+        self.progress = TrainingProgress()
         # Of this process's samples since they were merged last.
         self._notes: Counter[str] = Counter()
         # Processes of one training have to agree, as a stage that runs has seen to (run.py).
@@ -211,11 +198,7 @@ class Trainer:
         return _parts(mine, self.options.accumulate)
 
     def check_parts(self, group: int) -> None:
-        """Whether the samples of each part of each step have context views of one number.
-
-        Args:
-            group: so many samples in a row, from a multiple of it, have.
-        """
+        """Whether the samples of each part of each step have context views of one number."""
         for part in itertools.chain.from_iterable(map(self.parts, range(group))):
             if part[0] // group != part[-1] // group:
                 raise OptionError(
@@ -231,11 +214,7 @@ class Trainer:
             yield from self.parts(step)
 
     def step(self, stream: Iterator[TrainingBatch]) -> dict[str, float]:
-        """One optimiser step; returns what it logs. A bad batch is skipped and counted.
-
-        Args:
-            stream: the batches of the parts of this step come next.
-        """
+        """One optimiser step; returns what it logs. A bad batch is skipped and counted."""
         options, number = self.options, self.progress.step
         for group in self.optimizer.param_groups:
             group["lr"] = self.options.rate_at(number)

@@ -1,4 +1,4 @@
-"""Training samples drawn from several sources in proportion to their weights.
+"""Samples from several sources in proportion to their weights, and the report of the sampling.
 
 A sample's source follows from the seed and the sample's number (its index) alone: random numbers
 are read from a counter-based generator at a position that the index gives. So sample 1000 is the
@@ -8,7 +8,7 @@ same on any number of processes and workers, and no earlier sample has to be dra
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Protocol
@@ -18,8 +18,27 @@ from numpy.typing import NDArray
 
 from gvtools.errors import DegenerateError, OptionError
 from gvtools.training.dataset import MIXED
-from gvtools.training.invalid_sample import DEPTH, InvalidSampleError
-from gvtools.training.view_sample import Sample
+from gvtools.training.sample import TrainingSample
+
+# A scene cannot be opened, a view cannot be read, views hardly share anything, depth is missing.
+SCENE, UNREADABLE, OVERLAP, DEPTH = "scene", "unreadable", "overlap", "depth"
+
+
+class InvalidSampleError(DegenerateError):
+    """A sample that is not to be learnt from.
+
+    Attributes:
+        reason: one of the above.
+    """
+
+    def __init__(self, reason: str, message: str) -> None:
+        super().__init__(message)
+        self.reason = reason
+
+    def __reduce__(self) -> tuple[type[InvalidSampleError], tuple[str, str]]:
+        # Errors travel from workers to the training.
+        return type(self), (self.reason, str(self))
+
 
 Float64 = NDArray[np.float64]
 
@@ -42,7 +61,7 @@ DRAWN, RESAMPLED, GEOMETRY_OF = "drawn", "resampled", "geometry"
 class Redrawable(Protocol):
     """Samples by index, of which another one can be drawn where one is invalid."""
 
-    def sample(self, index: int, attempt: int = 0) -> Sample:
+    def sample(self, index: int, attempt: int = 0) -> TrainingSample:
         """The sample of an index; each attempt gives another one."""
         ...
 
@@ -52,31 +71,20 @@ class Redrawable(Protocol):
 
 
 @dataclass(frozen=True)
-class Source:
-    """One source of a mixture.
+class SampleSource:
+    """One source of a mixture."""
 
-    Attributes:
-        name: unique in a mixture; part of the notes.
-        weight: 0 or more; its share of the samples is weight / sum of all weights.
-        samples: drawn from it.
-    """
-
-    name: str
-    weight: float
-    samples: Redrawable
+    name: str  # unique in a mixture; part of the notes
+    weight: float  # 0 or more; its share of the samples is weight / sum of all weights
+    samples: Redrawable  # drawn from it
 
 
 @dataclass(frozen=True)
 class Mixture:
-    """Sources that samples are drawn from by weight.
+    """Sources that samples are drawn from by weight."""
 
-    Attributes:
-        sources: at least one.
-        seed: 0 or more.
-    """
-
-    sources: tuple[Source, ...]
-    seed: int = 0
+    sources: tuple[SampleSource, ...]  # at least one
+    seed: int = 0  # 0 or more
 
     def __post_init__(self) -> None:
         weights = [source.weight for source in self.sources]
@@ -95,11 +103,8 @@ class Mixture:
     def drawn(self, start: int, count: int, *, without: Collection[int] = ()) -> NDArray[np.int64]:
         """(count,) index of the source of each of the samples from ``start`` on.
 
-        Args:
-            start: number of the first sample, 0 or more.
-            count: how many samples.
-            without: indices of sources that are not to be drawn; another one with a weight above 0
-                has to remain.
+        ``start``: number of the first sample, 0 or more. ``without``: indices of sources that are
+        not to be drawn; another one with a weight above 0 has to remain.
         """
         numbers = stratified_at(start, count, stream=[self.seed, MIXED, SOURCES, len(without)])
         shares = np.where(np.isin(np.arange(len(self.sources)), list(without)), 0, self.shares)
@@ -108,7 +113,7 @@ class Mixture:
         last = int(np.flatnonzero(shares)[-1])
         return np.minimum(np.searchsorted(ends, numbers, side="right"), last)
 
-    def sample(self, index: int) -> Sample:
+    def sample(self, index: int) -> TrainingSample:
         """The sample of an index, 0 or more, with notes of its source and of invalid draws."""
         if index < 0:
             raise OptionError(f"sample {index}; expected a number of 0 or more")
@@ -149,19 +154,14 @@ class OwnOrEstimated:
 
     The GeoVerse paper mixes both. Where the estimate is to be used and there is none, the data
     set's own is; where own depth is missing or incomplete, the estimate is. Both cases are noted.
-
-    Attributes:
-        own: samples with recorded poses and depth.
-        estimated: samples with estimated poses and depth; None where there are none.
-        own_share: share of samples that are to have recorded geometry, 0 to 1; 2/3 for the paper's
-            2:1.
-        seed: 0 or more.
     """
 
-    own: Redrawable
+    own: Redrawable  # samples with recorded poses and depth
+    # samples with estimated poses and depth; None where there are none
     estimated: Redrawable | None = None
+    # share of samples that are to have recorded geometry, 0 to 1; 2/3 for the paper's 2:1
     own_share: float = 1.0
-    seed: int = 0
+    seed: int = 0  # 0 or more
 
     def __post_init__(self) -> None:
         if not 0 <= self.own_share <= 1:
@@ -174,7 +174,7 @@ class OwnOrEstimated:
         stream = [self.seed, MIXED, GEOMETRY, attempt]
         return stratified_at(start, count, stream=stream) < self.own_share
 
-    def sample(self, index: int, attempt: int = 0) -> Sample:
+    def sample(self, index: int, attempt: int = 0) -> TrainingSample:
         """The sample of an index, 0 or more; each attempt gives another one."""
         if self.wants_own(index, 1, attempt)[0]:
             try:
@@ -212,10 +212,8 @@ def stratified_at(start: int, count: int, *, stream: Sequence[int]) -> Float64:
     ... ]
     True
 
-    Args:
-        start: position in the stream, 0 or more.
-        count: how many.
-        stream: integers of 0 or more that name the stream, the seed among them.
+    ``start``: position in the stream, 0 or more. ``stream``: integers of 0 or more that name the
+    stream, the seed among them.
     """
     first, last = start // _RUN, -(-(start + count) // _RUN)
     key = np.random.SeedSequence(list(stream)).generate_state(2, np.uint64)
@@ -226,10 +224,36 @@ def stratified_at(start: int, count: int, *, stream: Sequence[int]) -> Float64:
     return numbers.ravel()[start - first * _RUN :][:count]
 
 
-def _noted(sample: Sample, text: str) -> Sample:
+def _noted(sample: TrainingSample, text: str) -> TrainingSample:
     return replace(sample, notes=(*sample.notes, f"{GEOMETRY_OF}/{text}"))
 
 
 def _split(note: str) -> tuple[str, str]:
     kind, _, text = note.partition("/")
     return kind, text
+
+
+# Of the log's keys that count what drawing met: logged, and printed at the end.
+NOTE_PREFIXES = tuple(f"{kind}/" for kind in (DRAWN, RESAMPLED, GEOMETRY_OF))
+
+
+def sampling_report(counts: Mapping[str, int]) -> Iterator[str]:
+    """One line for each source: how many samples, whose geometry, what was invalid and why.
+
+    Args:
+        counts: by note, see ``mixture``.
+
+    >>> counts = {"drawn/rooms": 30, "drawn/kitchen": 10, "resampled/kitchen/overlap": 2}
+    >>> list(sampling_report(counts))
+    ['10 samples (25 %) of kitchen; drawn again: 2 overlap', '30 samples (75 %) of rooms']
+    """
+    parts = [(name.split("/", 2), count) for name, count in sorted(counts.items())]
+    samples = {part[1]: count for part, count in parts if part[0] == DRAWN}
+    total = sum(samples.values())
+    for source in sorted({part[1] for part, _ in parts}):
+        count = samples.get(source, 0)
+        line = f"{count} samples ({count / max(total, 1):.0%}) of {source}".replace("%", " %")
+        for kind, title in ((GEOMETRY_OF, "geometry"), (RESAMPLED, "drawn again")):
+            found = [f"{n} {part[2]}" for part, n in parts if part[:2] == [kind, source]]
+            line += f"; {title}: {', '.join(found)}" if found else ""
+        yield line

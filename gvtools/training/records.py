@@ -14,12 +14,7 @@ LOG = "log.jsonl"
 
 
 class TrainingLog:
-    """Appends records; those after the step that a training is resumed at are dropped.
-
-    Args:
-        folder: of the stage.
-        step: records after this step are of a part that is done again.
-    """
+    """Appends records; those after the step that a training is resumed at are dropped."""
 
     def __init__(self, folder: Path, *, step: int = 0) -> None:
         folder.mkdir(parents=True, exist_ok=True)

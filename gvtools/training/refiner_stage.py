@@ -19,10 +19,9 @@ from gvtools.completers.geoverse.conditioning import ViewBatch, filled
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.completers.geoverse.refiner import CompletedViews, completed_views, cropped
 from gvtools.errors import OptionError
-from gvtools.training.batch import TrainingBatch
-from gvtools.training.draws import Draws
+from gvtools.training.batch import Draws, TrainingBatch
 from gvtools.training.options import RefinerStageOptions
-from gvtools.training.stage import Stage
+from gvtools.training.stages import Stage
 
 # Completions of so many samples are kept; of 8 views at 96 x 96 that is 1 GB.
 KEPT = 3072
@@ -68,7 +67,7 @@ class RefinerStage(Stage):
             values[:, context:].flatten(0, 1) for values in (batch.images, batch.depth)
         )
         right = (depth.flatten(0, 1)[:, None] / true_depth.clamp_min(1e-12) - 1).abs() < RIGHT
-        views, truth, (right, known) = changed(shown, truth, (right, true_depth > 0), draws=draws)
+        views, truth, (right, known) = augment(shown, truth, (right, true_depth > 0), draws=draws)
         with torch.autocast(truth.device.type, enabled=False):
             found = self.model.refiner(views)
         holes = ~views.valid
@@ -135,26 +134,19 @@ class RefinerStage(Stage):
 def view_errors(made: Tensor, truth: Tensor, holes: Tensor) -> tuple[Tensor, Tensor]:
     """(N,) mean squared colour error of each view's holes, and the number of their pixels.
 
-    Args:
-        made: (N, 3, H, W).
-        truth: likewise.
-        holes: (N, 1, H, W) bool.
+    ``made``: (N, 3, H, W). ``holes``: (N, 1, H, W) bool.
     """
     squared = (made - truth).square().mean(1, keepdim=True) * holes
     count = holes.sum((1, 2, 3))
     return squared.sum((1, 2, 3)) / count.clamp_min(1), count
 
 
-def changed(
+def augment(
     views: CompletedViews, truth: Tensor, maps: Iterable[Tensor], *, draws: Draws
 ) -> tuple[CompletedViews, Tensor, list[Tensor]]:
     """Views and what they are compared with: mirrored, in other colours, and cut out alike.
 
-    Args:
-        views: of all samples, each sample's one after the other.
-        truth: (N, 3, H, W) true pictures.
-        maps: (N, 1, H, W) each.
-        draws: of the step; the same window is cut out of all samples.
+    ``truth``: (N, 3, H, W) true pictures. ``maps``: (N, 1, H, W) each.
     """
     count = len(views.made) // len(draws.samples)
     device = views.made.device

@@ -28,19 +28,16 @@ from gvtools.networks.compute import name_of, training_type
 from gvtools.networks.config_json import to_json
 from gvtools.procedural.textures import photograph_names
 from gvtools.training.batch import TrainingBatch
-from gvtools.training.denoiser_stage import DenoiserStage
+from gvtools.training.data import TrainingSamples
 from gvtools.training.distributed import Processes, Replicated, models_of
-from gvtools.training.drawn import NOTE_PREFIXES, drawn_lines
-from gvtools.training.encoder_stage import EncoderStage, measure_statistics
-from gvtools.training.heads_stage import HeadsStage
+from gvtools.training.encoder_stage import EncoderStage, HeadsStage, measure_statistics
 from gvtools.training.loop import Record, Reporting, Trainer
+from gvtools.training.mixture import NOTE_PREFIXES, sampling_report
 from gvtools.training.options import ReflowStageOptions, TrainingSettings
 from gvtools.training.records import STAGES, TrainingLog, read_log
 from gvtools.training.refiner_stage import RefinerStage
-from gvtools.training.reflow_stage import ReflowStage
-from gvtools.training.samples import TrainingSamples
 from gvtools.training.sheets import completion_sheet, encoder_sheet, write_png
-from gvtools.training.stage import Stage
+from gvtools.training.stages import DenoiserStage, ReflowStage, Stage
 from gvtools.training.state import FILE, saved_identity
 
 WEIGHTS = "weights"
@@ -61,22 +58,13 @@ FINGERPRINT_BYTES = 2**22
 
 
 class StageRun:
-    """A stage in its folder ``OUT/STAGE``.
-
-    Args:
-        config: settings of the whole training.
-        stage: name of the stage, one of ``STAGES``.
-        out: folder of the whole training; the stage writes into ``out / stage``.
-        processes: rank, number and device of the training processes.
-        model_folder: folder that relative paths in the model's configuration refer to.
-        init: weights folder to start from, instead of the previous stage's.
-    """
+    """A stage in its folder ``OUT/STAGE``."""
 
     def __init__(
         self,
         config: TrainingSettings,
-        stage: str,
-        out: Path,
+        stage: str,  # name of the stage, one of ``STAGES``
+        out: Path,  # folder of the whole training; the stage writes into ``out / stage``
         *,
         processes: Processes,
         model_folder: Path | None = None,
@@ -148,7 +136,7 @@ class StageRun:
             sheet=self._sheet_writer(model, distributed, samples) if sheet_every else None,
         )
         trainer.train(reporting, until=until)
-        for line in drawn_lines(trainer.progress.drawn):
+        for line in sampling_report(trainer.progress.drawn):
             say(f"{self.stage}: {line}")
         if trainer.finished:
             self._write_weights(model, trainer, samples)

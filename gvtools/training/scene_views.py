@@ -18,12 +18,17 @@ from gvtools.errors import GvError, ProjectError
 from gvtools.scenes.collection import SceneCollection
 from gvtools.scenes.scene import View
 from gvtools.scenes.selection import select
-from gvtools.training.context_choice import ContextChoice
-from gvtools.training.corruption import GENTLE, CorruptionOptions, drawn
-from gvtools.training.dataset import FAULTS, PATH, RECORDED, context_seed, described
-from gvtools.training.hints import Clip
-from gvtools.training.invalid_sample import DEPTH, OVERLAP, SCENE, UNREADABLE, InvalidSampleError
-from gvtools.training.view_sample import Sample, make_sample
+from gvtools.training.corruption import GENTLE, CorruptionOptions, draw_strengths
+from gvtools.training.dataset import (
+    FAULTS,
+    PATH,
+    RECORDED,
+    ContextChoice,
+    context_seed,
+    shared_settings,
+)
+from gvtools.training.mixture import DEPTH, OVERLAP, SCENE, UNREADABLE, InvalidSampleError
+from gvtools.training.sample import Clip, TrainingSample, make_sample
 
 ATTEMPTS = 40
 MOST_STRIDE = 6  # steps between the views of a window
@@ -43,16 +48,11 @@ class TooFewViewsError(ProjectError):
 
 
 @dataclass(frozen=True, eq=False)
-class ReducedView:
-    """One view, cropped and reduced.
+class SampleView:
+    """One view, cropped and reduced."""
 
-    Attributes:
-        observed: as memory is made of it, at up to ``DETAIL`` times the model's size.
-        truth: at the model's size.
-    """
-
-    observed: Clip
-    truth: Clip
+    observed: Clip  # as memory is made of it, at up to ``DETAIL`` times the model's size
+    truth: Clip  # at the model's size
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -62,29 +62,22 @@ class SceneViews:
     A scene is drawn in proportion to the root of its number of views with depth; where that is not
     known before a scene is opened, all are equally likely. What depth a view has counts as true.
     Faults are added on top of what real depth has anyway, so the default is gentle.
-
-    Attributes:
-        scenes: with depth; views without any are left out. Those that are open are checked at
-            once, others when they are drawn.
-        select: which of a scene's views are used, see ``selection.select``.
-        seed: 0 or more.
-        views: of a sample.
-        size: (H, W) of the pictures; views are cropped about their centre to this aspect.
-        overlap: least share of a view's depth that the next view of the window shows, too.
-        context: how many views are given, and which.
-        faults: see CorruptionOptions; None for none.
-        fill: of the model's configuration, ``hints.fill``.
     """
 
+    # with depth; views without any are left out. Those that are open are checked at once, others
+    # when they are drawn.
     scenes: SceneCollection
-    select: str = "all"
-    seed: int = 0
-    views: int = 8
+    select: str = "all"  # which of a scene's views are used, see ``selection.select``
+    seed: int = 0  # 0 or more
+    views: int = 8  # of a sample
+    # (H, W) of the pictures; views are cropped about their centre to this aspect
     size: tuple[int, int] = (96, 96)
+    # least share of a view's depth that the next view of the window shows, too
     overlap: float = 0.4
+    # how many views are given, and which
     context: ContextChoice = field(default_factory=ContextChoice)
-    faults: CorruptionOptions | None = GENTLE
-    fill: str = "none"
+    faults: CorruptionOptions | None = GENTLE  # see CorruptionOptions; None for none
+    fill: str = "none"  # of the model's configuration, ``hints.fill``
     _shares: NDArray[np.float64] = field(init=False, repr=False, default_factory=lambda: np.ones(0))
 
     def __post_init__(self) -> None:
@@ -102,11 +95,11 @@ class SceneViews:
             )
         object.__setattr__(self, "_shares", shares / shares.sum())
 
-    def sample(self, index: int, attempt: int = 0) -> Sample:
+    def sample(self, index: int, attempt: int = 0) -> TrainingSample:
         """The sample of a number, 0 or more; of each attempt another one."""
         clip, truth = self.clips(index, attempt)
         rng = np.random.default_rng([self.seed, RECORDED, index, FAULTS, attempt])
-        strength = drawn(rng, self.faults or CorruptionOptions(clean=1.0))
+        strength = draw_strengths(rng, self.faults or CorruptionOptions(clean=1.0))
         count = self.context.count(context_seed(self.seed), index)
         context = self.context.chosen(rng, self.views, count)
         return make_sample(clip, truth, context, rng=rng, strength=strength, fill=self.fill)
@@ -127,7 +120,7 @@ class SceneViews:
                 frames = [_kept(views[row], self.size) for row in rows]
             except GvError as error:
                 raise InvalidSampleError(UNREADABLE, str(error)) from None
-            truth = joined([frame.truth for frame in frames])
+            truth = concatenate_clips([frame.truth for frame in frames])
             covered = float((truth.depth > 0).mean((1, 2)).min())
             if covered < LEAST_DEPTH:
                 raise InvalidSampleError(
@@ -138,7 +131,7 @@ class SceneViews:
             found = min(overlaps(truth))
             best = max(best, found)
             if found >= self.overlap:
-                return joined([frame.observed for frame in frames]), truth
+                return concatenate_clips([frame.observed for frame in frames]), truth
         raise InvalidSampleError(
             OVERLAP,
             f"{self.scenes.title}: no window of {self.views} views in {ATTEMPTS} trials of which "
@@ -162,7 +155,7 @@ class SceneViews:
             "scenes": {"title": self.scenes.title, "digest": self.scenes.digest},
             "select": self.select,
             "overlap": self.overlap,
-            **described(self),
+            **shared_settings(self),
         }
 
 
@@ -184,16 +177,13 @@ def _usable(data: SceneViews, number: int) -> tuple[View, ...]:
 
 def overlaps(clip: Clip) -> list[float]:
     """Share of each view's known depth that the next view shows likewise; 0 without any."""
-    return [float(shown(clip, i, [i + 1])[0]) for i in range(len(clip) - 1)]
+    return [float(covisibility(clip, i, [i + 1])[0]) for i in range(len(clip) - 1)]
 
 
-def shown(clip: Clip, index: int, others: Sequence[int]) -> NDArray[np.float64]:
+def covisibility(clip: Clip, index: int, others: Sequence[int]) -> NDArray[np.float64]:
     """(len(others),) share of one view's known depth that each of others shows likewise.
 
-    Args:
-        clip: the views.
-        index: of the view whose depth is looked for; without any, the shares are 0.
-        others: of the views that may show it.
+    ``index``: of the view whose depth is looked for; without any, the shares are 0.
     """
     height, width = clip.depth.shape[1:]
     rows = np.linspace(0, height - 1, PROBE).astype(int)[:, None]
@@ -218,7 +208,7 @@ def shown(clip: Clip, index: int, others: Sequence[int]) -> NDArray[np.float64]:
     return shares
 
 
-def reduced_view(view: View, size: tuple[int, int]) -> ReducedView:
+def reduced_view(view: View, size: tuple[int, int]) -> SampleView:
     """A view cropped about its centre to the aspect of ``size`` (H, W), and reduced.
 
     It is observed at ``DETAIL`` times that size, or less, if it is smaller. What its mask leaves
@@ -241,7 +231,7 @@ def reduced_view(view: View, size: tuple[int, int]) -> ReducedView:
         _resized(frame.rgb[window], depth[window], camera, size=(size[0] * times, size[1] * times))
         for times in (factor, 1)
     ]
-    return ReducedView(*parts)
+    return SampleView(*parts)
 
 
 _kept = lru_cache(KEPT_FRAMES)(reduced_view)
@@ -260,7 +250,7 @@ def _resized(
     )
 
 
-def joined(clips: Sequence[Clip]) -> Clip:
+def concatenate_clips(clips: Sequence[Clip]) -> Clip:
     """Views of one size as one clip."""
     return Clip(
         np.concatenate([clip.rgb for clip in clips]),

@@ -27,12 +27,7 @@ from gvtools.training.distributed import Replicated, models_of
 
 
 class Sharded(Replicated):
-    """See the module; the processes' group has to be there, with more than one process.
-
-    Args:
-        stage: the module in training, its parameters on the CPU and the same in every process.
-        processes: this process and the others.
-    """
+    """See the module; the processes' group has to be there, with more than one process."""
 
     collective = True
 

@@ -14,7 +14,7 @@ from gvtools.completers.geoverse.conditioning import encode_views, filled
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.files import replaced_when_written
 from gvtools.training.batch import TrainingBatch
-from gvtools.training.encoder_stage import decoded, head_features
+from gvtools.training.encoder_stage import decode_heads, head_features
 
 GAP = 4
 
@@ -25,11 +25,6 @@ def completion_sheet(model: GeoVerse, batch: TrainingBatch, *, seed: int = 0) ->
 
     Three bands a sample: given pictures and projections, completions (context pictures stay), true
     pictures; then the same for depth, each sample in its own range.
-
-    Args:
-        model: in any mode; put back into the one that it was in.
-        batch: a few samples.
-        seed: of the noise.
 
     Returns:
         (H, W, 3).
@@ -62,15 +57,11 @@ def completion_sheet(model: GeoVerse, batch: TrainingBatch, *, seed: int = 0) ->
 def encoder_sheet(model: GeoVerse, batch: TrainingBatch) -> NDArray[np.uint8]:
     """Four bands a sample: pictures decoded from their own features, true ones, depth likewise.
 
-    Args:
-        model: its encoder and heads are used alone.
-        batch: a few samples.
-
     Returns:
         (H, W, 3).
     """
     levels = encode_views(model.geometry, batch.true_views, slice(None), config=model.config.hints)
-    geometry, rgb = decoded(model, head_features(model, levels, batch), batch)
+    geometry, rgb = decode_heads(model, head_features(model, levels, batch), batch)
     depth = geometry.depth[:, :, None]
     rows = []
     for index in range(len(batch)):

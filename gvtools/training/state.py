@@ -1,56 +1,99 @@
-"""The state of a stage on disk: everything that an exact continuation needs, written atomically."""
+"""Averaged weights, and a stage's state on disk: all that an exact continuation needs."""
 
 from __future__ import annotations
 
 import zipfile
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor, nn
 
 from gvtools.errors import CheckpointError
 from gvtools.files import replaced_when_written
 from gvtools.networks.tensors import first_line
 from gvtools.untrusted import archive
 
+
+class AveragedWeights:
+    """Averages of named parameters, shadow = decay shadow + (1 - decay) parameter.
+
+    The first updates average faster, (1 + n) / (10 + n) up to the decay, so that a short training
+    is not dominated by its start.
+    """
+
+    def __init__(self, parameters: Iterable[tuple[str, nn.Parameter]], decay: float) -> None:
+        self.decay = decay
+        self.updates = 0
+        self._parameters = dict(parameters)
+        self.shadow = {name: p.detach().clone() for name, p in self._parameters.items()}
+
+    @torch.no_grad()
+    def update(self) -> None:
+        """Take one step of the parameters into account."""
+        decay = min(self.decay, (1 + self.updates) / (10 + self.updates))
+        self.updates += 1
+        names = list(self.shadow)
+        torch._foreach_lerp_(
+            [self.shadow[name] for name in names],
+            [self._parameters[name].detach() for name in names],
+            1 - decay,
+        )
+
+    @contextmanager
+    def swapped_in(self) -> Iterator[None]:
+        """The parameters hold their averages within the block."""
+        kept = {name: p.detach().clone() for name, p in self._parameters.items()}
+        self._put(self.shadow)
+        try:
+            yield
+        finally:
+            self._put(kept)
+
+    @torch.no_grad()
+    def _put(self, values: Mapping[str, Tensor]) -> None:
+        for name, parameter in self._parameters.items():
+            parameter.copy_(values[name])
+
+    def state_dict(self) -> dict[str, object]:
+        """For a checkpoint."""
+        return {"updates": self.updates, "shadow": self.shadow}
+
+    def load_state_dict(self, state: Mapping[str, object]) -> None:
+        """From a checkpoint."""
+        self.updates = int(state["updates"])  # type: ignore[call-overload]
+        shadow: Mapping[str, Tensor] = state["shadow"]  # type: ignore[assignment]
+        with torch.no_grad():
+            for name, value in self.shadow.items():
+                value.copy_(shadow[name])
+
+
 FILE = "state.pt"
 
 
 @dataclass
-class Progress:
-    """Where a stage is.
+class TrainingProgress:
+    """Where a stage is."""
 
-    Attributes:
-        step: optimiser steps made; the next sample is ``step`` x batch.
-        skipped: batches that were left out, not finite or too large.
-        seconds: spent so far.
-        drawn: how often what happened when samples of a mixture were drawn, by note.
-    """
-
-    step: int = 0
-    skipped: int = 0
-    seconds: float = 0.0
+    step: int = 0  # optimiser steps made; the next sample is ``step`` x batch
+    skipped: int = 0  # batches that were left out, not finite or too large
+    seconds: float = 0.0  # spent so far
+    # how often what happened when samples of a mixture were drawn, by note
     drawn: dict[str, int] = field(default_factory=dict)
 
 
 @dataclass
 class StageState:
-    """What is saved.
+    """What is saved."""
 
-    Attributes:
-        identity: what must not change between the parts of a training.
-        progress: see Progress.
-        model: trainable parameters by name.
-        optimizer: the optimiser's state.
-        ema: the averages' state.
-    """
-
-    identity: dict[str, Any]
-    progress: Progress = field(default_factory=Progress)
-    model: dict[str, Any] = field(default_factory=dict)
-    optimizer: dict[str, Any] = field(default_factory=dict)
-    ema: dict[str, Any] = field(default_factory=dict)
+    identity: dict[str, Any]  # what must not change between the parts of a training
+    progress: TrainingProgress = field(default_factory=TrainingProgress)  # see TrainingProgress
+    model: dict[str, Any] = field(default_factory=dict)  # trainable parameters by name
+    optimizer: dict[str, Any] = field(default_factory=dict)  # the optimiser's state
+    ema: dict[str, Any] = field(default_factory=dict)  # the averages' state
 
 
 def save_state(state: StageState, folder: Path) -> None:
@@ -69,13 +112,7 @@ def save_state(state: StageState, folder: Path) -> None:
 def load_state(
     folder: Path, identity: dict[str, Any], *, mapped: bool = False
 ) -> StageState | None:
-    """The saved state, or None where there is none.
-
-    Args:
-        folder: of the stage.
-        identity: what must not have changed.
-        mapped: leave tensors in the file until they are used; for processes that use a part each.
-    """
+    """The saved state, or None where there is none."""
     path = folder / FILE
     if not path.exists():
         return None
@@ -84,7 +121,7 @@ def load_state(
             pass  # its members claim what they may
         _check_sums(path)
         content = torch.load(path, map_location="cpu", weights_only=True, mmap=mapped)
-        state = StageState(**{**content, "progress": Progress(**content["progress"])})
+        state = StageState(**{**content, "progress": TrainingProgress(**content["progress"])})
     except Exception as error:
         raise CheckpointError(
             f"{path}: cannot be read ({first_line(error)}); start the stage again without --resume"

@@ -9,7 +9,7 @@ from gvtools.cameras import Cameras
 from gvtools.memory.back_projection import back_project
 from gvtools.memory.spatial_memory import SpatialMemory
 from pipelines.bench import open3d_peers, procedural_cloud
-from pipelines.bench.side_by_side import Comparison, alternate, compared
+from pipelines.bench.side_by_side import Comparison, alternate, comparison
 
 WIDTH, HEIGHT = 640, 480
 VOXEL = 0.005  # scene units; a fifth to a pixel's footprint in the middle of the box
@@ -71,6 +71,6 @@ def compare_fusing(memory: SpatialMemory, frames: list[Frame], *, repeat: int) -
     seconds = alternate([ours, concatenate, integrate], repeat)
     name = f"fuse {frames[0][0].shape[1]}x{frames[0][0].shape[0]} into {voxels:,} voxels"
     return [
-        compared(name, "Open3D concatenate + voxel_down_sample", seconds[0], peer_s=seconds[1]),
-        compared(name, "Open3D VoxelBlockGrid integrate", seconds[0], peer_s=seconds[2]),
+        comparison(name, "Open3D concatenate + voxel_down_sample", seconds[0], peer_s=seconds[1]),
+        comparison(name, "Open3D VoxelBlockGrid integrate", seconds[0], peer_s=seconds[2]),
     ]

@@ -24,12 +24,10 @@ from gvtools.completers.geoverse.model import DECODE, DECODING, VIDEO, GeoVerse
 from gvtools.completers.geoverse.video_prior import VideoPrior
 from gvtools.networks.compute import autocast, name_of
 from gvtools.training.batch import TrainingBatch
-from gvtools.training.denoiser_stage import DenoiserStage
 from gvtools.training.distributed import Processes, Replicated
 from gvtools.training.loop import Trainer
 from gvtools.training.options import DenoiserStageOptions, OptimizerOptions, ReflowStageOptions
-from gvtools.training.reflow_stage import ReflowStage
-from gvtools.training.stage import Stage
+from gvtools.training.stages import DenoiserStage, ReflowStage, Stage
 from pipelines.bench.live_bytes import LiveBytes, alone, predicted
 from pipelines.bench.options import CompleteOptions
 from pipelines.bench.random_model import random_video, random_views

@@ -84,7 +84,7 @@ def alternate(
     return seconds
 
 
-def compared(
+def comparison(
     name: str, peer: str, ours_s: list[float], *, peer_s: list[float], note: str = ""
 ) -> Comparison:
     """Medians and minima of two lists of seconds."""

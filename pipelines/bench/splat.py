@@ -9,7 +9,7 @@ from gvtools.cameras import Cameras
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.splat.one_pixel import NearestImage, project_nearest
 from pipelines.bench import open3d_peers, procedural_cloud
-from pipelines.bench.side_by_side import Comparison, alternate, compared
+from pipelines.bench.side_by_side import Comparison, alternate, comparison
 
 VIEWS = 16
 VOXEL = 0.005  # scene units, ours
@@ -54,7 +54,7 @@ def compare_splatting(
         steady=True,
     )
     name = f"project {memory.voxels:,} voxels into {camera.width[0]}x{camera.height[0]}"
-    return compared(name, "Open3D VoxelBlockGrid ray_cast", ours_s, peer_s=peer_s)
+    return comparison(name, "Open3D VoxelBlockGrid ray_cast", ours_s, peer_s=peer_s)
 
 
 def one_pixel_rows(count: int, *, repeat: int) -> list[Comparison]:
@@ -106,6 +106,6 @@ def compare_one_pixel(
     name = f"one pixel a point, {count:,} points into {camera.width[0]}x{camera.height[0]}"
     peer = "Open3D project_to_rgbd_image"
     return [
-        compared(name, f"{peer}, same order", seconds[0], peer_s=seconds[1], note=note),
-        compared(name, f"{peer}, random order", seconds[0], peer_s=seconds[2]),
+        comparison(name, f"{peer}, same order", seconds[0], peer_s=seconds[1], note=note),
+        comparison(name, f"{peer}, random order", seconds[0], peer_s=seconds[2]),
     ]

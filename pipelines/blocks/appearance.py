@@ -15,7 +15,7 @@ from gvtools.appearance.gaussians import Gaussians
 from gvtools.appearance.splat.project_kernels import HARMONICS, LOG_SCALE, SH
 from gvtools.appearance.turning import turned
 from gvtools.memory.store.local_frame import LocalFrame
-from pipelines.blocks.block import Block
+from pipelines.blocks.block import SceneBlock
 
 Float64 = NDArray[np.float64]
 
@@ -30,12 +30,12 @@ class BlockAppearance:
         appearance: its Gaussians.
     """
 
-    block: Block
+    block: SceneBlock
     context: tuple[str, ...]
     appearance: Appearance
 
 
-def joined(parts: Sequence[BlockAppearance], frame: LocalFrame) -> Appearance:
+def join_appearances(parts: Sequence[BlockAppearance], frame: LocalFrame) -> Appearance:
     """One appearance of all blocks'.
 
     Of each block the Gaussians whose centres lie in its cell. Each block's brightness is relative
@@ -122,7 +122,7 @@ def _log_gains(part: BlockAppearance) -> dict[str, Float64]:
 
 
 def _in_cell(
-    gaussians: Gaussians, block: Block, frame: LocalFrame, *, gain: Float64
+    gaussians: Gaussians, block: SceneBlock, frame: LocalFrame, *, gain: Float64
 ) -> NDArray[np.float32]:
     """The Gaussians in a block's cell, in a frame, dimmed by what their photographs' gains rise."""
     world = gaussians.frame.to_world(gaussians.values[:, :LOG_SCALE])
@@ -131,10 +131,10 @@ def _in_cell(
         return gaussians.values[:0]
     out = turned(gaussians.values[inside], frame.axes.T @ gaussians.frame.axes)
     out[:, :LOG_SCALE] = frame.from_world(world[inside])
-    return brighter(out, -gain)
+    return scale_colors(out, -gain)
 
 
-def brighter(values: NDArray[np.float32], log_gain: Float64) -> NDArray[np.float32]:
+def scale_colors(values: NDArray[np.float32], log_gain: Float64) -> NDArray[np.float32]:
     """(N, VALUES) Gaussians whose colours are multiplied by the exponential of (3,) logarithms."""
     out, scale = values.copy(), np.exp(log_gain)
     sh = out[:, SH:].reshape(len(out), -1, 3) * scale

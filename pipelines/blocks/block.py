@@ -26,10 +26,10 @@ Float64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Cell:
+class BlockCell:
     """A box of space, world frame, scene units; infinite where no other cell borders on it.
 
-    >>> left, right = Cell.everywhere().cut(0, 1.5)
+    >>> left, right = BlockCell.everywhere().cut(0, 1.5)
     >>> left.holds([[0, 9, 9], [1.5, 0, 0]]).tolist(), right.holds([[1.5, 0, 0]]).tolist()
     ([True, False], [True])
     """
@@ -38,15 +38,15 @@ class Cell:
     high: Float64
 
     @classmethod
-    def everywhere(cls) -> Cell:
+    def everywhere(cls) -> BlockCell:
         """All of space."""
         return cls(np.full(3, -np.inf), np.full(3, np.inf))
 
-    def cut(self, axis: int, place: float) -> tuple[Cell, Cell]:
+    def cut(self, axis: int, place: float) -> tuple[BlockCell, BlockCell]:
         """The parts below and from ``place`` on along an axis."""
         high, low = self.high.copy(), self.low.copy()
         high[axis] = low[axis] = place
-        return Cell(self.low, high), Cell(low, self.high)
+        return BlockCell(self.low, high), BlockCell(low, self.high)
 
     def holds(self, points: Any) -> NDArray[np.bool_]:
         """(N,) which points (N, 3) lie in it."""
@@ -55,14 +55,14 @@ class Cell:
 
 
 @dataclass(frozen=True, eq=False)
-class Block:
+class SceneBlock:
     """One block of a split project."""
 
     name: str  # also of its folder
     names: tuple[str, ...]  # of all blocks of the split
     project: str  # what opens the whole project
     reading: Mapping[str, Any]  # how that is read, JSON-ready
-    cell: Cell
+    cell: BlockCell
     owners: tuple[str, ...]  # context views in the cell, in order of their names
     helpers: tuple[str, ...]  # context views of other cells
     targets: tuple[str, ...]  # held-out views in the cell
@@ -98,7 +98,7 @@ class Block:
         )
 
     @classmethod
-    def load(cls, folder: Path) -> Block:
+    def load(cls, folder: Path) -> SceneBlock:
         """Read what ``save`` wrote."""
         path = folder / FILE
         try:
@@ -121,7 +121,7 @@ class Block:
         low = np.array([-np.inf if value is None else value for value in kept.low])
         high = np.array([np.inf if value is None else value for value in kept.high])
         return cls(
-            kept.name, tuple(kept.names), kept.project, kept.reading, Cell(low, high),
+            kept.name, tuple(kept.names), kept.project, kept.reading, BlockCell(low, high),
             tuple(kept.owners), tuple(kept.helpers), tuple(kept.targets), poses, kept.refined,
         )  # fmt: skip
 

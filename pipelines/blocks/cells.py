@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.errors import OptionError
-from pipelines.blocks.block import Cell
+from pipelines.blocks.block import BlockCell
 
 if TYPE_CHECKING:
     from gvtools.scenes.scene import Scene
@@ -24,7 +24,7 @@ SAMPLES = 400
 NEAREST = 4
 
 
-def cut_cells(centers: Float64, count: int) -> dict[str, Cell]:
+def cut_cells(centers: Float64, count: int) -> dict[str, BlockCell]:
     """Cells with about as many camera centres each, by name.
 
     An axis-parallel plane across the longest side of the centres' box divides them in two, then
@@ -43,7 +43,7 @@ def cut_cells(centers: Float64, count: int) -> dict[str, Cell]:
         raise OptionError(
             f"{count} blocks of {len(centers)} context views; expected 1 to {len(centers)}"
         )
-    leaves = _halved(centers, Cell.everywhere(), count, path="")
+    leaves = _halved(centers, BlockCell.everywhere(), count, path="")
     half = (max(len(path) for path, _ in leaves) + 1) // 2
     return {
         f"{int(path[:half] or '0', 2)}_{int(path[half:] or '0', 2)}": cell
@@ -51,7 +51,9 @@ def cut_cells(centers: Float64, count: int) -> dict[str, Cell]:
     }
 
 
-def _halved(centers: Float64, cell: Cell, count: int, *, path: str) -> list[tuple[str, Cell]]:
+def _halved(
+    centers: Float64, cell: BlockCell, count: int, *, path: str
+) -> list[tuple[str, BlockCell]]:
     """Divide a cell into ``count`` cells; returns each with its path, "0" low and "1" high."""
     if count == 1:
         return [(path, cell)]
@@ -117,7 +119,7 @@ def seen_points(scene: Scene, names: Sequence[str]) -> dict[str, Float64]:
 
 
 def helpers_of(
-    cell: Cell, owners: Sequence[str], seen: Mapping[str, Float64], *,
+    cell: BlockCell, owners: Sequence[str], seen: Mapping[str, Float64], *,
     near: Mapping[str, Sequence[str]], overlap: float,
 ) -> tuple[str, ...]:  # fmt: skip
     """The helpers of a block: views of other cells that it holds, too.

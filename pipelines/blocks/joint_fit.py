@@ -16,8 +16,8 @@ import numpy as np
 from gvtools.appearance.fit_options import FitOptions
 from gvtools.appearance.gaussians import Gaussians
 from gvtools.view_selection import evenly_spread
-from pipelines.blocks.appearance import brighter
-from pipelines.blocks.block import Block
+from pipelines.blocks.appearance import scale_colors
+from pipelines.blocks.block import SceneBlock
 from pipelines.reconstruction.fitting import Fitted, fit_appearance
 
 if TYPE_CHECKING:
@@ -32,14 +32,14 @@ SHARE = 0.5
 MOST_VIEWS = 1200
 
 
-def rows_across(context: Sequence[str], blocks: Sequence[Block]) -> list[int]:
+def rows_across(context: Sequence[str], blocks: Sequence[SceneBlock]) -> list[int]:
     """Rows of the context views that help another block than their own."""
     helping = {name for block in blocks for name in block.helpers}
     return [row for row, name in enumerate(context) if name in helping]
 
 
-def fitted_across(
-    plan: Plan, joined: Fitted, blocks: Sequence[Block], *, console: Console
+def fit_across(
+    plan: Plan, joined: Fitted, blocks: Sequence[SceneBlock], *, console: Console
 ) -> Fitted:
     """Joined Gaussians, fitted further to the views that see across faces; poses stay.
 
@@ -103,4 +103,4 @@ def _options(refine: FitOptions, *, fits: int) -> FitOptions:
 
 
 def _brighter(gaussians: Gaussians, log_gain: NDArray[np.float64]) -> Gaussians:
-    return Gaussians(brighter(gaussians.values, log_gain), frame=gaussians.frame)
+    return Gaussians(scale_colors(gaussians.values, log_gain), frame=gaussians.frame)

@@ -30,9 +30,9 @@ from gvtools.runs.poses import RunPoses
 from gvtools.runs.run import RunTarget
 from gvtools.scenes.project import open_recorded
 from gvtools.settings import dotted, with_values
-from pipelines.blocks.appearance import BlockAppearance, joined
+from pipelines.blocks.appearance import BlockAppearance, join_appearances
 from pipelines.blocks.completions import BlockCompletions
-from pipelines.blocks.joint_fit import fitted_across
+from pipelines.blocks.joint_fit import fit_across
 from pipelines.blocks.runs import BlockRun, read_runs
 from pipelines.reconstruction.plan import Plan, Targets, describe, run_identity
 from pipelines.reconstruction.prepare import make_plan, placed_scan
@@ -214,11 +214,11 @@ def _fitted(plan: Plan, runs: Sequence[BlockRun], console: Console) -> Fitted | 
         BlockAppearance(item.block, item.run.context, fitted.appearance)
         for item, fitted in zip(runs, found, strict=True)
     ]
-    appearance = joined(parts, grid_frame(plan.scene, plan.context))
+    appearance = join_appearances(parts, grid_frame(plan.scene, plan.context))
     fitted = Fitted(
         appearance,
         plan.poses,
         spread=any(fitted.spread for fitted in found),
         steps=min(fitted.steps for fitted in found),
     )
-    return fitted_across(plan, fitted, [item.block for item in runs], console=console)
+    return fit_across(plan, fitted, [item.block for item in runs], console=console)

@@ -13,7 +13,7 @@ import numpy as np
 from gvtools.errors import OptionError, ProjectError
 from gvtools.runs.poses import refined_poses_of
 from gvtools.runs.run import Run, RunTarget, load_run
-from pipelines.blocks.block import FILE, Block
+from pipelines.blocks.block import FILE, SceneBlock
 from pipelines.blocks.write import by_name, read_blocks
 
 # What may differ from block to block.
@@ -30,7 +30,7 @@ class BlockRun:
     """
 
     run: Run
-    block: Block
+    block: SceneBlock
 
     @cached_property
     def poses(self) -> dict[str, np.ndarray]:
@@ -98,7 +98,7 @@ def read_runs(paths: Sequence[Path], *, blocks: Path | None = None) -> list[Bloc
                 f"{path}: its project {place} is no block, or is gone; expected one that gvtools "
                 "split wrote; say by --blocks where the split lies"
             )
-        block = Block.load(place)
+        block = SceneBlock.load(place)
         if block.name in found:
             raise OptionError(
                 f"{found[block.name].run.path} and {path} are both of block {block.name}; expected "

@@ -12,7 +12,7 @@ from gvtools.runs.poses import with_poses
 from gvtools.scenes.reduced import reduced
 from gvtools.scenes.selection import select
 from gvtools.view_selection import nearest_views
-from pipelines.blocks.block import Block
+from pipelines.blocks.block import SceneBlock
 from pipelines.blocks.cells import NEAREST, VIEWS_PER_BLOCK, cut_cells, helpers_of, seen_points
 from pipelines.blocks.write import PROJECTS, write_blocks
 from pipelines.reconstruction.prepare import refined_poses_of
@@ -33,7 +33,7 @@ def split(
     max_side: int | None = 1600,
     reading: Mapping[str, Any] | None = None,
     say: Callable[[str], None] = lambda text: None,
-) -> tuple[Block, ...]:
+) -> tuple[SceneBlock, ...]:
     """Write the blocks of a project.
 
     Args:
@@ -69,7 +69,7 @@ def split(
         for name, cell in cells.items():
             owners = _inside(scene, names, cell.holds)
             held = (*owners, *(targets := _inside(scene, others, cell.holds)))
-            block = Block(
+            block = SceneBlock(
                 name, tuple(cells), scene.address, reading or {}, cell, owners,
                 helpers_of(cell, owners, seen, near=near, overlap=overlap), targets,
                 {view: (posed or scene)[view].camera.cam_from_world[0] for view in held},

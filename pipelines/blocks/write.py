@@ -29,7 +29,7 @@ from gvtools.scenes.colmap import CHUNK_BOX
 from gvtools.scenes.colmap_writer import write_colmap
 from gvtools.scenes.images import read_image
 from gvtools.scenes.scene import Frame, Scene, View
-from pipelines.blocks.block import Block, Cell
+from pipelines.blocks.block import BlockCell, SceneBlock
 
 PROJECTS, CHUNKS = "projects", "chunks"
 LAYOUTS = (PROJECTS, CHUNKS)
@@ -41,7 +41,7 @@ def block_folder(out: Path, name: str, layout: str) -> Path:
     return out / name if layout == PROJECTS else out / "chunks" / name
 
 
-def write_blocks(out: Path, scene: Scene, blocks: Sequence[Block], *, layout: str) -> None:
+def write_blocks(out: Path, scene: Scene, blocks: Sequence[SceneBlock], *, layout: str) -> None:
     """Write all blocks into an empty folder.
 
     Args:
@@ -75,16 +75,16 @@ def write_blocks(out: Path, scene: Scene, blocks: Sequence[Block], *, layout: st
         _write_model(out / "aligned/sparse/0", scene, scene.names)
 
 
-def _held(block: Block) -> tuple[str, ...]:
+def _held(block: SceneBlock) -> tuple[str, ...]:
     """All views of a block."""
     return tuple(sorted({*block.context, *block.targets}))
 
 
-def _box(cameras: Cameras) -> Cell:
+def _box(cameras: Cameras) -> BlockCell:
     """The box of all cameras, wider by its longest side: chunks' boxes are finite."""
     centers = cameras.centers
     side = max(float(np.ptp(centers, axis=0).max()), 1e-9)
-    return Cell(centers.min(axis=0) - side, centers.max(axis=0) + side)
+    return BlockCell(centers.min(axis=0) - side, centers.max(axis=0) + side)
 
 
 def _write_view(view: View, frame: Frame, places: Sequence[Path]) -> None:
@@ -153,14 +153,14 @@ def _write_model(folder: Path, scene: Scene, names: Sequence[str]) -> None:
     )  # fmt: skip
 
 
-def read_blocks(folder: Path) -> Iterator[tuple[Path, Block]]:
+def read_blocks(folder: Path) -> Iterator[tuple[Path, SceneBlock]]:
     """The blocks below a folder of either layout, with their folders, in order of their names."""
     for place in (folder, folder / "chunks"):
         for path in sorted(place.glob("*/block.json")):
-            yield path.parent, Block.load(path.parent)
+            yield path.parent, SceneBlock.load(path.parent)
 
 
-def by_name(found: Mapping[str, Block], *, what: str) -> tuple[Block, ...]:
+def by_name(found: Mapping[str, SceneBlock], *, what: str) -> tuple[SceneBlock, ...]:
     """All blocks of one split, in order of their names."""
     first = next(iter(found.values()))
     missing = [name for name in first.names if name not in found]

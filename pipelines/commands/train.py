@@ -92,7 +92,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
     from gvtools.files import check_parent, make_folder, write_text
     from gvtools.runs.folder_lock import folder_lock
     from gvtools.settings import with_texts
-    from gvtools.training.distributed import started
+    from gvtools.training.distributed import join_processes
     from gvtools.training.options import shipped_or_read
     from gvtools.training.records import STAGES
     from gvtools.training.run import StageRun
@@ -116,7 +116,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
     make_folder(args.out)
     figures: dict[str, dict[str, float]] = {}
     with ExitStack() as held:
-        processes = held.enter_context(started(args.device))
+        processes = held.enter_context(join_processes(args.device))
         if processes.first:
             held.enter_context(folder_lock(args.out))
         for stage in stages:

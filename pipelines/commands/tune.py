@@ -57,7 +57,7 @@ def run_tune(args: argparse.Namespace, console: Console) -> None:
     from gvtools.completers.geoverse.completer import SHIPPED
     from gvtools.files import check_parent, write_json
     from gvtools.scenes.project import open_project
-    from gvtools.training.tune import check_tunable, tune
+    from pipelines.tuning.tune import check_tunable, tune
 
     config = _checked(args)
     weights = args.init or SHIPPED

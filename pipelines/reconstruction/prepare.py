@@ -20,11 +20,11 @@ from gvtools.runs.poses import RunPoses, posed, with_poses
 from gvtools.scenes.reduced import reduced
 from gvtools.scenes.scene import Frame, Scene
 from gvtools.scenes.selection import select
-from gvtools.training.tune_options import FEWEST_VIEWS
 from gvtools.view_selection import evenly_spread
 from pipelines.console import Console
 from pipelines.reconstruction.plan import PlacedScan, Plan, make_schedule, resolve_targets
 from pipelines.reconstruction.voxel import grid_frame
+from pipelines.tuning.options import FEWEST_VIEWS
 
 if TYPE_CHECKING:
     from gvtools.depth.source import DepthSource
@@ -399,7 +399,7 @@ TUNING = "tuning"
 
 def check_tuning(completer: Completer, context: Sequence[str]) -> None:
     """Whether a completer can be tuned to so many context views."""
-    from gvtools.training.tune import check_tunable
+    from pipelines.tuning.tune import check_tunable
 
     if completer.weights is None:
         raise OptionError(
@@ -423,14 +423,14 @@ def tuned(plan: Plan, cache: DepthCache, directory: RunDirectory, *, console: Co
         directory: of the run; the weights are kept in it.
         console: where progress goes.
     """
-    from gvtools.training.tune import tune, tuned_before
+    from pipelines.tuning.tune import previous_tuning, tune
 
     weights, config = plan.completer.weights, plan.config
     assert weights is not None
     scene = with_depth(plan.evidence or plan.scene, plan.context, cache)
     out, options = directory.path / TUNED, {**config.completer_options}
     options.pop("weights", None)
-    record = tuned_before(scene, weights, out, options=config.tune, seed=config.seed)
+    record = previous_tuning(scene, weights, out, options=config.tune, seed=config.seed)
     if record is None:
         console.line(f"tuning {weights} to the context, {config.tune.length}")
         tuning = tune(

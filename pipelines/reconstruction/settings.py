@@ -17,7 +17,7 @@ from gvtools.memory.spatial_memory import MemoryOptions
 from gvtools.memory.splat.api import SplatOptions
 from gvtools.scenes.reduced import SMALLEST
 from gvtools.settings import Settings
-from gvtools.training.tune_options import TuneOptions
+from pipelines.tuning.options import TuneOptions
 
 
 class ScanOptions(Settings):

@@ -19,12 +19,12 @@ from gvtools.runs.folder import RunDirectory
 from gvtools.runs.layout import METRICS
 from gvtools.scenes.scene import Scene
 from gvtools.settings import with_values
-from gvtools.training.tune_options import FEWEST_VIEWS, TuneOptions
 from gvtools.untrusted import read_json
 from pipelines.console import Console, Silent
 from pipelines.reconstruction.run import reconstruct
 from pipelines.reconstruction.settings import RunSettings
 from pipelines.scoring.sweep import DONE, FAILED, InTurn, Job, Record, Watch, sweep
+from pipelines.tuning.options import FEWEST_VIEWS, TuneOptions
 from viz.plots.comparisons import draw_pareto
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ from quake_map import room, write_archive
 
 from benchmarks.experiments.level_walks import unjudged, write_walks
 from gvtools.scenes.project import open_project
-from gvtools.training.hints import Observation, projected
+from gvtools.training.sample import Observation, project_observation
 
 
 def test_versions_of_judged_maps_are_left_out():
@@ -34,7 +34,7 @@ def test_walks_are_scenes_whose_views_agree(tmp_path):
     from gvtools.completers.base import ContextView
 
     given = ContextView(first.name, first.camera, frames[0].rgb, frames[0].depth)
-    guidance = projected(Observation((given,), (first.camera,)), last.camera)
+    guidance = project_observation(Observation((given,), (first.camera,)), last.camera)
     known = guidance.valid[0]
     assert known.mean() > 0.3
     error = np.abs(guidance.depth[0] / frames[1].depth - 1)[known]

@@ -16,7 +16,7 @@ from kill_commands import PLAIN
 from kill_contents import contents
 
 from gvtools.errors import GvError, ProjectError
-from gvtools.training.state import Progress, StageState, load_state, save_state
+from gvtools.training.state import StageState, TrainingProgress, load_state, save_state
 from pipelines.cli import main
 
 RUN = (*PLAIN, "--quiet")
@@ -105,7 +105,9 @@ def test_a_folder_that_cannot_be_written_is_one_line(scan, run, tmp_path, capsys
 
 
 def state(value: float) -> StageState:
-    return StageState({"of": "a test"}, Progress(step=3), {"w": torch.full((60_000,), value)})
+    return StageState(
+        {"of": "a test"}, TrainingProgress(step=3), {"w": torch.full((60_000,), value)}
+    )
 
 
 def test_a_training_state_survives_a_full_disk(tmp_path):

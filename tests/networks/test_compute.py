@@ -28,15 +28,14 @@ from gvtools.networks.compute import (
     training_type,
 )
 from gvtools.networks.depth_anything.network import DepthAnything3
-from gvtools.training.batch import TrainingBatch
-from gvtools.training.denoiser_stage import DenoiserStage
-from gvtools.training.draws import Draws
+from gvtools.training.batch import Draws, TrainingBatch
 from gvtools.training.encoder_stage import EncoderStage
 from gvtools.training.options import (
     DenoiserStageOptions,
     EncoderStageOptions,
     OptimizerOptions,
 )
+from gvtools.training.stages import DenoiserStage
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -10,7 +10,7 @@ from gvtools.cameras import Cameras
 from gvtools.errors import OptionError, ProjectError
 from gvtools.procedural.noisy_room import (
     SensorView,
-    jittered,
+    jitter_poses,
     measured_depth,
     range_noise,
     write_noisy_room,
@@ -156,7 +156,7 @@ def test_targets_are_the_truth_at_the_true_poses(
 
 def test_pose_errors_have_the_stated_size_and_drift() -> None:
     poses = np.tile(np.eye(4), (4000, 1, 1))
-    moved = jittered(poses, np.random.default_rng(0))
+    moved = jitter_poses(poses, np.random.default_rng(0))
     centers = -np.einsum("vji,vj->vi", moved[:, :3, :3], moved[:, :3, 3])
     assert np.sqrt((centers**2).sum(1).mean()) == pytest.approx(0.01, rel=0.05)
     cosine = (np.trace(moved[:, :3, :3], axis1=1, axis2=2) - 1) / 2

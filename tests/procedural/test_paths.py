@@ -8,7 +8,7 @@ from gvtools.errors import OptionError
 from gvtools.procedural.layouts import scene
 from gvtools.procedural.paths import camera_path
 from gvtools.procedural.ray_cast import cast
-from gvtools.training.context_choice import ContextChoice, chosen_context
+from gvtools.training.dataset import ContextChoice, chosen_context
 
 SIZE = (48, 64)
 

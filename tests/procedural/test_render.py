@@ -9,7 +9,7 @@ from gvtools.procedural.builder import Light, ProceduralScene, SceneBuilder
 from gvtools.procedural.layouts import scene
 from gvtools.procedural.paths import camera_path
 from gvtools.procedural.ray_cast import BALL, BOX, TUBE, cast, clearance
-from gvtools.procedural.render import Look, developed, radiance
+from gvtools.procedural.render import Look, radiance, to_srgb
 from gvtools.trajectories import look_at
 
 SEEDS = range(8)
@@ -146,7 +146,7 @@ def test_a_point_has_one_colour_in_all_views() -> None:
     for seed in range(6):
         place, cameras = _drawn(seed, size=(64, 64), views=2)
         light, depth = radiance(place.geometry, place.look, cameras)
-        image = developed(light, place.key / light.mean()).astype(float) / 255
+        image = to_srgb(light, place.key / light.mean()).astype(float) / 255
         points = cameras.centers[0] + depth[0].reshape(-1, 1) * _rays(cameras, 0)
         xy, z = cameras[1].project(points)
         with np.errstate(invalid="ignore"):

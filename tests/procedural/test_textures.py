@@ -17,7 +17,7 @@ from gvtools.procedural.textures import (
     photograph,
     photograph_names,
     picture,
-    stacked,
+    stack_levels,
     texture,
 )
 
@@ -83,7 +83,7 @@ def test_noise_fills_its_range() -> None:
 def test_levels_are_block_means_in_linear_light() -> None:
     rng = np.random.default_rng(0)
     images = rng.integers(0, 256, (2, SIDE, SIDE, 3), np.uint8)
-    texels = stacked(list(images))
+    texels = stack_levels(list(images))
     linear = decode_srgb(images).astype(np.float64)
     starts = level_starts(SIDE)
     for level in range(len(starts) - 1):

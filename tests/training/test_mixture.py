@@ -14,10 +14,19 @@ from scipy.stats import chi2_contingency
 from gvtools.errors import DegenerateError, OptionError, ProjectError
 from gvtools.scenes.data_sets.catalogue import load_spec, spec_names
 from gvtools.training.distributed import Processes
-from gvtools.training.drawn import drawn_lines
-from gvtools.training.invalid_sample import DEPTH, OVERLAP, UNREADABLE, InvalidSampleError
-from gvtools.training.mixture import TRIES, Mixture, OwnOrEstimated, Source, stratified_at
-from gvtools.training.view_sample import TENSORS, Sample
+from gvtools.training.mixture import (
+    DEPTH,
+    OVERLAP,
+    TRIES,
+    UNREADABLE,
+    InvalidSampleError,
+    Mixture,
+    OwnOrEstimated,
+    SampleSource,
+    sampling_report,
+    stratified_at,
+)
+from gvtools.training.sample import TENSORS, TrainingSample
 
 MILLION = 10**6
 # Images of the paper's fifteen data sets, as its appendix lists them.
@@ -46,13 +55,13 @@ class Numbered:
     def __init__(self, name: str = "", invalid=lambda index, attempt: None) -> None:
         self.name, self.invalid = name, invalid
 
-    def sample(self, index: int, attempt: int = 0) -> Sample:
+    def sample(self, index: int, attempt: int = 0) -> TrainingSample:
         reason = self.invalid(index, attempt)
         if reason:
             raise InvalidSampleError(reason, f"{self.name} {index} {attempt}")
         number = torch.tensor([index, attempt])
         tensors: dict[str, Any] = dict.fromkeys(TENSORS, number)
-        return Sample(**tensors, context=1)
+        return TrainingSample(**tensors, context=1)
 
     def describe(self) -> dict[str, str]:
         return {"name": self.name}
@@ -61,7 +70,9 @@ class Numbered:
 def mixture(weights: dict[str, float], **invalid) -> Mixture:
     return Mixture(
         tuple(
-            Source(name, weight, Numbered(name, invalid.get(name, lambda index, attempt: None)))
+            SampleSource(
+                name, weight, Numbered(name, invalid.get(name, lambda index, attempt: None))
+            )
             for name, weight in weights.items()
         )
     )
@@ -177,7 +188,7 @@ def test_other_errors_are_no_invalid_samples():
             raise ProjectError("the disk is gone")
 
     with pytest.raises(ProjectError, match="disk"):
-        Mixture((Source("a", 1, Failing()),)).sample(0)
+        Mixture((SampleSource("a", 1, Failing()),)).sample(0)
 
 
 def test_geometry_falls_back_and_every_fall_is_noted():
@@ -209,7 +220,7 @@ def test_geometry_falls_back_and_every_fall_is_noted():
     # Of a file that cannot be read, an estimate is none.
     unread = Numbered("own", lambda index, attempt: UNREADABLE)
     assert notes(OwnOrEstimated(unread, plain, 1.0)) == {UNREADABLE: 300}
-    named = Mixture((Source("kitchen", 1, OwnOrEstimated(own, plain, 1.0)),)).sample(1)
+    named = Mixture((SampleSource("kitchen", 1, OwnOrEstimated(own, plain, 1.0)),)).sample(1)
     assert named.notes == ("drawn/kitchen", "geometry/kitchen/own")
 
 
@@ -222,7 +233,7 @@ def test_lines_tell_each_source():
         "resampled/kitchen/overlap": 3,
         "resampled/attic/unreadable": 20,
     }
-    assert list(drawn_lines(counts)) == [
+    assert list(sampling_report(counts)) == [
         "0 samples (0 %) of attic; drawn again: 20 unreadable",
         "10 samples (25 %) of kitchen; geometry: 8 own, 2 own (no estimate); drawn again: "
         "3 overlap",
@@ -236,7 +247,7 @@ def test_impossible_mixtures_are_refused():
     with pytest.raises(OptionError, match="expected 0 or more"):
         mixture({"a": 1, "b": -1})
     with pytest.raises(OptionError, match="each name once"):
-        Mixture((Source("a", 1, Numbered()), Source("a", 1, Numbered())))
+        Mixture((SampleSource("a", 1, Numbered()), SampleSource("a", 1, Numbered())))
     with pytest.raises(OptionError, match="sample -1"):
         mixture({"a": 1}).sample(-1)
     with pytest.raises(OptionError, match="some geometry"):

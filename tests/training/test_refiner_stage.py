@@ -11,10 +11,9 @@ import torch
 
 from gvtools.completers.geoverse.refiner import CompletedViews, RefinerConfig
 from gvtools.errors import OptionError
-from gvtools.training.batch import TrainingBatch
-from gvtools.training.draws import Draws
+from gvtools.training.batch import Draws, TrainingBatch
 from gvtools.training.options import RefinerStageOptions
-from gvtools.training.refiner_stage import CUT, RefinerStage, changed, view_errors
+from gvtools.training.refiner_stage import CUT, RefinerStage, augment, view_errors
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -36,7 +35,7 @@ def test_views_and_truth_are_changed_alike(step):
         made=picture,
         mean=picture[..., 3, 4],
     )
-    found, truth, (where,) = changed(views, picture, [place], draws=draws(step))
+    found, truth, (where,) = augment(views, picture, [place], draws=draws(step))
     height, width = truth.shape[-2:]
     assert CUT * 32 - 1 <= height <= 32 and height % 2 == width % 2 == 0
     assert torch.equal(found.made, truth) and torch.equal(found.filled, truth)
@@ -59,7 +58,7 @@ def test_steps_change_views_differently():
     views = CompletedViews(
         picture, one, one > 0, one.expand(2, 2, 16, 16), picture, one[:, :, 0, 0].expand(2, 3)
     )
-    shown = [changed(views, picture, [], draws=draws(step))[1] for step in (1, 1, 2)]
+    shown = [augment(views, picture, [], draws=draws(step))[1] for step in (1, 1, 2)]
     assert torch.equal(shown[0], shown[1])
     assert shown[0].shape != shown[2].shape or not torch.equal(shown[0], shown[2])
 

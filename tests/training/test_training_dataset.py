@@ -9,32 +9,37 @@ import torch
 
 from gvtools.errors import OptionError, ShapeError
 from gvtools.procedural.textures import photograph_names
-from gvtools.training.context_choice import ContextChoice
 from gvtools.training.corruption import (
     NOTHING,
     CorruptionOptions,
     corrupted_camera,
     corrupted_color,
     corrupted_depth,
-    drawn,
+    draw_strengths,
 )
-from gvtools.training.dataset import ProceduralViews
-from gvtools.training.hints import Clip, observed, projected
-from gvtools.training.view_sample import TENSORS, Sample, collated
+from gvtools.training.dataset import ContextChoice, ProceduralViews
+from gvtools.training.sample import (
+    TENSORS,
+    Clip,
+    TrainingSample,
+    collate,
+    observe_context,
+    project_observation,
+)
 
 CLEAN = ProceduralViews(faults=None)
 COUNT = 12
 
 
 @cache
-def _samples(split: str, clean: bool) -> list[Sample]:
+def _samples(split: str, clean: bool) -> list[TrainingSample]:
     data = ProceduralViews(split=split)
     data = replace(data, faults=None) if clean else data
     return [data.sample(index) for index in range(COUNT)]
 
 
-def _equal(a: Sample, b: Sample) -> bool:
-    pairs = ((getattr(a, entry.name), getattr(b, entry.name)) for entry in fields(Sample))
+def _equal(a: TrainingSample, b: TrainingSample) -> bool:
+    pairs = ((getattr(a, entry.name), getattr(b, entry.name)) for entry in fields(TrainingSample))
     return all(torch.equal(x, y) if isinstance(x, torch.Tensor) else x == y for x, y in pairs)
 
 
@@ -121,7 +126,7 @@ def test_true_depth_of_one_view_is_that_of_the_others() -> None:
     assert np.mean(agreed) > 0.85
 
 
-def _carried(sample: Sample, first: int, second: int) -> tuple[torch.Tensor, torch.Tensor]:
+def _carried(sample: TrainingSample, first: int, second: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Depths that the first view's pixels have in the second, and the second's own there."""
     height, width = sample.depth.shape[2:]
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
@@ -168,8 +173,8 @@ def _plane() -> Clip:
 def test_every_fault_by_itself(fault: str) -> None:
     clip = _plane()
     strength = NOTHING.replaced(**{fault: 1.0 if fault in ("flying", "dropped") else 0.2})
-    perfect = observed(clip, (0, 2), NOTHING, rng=np.random.default_rng(0))
-    harmed = observed(clip, (0, 2), strength, rng=np.random.default_rng(0))
+    perfect = observe_context(clip, (0, 2), NOTHING, rng=np.random.default_rng(0))
+    harmed = observe_context(clip, (0, 2), strength, rng=np.random.default_rng(0))
     first, second = harmed.views
     kept = perfect.views[1]
     assert kept.depth is not None and np.array_equal(kept.depth, clip.depth[2])
@@ -242,35 +247,35 @@ def test_projection_noise_touches_valid_target_pixels_alone() -> None:
 
 def test_strengths_are_drawn_within_their_ranges() -> None:
     options = CorruptionOptions()
-    strengths = [drawn(np.random.default_rng(n), options) for n in range(400)]
+    strengths = [draw_strengths(np.random.default_rng(n), options) for n in range(400)]
     for name in CorruptionOptions.model_fields:
         if name not in ("clean", "absent"):
             values = np.array([getattr(strength, name) for strength in strengths])
             assert values.min() == 0 and values.max() <= getattr(options, name)
     untouched = np.mean([strength == NOTHING for strength in strengths])
     assert untouched == pytest.approx(options.clean, abs=0.08)
-    assert drawn(np.random.default_rng(0), CorruptionOptions(clean=1.0)) == NOTHING
+    assert draw_strengths(np.random.default_rng(0), CorruptionOptions(clean=1.0)) == NOTHING
 
 
 def test_a_memory_without_points_projects_nothing() -> None:
     clip = _plane()
     blind = Clip(clip.rgb, np.zeros_like(clip.depth), clip.cameras)
-    guidance = projected(
-        observed(blind, (0,), NOTHING, rng=np.random.default_rng(0)), clip.cameras[1:]
+    guidance = project_observation(
+        observe_context(blind, (0,), NOTHING, rng=np.random.default_rng(0)), clip.cameras[1:]
     )
     assert not guidance.valid.any()
 
 
 def test_batches_are_what_the_model_takes() -> None:
     samples = _samples("train", False)[:8]
-    batch = collated(samples)
+    batch = collate(samples)
     assert batch.views.images.shape == (8, 8, 3, 96, 96)
     assert batch.views.context == samples[0].context and batch.views.valid.dtype == torch.bool
     assert torch.equal(batch.images[3], samples[3].images)
     data = ProceduralViews(context=ContextChoice(group=1), size=(24, 24))
     mixed = [data.sample(index) for index in range(12)]
     with pytest.raises(ShapeError, match="group"):
-        collated(mixed)
+        collate(mixed)
 
 
 def test_impossible_data_is_refused() -> None:

@@ -15,10 +15,10 @@ from gvtools.completers.geoverse.flow import (
     velocity_target,
 )
 from gvtools.completers.geoverse.model import GeoVerse
-from gvtools.training.draws import Draws
+from gvtools.training.batch import Draws
+from gvtools.training.data import TrainingSamples
 from gvtools.training.options import ReflowStageOptions, shipped_or_read
-from gvtools.training.reflow_stage import ReflowStage
-from gvtools.training.samples import TrainingSamples
+from gvtools.training.stages import ReflowStage
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -19,8 +19,8 @@ from gvtools.completers.geoverse.config import GeoVerseConfig, named, read
 from gvtools.completers.geoverse.denoiser import Conditions
 from gvtools.completers.geoverse.weights import save_pretrained
 from gvtools.networks.config_json import to_json
+from gvtools.training.data import TrainingSamples
 from gvtools.training.options import SHIPPED, shipped_or_read
-from gvtools.training.samples import TrainingSamples
 from pipelines.cli import main
 
 pytestmark = pytest.mark.usefixtures("one_thread")

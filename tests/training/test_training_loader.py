@@ -11,8 +11,7 @@ import torch
 
 from gvtools.errors import DegenerateError
 from gvtools.training.batch import TrainingBatch
-from gvtools.training.context_choice import ContextChoice
-from gvtools.training.dataset import ProceduralViews
+from gvtools.training.dataset import ContextChoice, ProceduralViews
 from gvtools.training.loader import batches
 
 DATA = ProceduralViews(views=3, size=(24, 24), context=ContextChoice(most=2, group=4))
@@ -50,7 +49,7 @@ class Refusing:
 
 _ORPHANS = """
 import os, time
-from gvtools.training.context_choice import ContextChoice
+from gvtools.training.dataset import ContextChoice
 from gvtools.training.dataset import ProceduralViews
 from gvtools.training.loader import batches
 
@@ -89,7 +88,7 @@ def test_workers_end_with_a_process_that_is_killed(tmp_path):
 _DEATH = """
 import multiprocessing, os, signal
 from gvtools.errors import ProjectError
-from gvtools.training.context_choice import ContextChoice
+from gvtools.training.dataset import ContextChoice
 from gvtools.training.dataset import ProceduralViews
 from gvtools.training.loader import batches
 

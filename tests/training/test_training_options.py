@@ -10,12 +10,12 @@ import pytest
 
 from gvtools.errors import OptionError
 from gvtools.settings import with_texts
+from gvtools.training.data import TrainingSamples
 from gvtools.training.options import (
     EncoderStageOptions,
     OptimizerOptions,
     shipped_or_read,
 )
-from gvtools.training.samples import TrainingSamples
 
 
 def test_the_rate_rises_and_falls_once_a_cycle():

@@ -19,14 +19,14 @@ from pathlib import Path
 import torch
 import torch.distributed as dist
 
-from gvtools.training.distributed import started
+from gvtools.training.distributed import join_processes
 
 
 def threads() -> int:
     return sum("gloo" in name.read_text() for name in Path("/proc/self/task").glob("*/comm"))
 
 
-with started("cpu") as processes:
+with join_processes("cpu") as processes:
     import torch._dynamo  # as optimizers do, on their first step
 
     dist.all_reduce(torch.ones(3))

@@ -6,8 +6,8 @@ import torch
 from gvtools.completers.geoverse.config import named
 from gvtools.errors import OptionError
 from gvtools.settings import with_texts
+from gvtools.training.data import TrainingSamples
 from gvtools.training.options import shipped_or_read
-from gvtools.training.samples import TrainingSamples
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

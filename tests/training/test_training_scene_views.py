@@ -13,11 +13,11 @@ from gvtools.cameras import Cameras
 from gvtools.errors import DegenerateError, ProjectError
 from gvtools.procedural.layouts import scene
 from gvtools.procedural.paths import camera_path
-from gvtools.procedural.render import developed, radiance
+from gvtools.procedural.render import radiance, to_srgb
 from gvtools.scenes.collection import of_scenes
 from gvtools.scenes.project import open_project
 from gvtools.scenes.scene import Frame, Scene, View
-from gvtools.training.context_choice import ContextChoice
+from gvtools.training.dataset import ContextChoice
 from gvtools.training.scene_views import SceneViews, overlaps
 
 TALL, WIDE = 96, 128
@@ -39,7 +39,7 @@ def _scene(seed: int = 0, *, count: int = 20, masked: bool = False) -> Scene:
     place = scene(rng, "train")
     cameras = camera_path(rng, place.geometry, views=count, size=(TALL, WIDE))
     light, depth = radiance(place.geometry, place.look, cameras)
-    rgb = developed(light, place.key / light.mean())
+    rgb = to_srgb(light, place.key / light.mean())
     mask = np.ones((TALL, WIDE), bool)
     mask[:10] = False
     views = tuple(

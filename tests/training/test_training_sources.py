@@ -21,10 +21,10 @@ from gvtools.scenes.project import open_collection
 from gvtools.scenes.shards.writer import ShardOptions, write_shards
 from gvtools.settings import with_texts
 from gvtools.training.batch import TrainingBatch
+from gvtools.training.data import TrainingSamples
 from gvtools.training.mixture import Mixture
 from gvtools.training.options import shipped_or_read
 from gvtools.training.records import read_log
-from gvtools.training.samples import TrainingSamples
 from gvtools.training.state import load_state
 from pipelines.cli import main
 

@@ -65,7 +65,7 @@ def test_calls_take_turns_and_warm_ups_are_not_counted():
 
 
 def test_a_comparison_is_of_medians_and_minima():
-    row = side_by_side.compared("x", "peer", [1.0, 9.0, 2.0], peer_s=[4.0, 8.0, 3.0])
+    row = side_by_side.comparison("x", "peer", [1.0, 9.0, 2.0], peer_s=[4.0, 8.0, 3.0])
     assert (row.ours_s, row.peer_s, row.ratio) == (2.0, 4.0, 0.5)
     assert row.ratio_of_minima == pytest.approx(1 / 3)
 

@@ -16,7 +16,7 @@ from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.runs.run import load_run
 from gvtools.scenes.project import open_project
 from gvtools.settings import with_values
-from pipelines.blocks.block import Block
+from pipelines.blocks.block import SceneBlock
 from pipelines.blocks.cells import cut_cells
 from pipelines.blocks.merge import merge
 from pipelines.blocks.split import split
@@ -227,9 +227,9 @@ def test_what_cannot_be_merged_is_refused_in_one_line(
 def test_a_damaged_manifest_is_named(walk: Path, tmp_path: Path) -> None:
     place, block = next(read_blocks(walk / "blocks"))
     shutil.copy(place / "block.json", tmp_path / "block.json")
-    assert Block.load(tmp_path).owners == block.owners
+    assert SceneBlock.load(tmp_path).owners == block.owners
     data = json.loads((place / "block.json").read_text())
     del data["poses"][block.owners[0]]
     (tmp_path / "block.json").write_text(json.dumps(data))
     with pytest.raises(ProjectError, match="no pose of"):
-        Block.load(tmp_path)
+        SceneBlock.load(tmp_path)

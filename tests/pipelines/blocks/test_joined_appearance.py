@@ -13,8 +13,8 @@ from gvtools.appearance.splat.project_kernels import HARMONICS, LOG_SCALE, SH
 from gvtools.appearance.turning import turned
 from gvtools.cameras import Cameras
 from gvtools.memory.store.local_frame import LocalFrame
-from pipelines.blocks.appearance import BlockAppearance, joined
-from pipelines.blocks.block import Block, Cell
+from pipelines.blocks.appearance import BlockAppearance, join_appearances
+from pipelines.blocks.block import BlockCell, SceneBlock
 
 NAMES = ("a", "b", "c")
 
@@ -42,14 +42,14 @@ def in_frame(some: Gaussians, frame: LocalFrame, gain: float) -> Gaussians:
     return Gaussians(values, frame=frame)
 
 
-def part(number: int, cell: Cell, *, gain: float) -> BlockAppearance:
+def part(number: int, cell: BlockCell, *, gain: float) -> BlockAppearance:
     """A block that has all Gaussians; its photographs are darker by what they are brighter."""
     turn = Rotation.from_euler("xyz", [0.3 * number, 0.5, -0.2 * number]).as_matrix()
     frame = LocalFrame.at([number, -0.5, 0.25], turn)
     poses = np.tile(np.eye(4), (3, 1, 1))
     logs = np.full((3, 3), -np.log(gain))
     owners = NAMES[:1] if number == 0 else NAMES[1:]
-    block = Block(
+    block = SceneBlock(
         str(number), ("0", "1"), "", {}, cell, owners, (), (), {}, refined=False
     )  # fmt: skip
     exposures = Exposures(frame.cam_from_local(poses), logs, 1.0)
@@ -59,8 +59,8 @@ def part(number: int, cell: Cell, *, gain: float) -> BlockAppearance:
 
 
 def test_joined_blocks_show_the_undivided_picture() -> None:
-    left, right = Cell.everywhere().cut(0, 0.1)
-    merged = joined([part(0, left, gain=1.25), part(1, right, gain=0.8)], LocalFrame.at())
+    left, right = BlockCell.everywhere().cut(0, 0.1)
+    merged = join_appearances([part(0, left, gain=1.25), part(1, right, gain=0.8)], LocalFrame.at())
     # Equal photographs: half of the ratio of the blocks' scales goes to each.
     assert len(merged.gaussians) == 300
     assert merged.exposures is not None
@@ -71,12 +71,12 @@ def test_joined_blocks_show_the_undivided_picture() -> None:
 
 
 def test_only_the_gaussians_of_the_own_cell_stay() -> None:
-    left, right = Cell.everywhere().cut(0, 0.1)
-    merged = joined([part(0, left, gain=1.0), part(1, right, gain=1.0)], LocalFrame.at())
+    left, right = BlockCell.everywhere().cut(0, 0.1)
+    merged = join_appearances([part(0, left, gain=1.0), part(1, right, gain=1.0)], LocalFrame.at())
     x = np.sort(merged.gaussians.values[:, 0])
     assert np.allclose(x, np.sort(whole().values[:, 0]), atol=1e-5)
-    nothing = Cell(np.full(3, 50.0), np.full(3, 60.0))
-    assert len(joined([part(0, left, gain=1.0), part(1, nothing, gain=1.0)], LocalFrame.at())
-               .gaussians) < 300  # fmt: skip
-    with_one = joined([part(0, left, gain=1.0)], LocalFrame.at())
+    nothing = BlockCell(np.full(3, 50.0), np.full(3, 60.0))
+    parts = [part(0, left, gain=1.0), part(1, nothing, gain=1.0)]
+    assert len(join_appearances(parts, LocalFrame.at()).gaussians) < 300
+    with_one = join_appearances([part(0, left, gain=1.0)], LocalFrame.at())
     assert (with_one.gaussians.values[:, 0] < 0.1 + 1e-5).all()

@@ -16,8 +16,8 @@ from gvtools.runs.run import load_run
 from gvtools.scenes.project import open_project
 from gvtools.settings import with_values
 from pipelines.blocks import merge as merging
-from pipelines.blocks.block import Block
-from pipelines.blocks.joint_fit import fitted_across, rows_across
+from pipelines.blocks.block import SceneBlock
+from pipelines.blocks.joint_fit import fit_across, rows_across
 from pipelines.blocks.merge import merge
 from pipelines.blocks.split import split
 from pipelines.blocks.write import read_blocks
@@ -141,9 +141,9 @@ def test_a_resumed_merge_has_the_same_bytes_and_fits_no_second_time(
 def test_poses_and_brightness_stay_where_the_views_across_are_exposed_unlike_others(
     fitted: Path, tmp_path: Path
 ) -> None:
-    given: list[tuple[Plan, Fitted, list[Block]]] = []
+    given: list[tuple[Plan, Fitted, list[SceneBlock]]] = []
 
-    def note(plan: Plan, joined: Fitted, blocks: list[Block], *, console: Console) -> Fitted:
+    def note(plan: Plan, joined: Fitted, blocks: list[SceneBlock], *, console: Console) -> Fitted:
         given.append((plan, joined, blocks))
         return joined
 
@@ -160,7 +160,7 @@ def test_poses_and_brightness_stay_where_the_views_across_are_exposed_unlike_oth
     log_gains = np.zeros_like(exposures.log_gains)
     log_gains[rows_across(plan.context, blocks)] = 0.5
     appearance = replace(joined.appearance, exposures=replace(exposures, log_gains=log_gains))
-    found = fitted_across(
+    found = fit_across(
         plan, replace(joined, appearance=appearance, poses=poses), blocks, console=QUIET
     )
     assert found.poses is poses

@@ -12,7 +12,7 @@ from tiny_scan import world_from_cam, write_scan
 
 from gvtools.appearance.camera_corrections import moved
 from gvtools.errors import MemoryFileError, ProjectError
-from gvtools.procedural.noisy_room import jittered
+from gvtools.procedural.noisy_room import jitter_poses
 from gvtools.runs.poses import RunPoses
 from gvtools.runs.run import load_run
 from gvtools.scenes.project import open_project
@@ -34,7 +34,7 @@ def scan(tmp_path_factory):
     folder = write_scan(tmp_path_factory.mktemp("poses") / "scan", views=10)
     true = np.stack([world_from_cam(i) for i in range(10)])
     rng = np.random.default_rng(0)
-    wrong = np.linalg.inv(jittered(jittered(np.linalg.inv(true), rng), rng))
+    wrong = np.linalg.inv(jitter_poses(jitter_poses(np.linalg.inv(true), rng), rng))
     for i, pose in enumerate(wrong):
         np.savetxt(folder / f"frame-{i:06d}.pose.txt", pose)
     return folder

@@ -13,8 +13,8 @@ from micro_weights import write_micro_weights
 from tiny_scan import write_scan
 
 from gvtools.completers.geoverse import from_pretrained
-from gvtools.training import tune as tuning
 from pipelines.cli import main
+from pipelines.tuning import tune as tuning
 
 pytestmark = pytest.mark.usefixtures("one_thread", "unpainted")
 

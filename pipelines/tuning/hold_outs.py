@@ -13,14 +13,18 @@ from gvtools.completers.geoverse.views import model_size
 from gvtools.errors import ProjectError
 from gvtools.guidance import Guidance
 from gvtools.scenes.scene import Scene
-from gvtools.training.context_choice import ContextChoice
-from gvtools.training.corruption import GENTLE, drawn
-from gvtools.training.dataset import FAULTS, PATH
-from gvtools.training.hints import Clip, Observation, projected
-from gvtools.training.scene_views import ReducedView, joined, reduced_view, shown
-from gvtools.training.tune_options import FEWEST_VIEWS
-from gvtools.training.view_sample import Sample, make_sample
+from gvtools.training.corruption import GENTLE, draw_strengths
+from gvtools.training.dataset import FAULTS, PATH, ContextChoice
+from gvtools.training.sample import (
+    Clip,
+    Observation,
+    TrainingSample,
+    make_sample,
+    project_observation,
+)
+from gvtools.training.scene_views import SampleView, concatenate_clips, covisibility, reduced_view
 from gvtools.view_selection import evenly_spread
+from pipelines.tuning.options import FEWEST_VIEWS
 
 # Beside PATH and FAULTS, the stream that a sample's further views are drawn from.
 LIFTED = 10
@@ -37,46 +41,32 @@ LEAST_SHOWN = 0.15
 
 
 @dataclass(frozen=True, eq=False)
-class Prediction:
-    """A view that judges, and what it is predicted from.
+class HeldOutView:
+    """A view that judges, and what it is predicted from."""
 
-    Attributes:
-        context: views that do not judge, all or some; a completer is given them.
-        guidance: the memory of them, projected into the view.
-        rgb: (1, H, W, 3) its photograph in [0, 1].
-    """
-
+    # views that do not judge, all or some; a completer is given them
     context: tuple[ContextView, ...]
-    guidance: Guidance
-    rgb: np.ndarray
+    guidance: Guidance  # the memory of them, projected into the view
+    rgb: np.ndarray  # (1, H, W, 3) its photograph in [0, 1]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class HoldOuts:
-    """Samples in which one view is held out and predicted from others that see the same.
+    """Samples in which one view is held out and predicted from others that see the same."""
 
-    Attributes:
-        views: reduced, of one size.
-        targets: which of them are held out.
-        given: which of them may be given; a target is never given to itself.
-        context: how many are given.
-        seed: 0 or more.
-        fill: of the model's configuration, ``hints.fill``.
-    """
-
-    views: tuple[ReducedView, ...]
-    targets: tuple[int, ...]
-    given: tuple[int, ...]
-    context: ContextChoice
-    seed: int = 0
-    fill: str = "none"
+    views: tuple[SampleView, ...]  # reduced, of one size
+    targets: tuple[int, ...]  # which of them are held out
+    given: tuple[int, ...]  # which of them may be given; a target is never given to itself
+    context: ContextChoice  # how many are given
+    seed: int = 0  # 0 or more
+    fill: str = "none"  # of the model's configuration, ``hints.fill``
     _partners: dict[int, tuple[int, ...]] = field(init=False, repr=False, default_factory=dict)
 
     def __post_init__(self) -> None:
-        clip = joined([view.truth for view in self.views])
+        clip = concatenate_clips([view.truth for view in self.views])
         for target in self.targets:
             others = [index for index in self.given if index != target]
-            shares = shown(clip, target, others)
+            shares = covisibility(clip, target, others)
             chosen = [n for n, share in zip(others, shares, strict=True) if share >= LEAST_SHOWN]
             if chosen:
                 self._partners[target] = tuple(chosen)
@@ -86,23 +76,27 @@ class HoldOuts:
         """The targets that some given view shows in part."""
         return tuple(self._partners)
 
-    def sample(self, index: int) -> Sample:
+    def sample(self, index: int) -> TrainingSample:
         """The sample of a number, 0 or more; the target is its last view."""
         chosen, lifted = self.chosen(index), self.lifted(index)
         rng = np.random.default_rng([self.seed, index, FAULTS])
         frames = [self.views[number] for number in chosen]
-        more = joined([self.views[number].observed for number in lifted]) if lifted else None
+        more = (
+            concatenate_clips([self.views[number].observed for number in lifted])
+            if lifted
+            else None
+        )
         return make_sample(
-            joined([frame.observed for frame in frames]),
-            joined([frame.truth for frame in frames]),
+            concatenate_clips([frame.observed for frame in frames]),
+            concatenate_clips([frame.truth for frame in frames]),
             tuple(range(len(chosen) - 1)),
             rng=rng,
-            strength=drawn(rng, GENTLE),
+            strength=draw_strengths(rng, GENTLE),
             fill=self.fill,
             more=more,
         )
 
-    def prediction(self, target: int) -> Prediction:
+    def prediction(self, target: int) -> HeldOutView:
         """One target as a run is asked for it: with the memory of all given views.
 
         Where that leaves less than ``LEAST_HOLES`` to generate, of every second of them, every
@@ -113,11 +107,11 @@ class HoldOuts:
         while True:
             context = tuple(_context_view(self.views[number].observed) for number in given)
             observation = Observation(context, tuple(view.camera for view in context))
-            guidance = projected(observation, truth.cameras)
+            guidance = project_observation(observation, truth.cameras)
             if len(given) == 1 or (~guidance.valid).mean() >= LEAST_HOLES:
                 break
             given = given[::2]
-        return Prediction(context, guidance, (truth.rgb / np.float32(255)).astype(np.float32))
+        return HeldOutView(context, guidance, (truth.rgb / np.float32(255)).astype(np.float32))
 
     def chosen(self, index: int) -> tuple[int, ...]:
         """The views of a sample: those that are given, ascending, then the target."""
@@ -162,41 +156,28 @@ class HoldOuts:
 
 @dataclass(frozen=True, eq=False)
 class SplitContext:
-    """A scene's context, split into views to learn from and views that judge.
+    """A scene's context, split into views to learn from and views that judge."""
 
-    Attributes:
-        views: all of them, reduced to the model's size.
-        learnt: samples that the model learns from.
-        judged: predictions of the judging views from the others.
-        dropped: context views without depth, and those beyond ``MOST``.
-    """
-
-    views: tuple[ReducedView, ...]
-    learnt: HoldOuts
-    judged: HoldOuts
-    dropped: int
+    views: tuple[SampleView, ...]  # all of them, reduced to the model's size
+    learnt: HoldOuts  # samples that the model learns from
+    judged: HoldOuts  # predictions of the judging views from the others
+    dropped: int  # context views without depth, and those beyond ``MOST``
 
     @property
     def judges(self) -> list[str]:
         """Names of the judging views."""
         return [self.views[n].truth.cameras.names[0] for n in self.judged.usable]
 
-    def predictions(self) -> list[Prediction]:
+    def predictions(self) -> list[HeldOutView]:
         """What the judging views are predicted from."""
         return [self.judged.prediction(target) for target in self.judged.usable]
 
 
 def split_context(scene: Scene, config: GeoVerseConfig, *, seed: int = 0) -> SplitContext:
-    """Read a scene's views, and keep some of them as judges.
-
-    Args:
-        scene: the context alone, with depth.
-        config: of the model.
-        seed: of the samples.
-    """
+    """Read a scene's views, and keep some of them as judges."""
     usable = [view for view in scene if view.has_depth]
     chosen = list(evenly_spread(usable, MOST))
-    views: tuple[ReducedView, ...] = ()
+    views: tuple[SampleView, ...] = ()
     if chosen:
         height, width = int(chosen[0].camera.height[0]), int(chosen[0].camera.width[0])
         size = model_size(height, width, longest=config.image_size, patch=config.patch)
@@ -233,12 +214,12 @@ def split_context(scene: Scene, config: GeoVerseConfig, *, seed: int = 0) -> Spl
     return SplitContext(views, learnt, judged, len(scene) - len(views))
 
 
-def _of_one_size(views: tuple[ReducedView, ...]) -> tuple[ReducedView, ...]:
+def _of_one_size(views: tuple[SampleView, ...]) -> tuple[SampleView, ...]:
     """Small pictures are observed at less than ``DETAIL`` times the size; all then are."""
     sizes = {view.observed.depth.shape for view in views}
     if len(sizes) == 1:
         return views
-    return tuple(ReducedView(view.truth, view.truth) for view in views)
+    return tuple(SampleView(view.truth, view.truth) for view in views)
 
 
 def _context_view(clip: Clip) -> ContextView:

@@ -33,9 +33,7 @@ from gvtools.errors import CheckpointError, ProjectError
 from gvtools.files import folder_replaced_when_written, make_folder, write_json
 from gvtools.runs.identity import array_digest
 from gvtools.scenes.scene import Scene
-from gvtools.training.denoiser_stage import DenoiserStage
 from gvtools.training.distributed import Processes, Replicated
-from gvtools.training.hold_outs import Prediction, SplitContext, split_context
 from gvtools.training.loader import batches
 from gvtools.training.loop import Trainer
 from gvtools.training.options import (
@@ -46,8 +44,10 @@ from gvtools.training.options import (
     shipped_or_read,
 )
 from gvtools.training.run import fingerprint
-from gvtools.training.tune_options import TuneOptions
+from gvtools.training.stages import DenoiserStage
 from gvtools.untrusted import read_json
+from pipelines.tuning.hold_outs import HeldOutView, SplitContext, split_context
+from pipelines.tuning.options import TuneOptions
 
 Say = Callable[[str], None]
 
@@ -66,27 +66,16 @@ ENDLESS = 10**7
 
 @dataclass(frozen=True)
 class Tuning:
-    """What a tuning came to.
+    """What a tuning came to."""
 
-    Attributes:
-        kept: whether the weights are the tuned ones; otherwise they are as they were.
-        psnr_before: of generated pixels of the judging views, dB, by the untuned weights.
-        psnr_after: likewise by the best of the tuned ones.
-        steps: optimiser steps made.
-        best_step: the step whose weights were best.
-        seconds: all of it.
-        views: context views that were learnt from.
-        judges: names of the views that judged.
-    """
-
-    kept: bool
-    psnr_before: float
-    psnr_after: float
-    steps: int
-    best_step: int
-    seconds: float
-    views: int
-    judges: list[str]
+    kept: bool  # whether the weights are the tuned ones; otherwise they are as they were
+    psnr_before: float  # of generated pixels of the judging views, dB, by the untuned weights
+    psnr_after: float  # likewise by the best of the tuned ones
+    steps: int  # optimiser steps made
+    best_step: int  # the step whose weights were best
+    seconds: float  # all of it
+    views: int  # context views that were learnt from
+    judges: list[str]  # names of the views that judged
 
     def to_dict(self) -> dict[str, Any]:
         """For a JSON file."""
@@ -119,25 +108,14 @@ def check_tunable(weights: Path) -> GeoVerseConfig:
 def tune(
     scene: Scene,
     weights: Path,
-    out: Path,
+    out: Path,  # absent or empty, or of an earlier tuning, which is replaced when this one is done
     *,
     options: TuneOptions,
     completer: Mapping[str, Any] | None = None,
     seed: int = 0,
     say: Say = print,
 ) -> Tuning:
-    """Tune a model to a scene, and write the better weights, tuned or not, into a folder.
-
-    Args:
-        scene: context views alone; no other picture is read.
-        weights: to start from.
-        out: absent or empty, or of an earlier tuning, which is replaced when this one is done.
-        options: how long; the limit covers everything, judging included, and may be exceeded by
-            one step.
-        completer: further options of the completer that predicts the judging views.
-        seed: of everything random.
-        say: is told how far it is.
-    """
+    """Tune a model to a scene, and write the better weights, tuned or not, into a folder."""
     begun = time.monotonic()
     config = check_tunable(weights)
     split = split_context(scene, config, seed=seed)
@@ -164,7 +142,7 @@ def tune(
     return tuning
 
 
-def tuned_before(
+def previous_tuning(
     scene: Scene, weights: Path, out: Path, *, options: TuneOptions, seed: int = 0
 ) -> dict[str, Any] | None:
     """The record of a tuning that ``tune`` would make again with these arguments; None without one.
@@ -192,7 +170,7 @@ def inputs_of(split: SplitContext, weights: Path, *, options: TuneOptions, seed:
 class _Judge:
     """Predicts the judging views by one model, as it is at the time."""
 
-    def __init__(self, predictions: list[Prediction], completer: GeoVerseCompleter) -> None:
+    def __init__(self, predictions: list[HeldOutView], completer: GeoVerseCompleter) -> None:
         self.predictions, self.completer = predictions, completer
         self.seconds = 0.0
         self.before = self.psnr()
@@ -205,7 +183,7 @@ class _Judge:
         return found
 
 
-def generated_psnr(completer: Completer, predictions: list[Prediction]) -> float:
+def generated_psnr(completer: Completer, predictions: list[HeldOutView]) -> float:
     """PSNR in dB over the generated pixels of all predictions together, at most 100."""
     squared, pixels = 0.0, 0
     for number, case in enumerate(predictions):
@@ -313,10 +291,7 @@ def stage_options(
 
     Products are in float32 on CPUs, of which many emulate bfloat16 at a fraction of its speed.
 
-    Args:
-        config: of the model; a training that ships under its name gives the losses.
-        device: that it learns on.
-        steps: None for a training by the clock.
+    ``steps``: None for a training by the clock.
     """
     shipped = (SHIPPED / f"{config.name}.json").is_file()
     own = (shipped_or_read(config.name)[0] if shipped else TrainingSettings()).denoiser

@@ -24,11 +24,11 @@ from gvtools.depth.source import DepthMap
 from gvtools.errors import ProjectError
 from gvtools.scenes.project import open_project
 from gvtools.scenes.scene import Frame, Scene, View
-from gvtools.training import tune as tuning
-from gvtools.training.hold_outs import split_context
 from gvtools.training.options import SHIPPED
-from gvtools.training.tune import generated_psnr, stage_options
 from pipelines.cli import main
+from pipelines.tuning import tune as tuning
+from pipelines.tuning.hold_outs import split_context
+from pipelines.tuning.tune import generated_psnr, stage_options
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

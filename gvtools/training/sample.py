@@ -1,0 +1,239 @@
+"""One training sample: context views, their memory projected into the targets, and the truth.
+
+Views are lifted to the project's memory and splatted to the targets as inference does it, by the
+same code: back-projection, fusion, projection, reduction to the model's size. A memory of four
+views at 96 x 96 costs milliseconds, so nothing faster stands in.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+from torch import Tensor
+
+from gvtools.cameras import Cameras
+from gvtools.completers.base import ContextView
+from gvtools.completers.geoverse.conditioning import ViewBatch
+from gvtools.completers.geoverse.views import view_batch
+from gvtools.completers.surface_fill import surface_fill
+from gvtools.errors import ShapeError
+from gvtools.guidance import Guidance
+from gvtools.memory.spatial_memory import SpatialMemory
+from gvtools.training.batch import TrainingBatch
+from gvtools.training.corruption import (
+    NOTHING,
+    CorruptionOptions,
+    corrupted_camera,
+    corrupted_color,
+    corrupted_depth,
+)
+
+Float32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class Clip:
+    """Ordered views of one size with pictures and depth."""
+
+    rgb: NDArray[np.uint8]  # (V, H, W, 3) uint8
+    depth: Float32  # (V, H, W) float32 z-depth, scene units, 0 = none
+    cameras: Cameras  # V of them
+
+    def __post_init__(self) -> None:
+        if self.rgb.shape != (*self.depth.shape, 3) or len(self.cameras) != len(self.rgb):
+            raise ShapeError(
+                f"clip: rgb {self.rgb.shape}, depth {self.depth.shape}, {len(self.cameras)} "
+                "cameras; expected (V, H, W, 3), (V, H, W) and V"
+            )
+
+    def __len__(self) -> int:
+        return len(self.rgb)
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """Context views as a user has them, and where they are believed to stand."""
+
+    # pictures and depth in the true cameras, which the model is told
+    views: tuple[ContextView, ...]
+    lifted: tuple[Cameras, ...]  # the cameras that their depth is lifted by
+
+    def with_more(self, other: Observation) -> Observation:
+        """These views and others."""
+        return Observation(self.views + other.views, self.lifted + other.lifted)
+
+
+def observe_context(
+    clip: Clip, context: Sequence[int], strength: CorruptionOptions, *, rng: np.random.Generator
+) -> Observation:
+    """Context views of a clip with their faults.
+
+    ``strength``: of this sample's faults, see ``corruption.drawn``.
+    """
+    known = clip.depth[list(context)]
+    unit = float(known[known > 0].mean()) if (known > 0).any() else 1.0
+    views, lifted = [], []
+    for number, index in enumerate(context):
+        camera = clip.cameras[index]
+        rgb = clip.rgb[index]
+        depth = corrupted_depth(rng, clip.depth[index], strength)
+        own = strength if number else strength.replaced(exposure=0.0, color=0.0, dropped=0.0)
+        rgb = corrupted_color(rng, rgb, own)
+        dropped = rng.random() < own.dropped
+        lifted.append(corrupted_camera(rng, camera, unit, strength=strength))
+        picture = (rgb / np.float32(255)).astype(np.float32)
+        views.append(ContextView(camera.names[0], camera, picture, None if dropped else depth))
+    return Observation(tuple(views), tuple(lifted))
+
+
+def project_observation(observation: Observation, targets: Cameras) -> Guidance:
+    """The memory of some observed views, with a run's defaults, projected into target cameras."""
+    lifted = [
+        (np.rint(view.rgb * 255).astype(np.uint8), view.depth, camera)
+        for view, camera in zip(observation.views, observation.lifted, strict=True)
+        if view.depth is not None and (view.depth > 0).any()
+    ]
+    footprints = [
+        np.median(depth[depth > 0]) / np.sqrt(camera.K[0, 0, 0] * camera.K[0, 1, 1])
+        for _, depth, camera in lifted
+    ]
+    voxel = float(np.median(footprints)) if lifted else 1.0
+    memory = SpatialMemory(voxel, origin=targets.centers[0])
+    for rgb, depth, camera in lifted:
+        memory.observe(rgb, depth, camera, round=0)
+    return memory.project(targets)
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingSample:
+    """V views, the context first, both parts in the order of the path.
+
+    The world is the first view's frame; the unit is the mean depth of what the context knows.
+    """
+
+    images: Tensor  # (V, 3, H, W) true pictures in [0, 1]
+    depth: Tensor  # (V, 1, H, W) true z-depth; 0 = unknown
+    # (V, 3, H, W): context pictures as given; projections on targets, holes at 0 or filled
+    hint: Tensor
+    hint_depth: Tensor  # (V, 1, H, W): likewise; 0 = none
+    valid: Tensor  # (V, 1, H, W) bool: True on context; True where the projection knows a target
+    evidence: Tensor  # (V, 2, H, W) of the fill, see ``ViewBatch``; zeros without one
+    cam_from_world: Tensor  # (V, 4, 4)
+    K: Tensor  # (V, 3, 3), pixels, pixel centres at + 0.5
+    place: Tensor  # (V,) int64, where each view stands along the path
+    context: int  # number of context views
+    notes: tuple[str, ...] = ()  # what happened when it was drawn, to be counted, see ``mixture``
+
+
+# The parts of a sample that are tensors.
+TENSORS = tuple(
+    part.name for part in fields(TrainingSample) if part.name not in ("context", "notes")
+)
+
+
+def make_sample(
+    clip: Clip,
+    truth: Clip,
+    context: Sequence[int],  # which of them are given, ascending
+    *,
+    rng: np.random.Generator,
+    strength: CorruptionOptions = NOTHING,
+    fill: str = "none",  # of the model's configuration, ``hints.fill``
+    more: Clip | None = None,
+) -> TrainingSample:
+    """A sample from views in the order of their path, the same on any number of threads."""
+    targets = [index for index in range(len(clip)) if index not in context]
+    observation = observe_context(clip, context, strength, rng=rng)
+    known = observation
+    if more is not None:
+        known = observation.with_more(observe_context(more, range(len(more)), strength, rng=rng))
+    guidance = project_observation(known, clip.cameras[targets])
+    size = truth.depth.shape[1], truth.depth.shape[2]
+    with _one_thread():
+        over = surface_fill(known.views, guidance) if fill == "surfaces" else None
+        views, cameras = view_batch(observation.views, guidance, size, fill=over)
+    order = [*context, *targets]
+    true_depth = torch.from_numpy(truth.depth[order])[:, None]
+    unit = _mean_known([_at_size(view.depth, size) for view in observation.views])
+    unit = unit or _mean_known([truth.depth[list(context)]]) or 1.0
+    # The batch's own unit is one of its cameras; here lengths are in one of depth.
+    factor = 1 / (_mean_known([views.depth[0, : len(context)].numpy()]) or 1.0)
+    relative = cameras.cam_from_world @ cameras.world_from_cam[:1]
+    relative[:, :3, 3] /= unit
+    hint = views.images[0]
+    if strength.projection > 0:
+        noise = rng.standard_normal(hint.shape, np.float32)
+        noise[: len(context)] = 0
+        noisy = hint + strength.projection * torch.from_numpy(noise)
+        hint = torch.where(views.valid[0], noisy, hint).clamp(0, 1)
+    pictures = torch.from_numpy(truth.rgb[order]).permute(0, 3, 1, 2)
+    return TrainingSample(
+        images=pictures.float() / 255,
+        depth=true_depth / unit,
+        hint=hint.contiguous(),
+        hint_depth=views.depth[0] * factor,
+        valid=views.valid[0],
+        evidence=torch.zeros(len(order), 2, *size) if views.evidence is None else views.evidence[0],
+        cam_from_world=torch.from_numpy(relative).float(),
+        K=views.K[0],
+        place=torch.tensor(order),
+        context=len(context),
+    )
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Torch's averages differ in the last digit by how many threads share them."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def _at_size(depth: Float32 | None, size: tuple[int, int]) -> Float32:
+    """(1, 1, h, w) depth under the model's pixel centres; nothing where there is none."""
+    if depth is None:
+        return np.zeros((1, 1, 0, 0), np.float32)
+    return F.interpolate(
+        torch.from_numpy(depth)[None, None], size=size, mode="nearest-exact"
+    ).numpy()
+
+
+def _mean_known(depths: Sequence[Float32]) -> float:
+    """Mean of all depth above 0; 0 where there is none.
+
+    Not by torch, whose sums depend on the number of threads in their last digit.
+    """
+    known = np.concatenate([depth[depth > 0] for depth in depths]).astype(np.float64)
+    return float(known.mean()) if known.size else 0.0
+
+
+def collate(samples: Sequence[TrainingSample]) -> TrainingBatch:
+    """Samples of one size and one number of context views as a batch."""
+    kinds = {(tuple(sample.images.shape), sample.context) for sample in samples}
+    if len(kinds) != 1:
+        raise ShapeError(
+            f"a batch of samples with {sorted(kinds)} as shapes and context counts; expected one; "
+            "take the samples of a batch from one group"
+        )
+    stacked = {name: torch.stack([getattr(sample, name) for sample in samples]) for name in TENSORS}
+    notes = Counter(note for sample in samples for note in sample.notes)
+    views = ViewBatch(
+        images=stacked["hint"],
+        depth=stacked["hint_depth"],
+        valid=stacked["valid"],
+        cam_from_world=stacked["cam_from_world"],
+        K=stacked["K"],
+        context=samples[0].context,
+        evidence=stacked["evidence"],
+    )
+    return TrainingBatch(views, stacked["images"], stacked["depth"], notes)

@@ -1,0 +1,1 @@
+"""Tuning of the generative core to one scene."""
