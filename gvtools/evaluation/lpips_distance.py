@@ -70,7 +70,7 @@ def alexnet() -> nn.Sequential:
 
 
 @dataclass(frozen=True)
-class Backbone:
+class LpipsBackbone:
     """One network that LPIPS is defined on."""
 
     build: Callable[[], nn.Sequential]  # makes its layers
@@ -89,13 +89,13 @@ class Backbone:
 
 
 BACKBONES = {
-    "vgg": Backbone(vgg16, (3, 8, 15, 22, 29), "vgg16-397923af.pth"),
-    "alex": Backbone(alexnet, (1, 4, 7, 9, 11), "alexnet-owt-7be5be79.pth"),
+    "vgg": LpipsBackbone(vgg16, (3, 8, 15, 22, 29), "vgg16-397923af.pth"),
+    "alex": LpipsBackbone(alexnet, (1, 4, 7, 9, 11), "alexnet-owt-7be5be79.pth"),
 }
 
 
 @dataclass(frozen=True, eq=False)
-class Model:
+class LpipsModel:
     """A network with its weights."""
 
     layers: nn.Sequential  # the convolutional ones
@@ -154,7 +154,7 @@ def find_weights(net: str, folder: Path | None = None) -> Path:
     return file
 
 
-def load_model(net: str, file: Path) -> Model:
+def load_model(net: str, file: Path) -> LpipsModel:
     """The network on the weights of ``file``, with the package's last layers."""
     import torch
 
@@ -175,11 +175,11 @@ def load_model(net: str, file: Path) -> Model:
     calibrated = package / "weights" / "v0.1" / f"{net}.pth"
     heads = torch.load(calibrated, map_location="cpu", weights_only=True)
     names = [f"lin{number}.model.1.weight" for number in range(len(backbone.compared))]
-    return Model(layers, backbone.compared, [heads[name] for name in names])
+    return LpipsModel(layers, backbone.compared, [heads[name] for name in names])
 
 
 def distance(
-    model: Model, image: NDArray[np.uint8], truth: NDArray[np.uint8]
+    model: LpipsModel, image: NDArray[np.uint8], truth: NDArray[np.uint8]
 ) -> tuple[float, NDArray[np.float32]]:
     """See ``Lpips.distance``; ``model`` is from ``load_model``."""
     import torch
@@ -205,7 +205,7 @@ def distance(
     return total, np.sum([layer.numpy() for layer in spread], axis=0)
 
 
-def _features(model: Model, picture: NDArray[np.uint8]) -> Iterator[Tensor]:
+def _features(model: LpipsModel, picture: NDArray[np.uint8]) -> Iterator[Tensor]:
     """(1, C, h, w) of each compared layer, of length 1 at every pixel."""
     import torch
 

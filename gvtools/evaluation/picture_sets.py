@@ -215,7 +215,7 @@ def _without_ending(name: str) -> str:
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
+class MethodPicture:
     """One picture."""
 
     name: str  # by which it is matched: its path below the folder of the pictures
@@ -232,7 +232,7 @@ class PictureSet:
 
     path: Path  # what was given
     layout: str  # whose layout it has
-    pictures: tuple[Picture, ...]  # in natural order of their names
+    pictures: tuple[MethodPicture, ...]  # in natural order of their names
     # Whether numbers in the names count the views in alphabetical order of their names instead of
     # natural order.
     alphabetical: bool = False
@@ -281,10 +281,10 @@ def _on_black(image: Image) -> NDArray[np.uint8]:
     return np.rint(rgba[..., :3] * (rgba[..., 3:] / 255)).astype(np.uint8)
 
 
-def canvas_picture(file: Path, folder: Path) -> Picture:
+def canvas_picture(file: Path, folder: Path) -> MethodPicture:
     """A picture whose left half is the truth and whose right half is the render."""
     name = file.relative_to(folder).as_posix()
-    return Picture(name, lambda: Frame(_half(file, 1)), lambda: _half(file, 0))
+    return MethodPicture(name, lambda: Frame(_half(file, 1)), lambda: _half(file, 0))
 
 
 def _half(file: Path, side: int) -> NDArray[np.uint8]:
@@ -297,11 +297,11 @@ def _half(file: Path, side: int) -> NDArray[np.uint8]:
     return np.ascontiguousarray(canvas[:, side * width // 2 :][:, : width // 2])
 
 
-def _beside_truth(file: Path, folder: Path, truths: Path) -> Picture:
+def _beside_truth(file: Path, folder: Path, truths: Path) -> MethodPicture:
     """A picture named by its path below ``folder``, whose truth lies at the same path elsewhere."""
     name = file.relative_to(folder)
     truth = partial(read_rgb, truths / name) if (truths / name).is_file() else None
-    return Picture(name.as_posix(), lambda: Frame(read_rgb(file)), truth)
+    return MethodPicture(name.as_posix(), lambda: Frame(read_rgb(file)), truth)
 
 
 def nerfstudio_dataset(path: Path) -> PictureSet | None:
@@ -411,13 +411,13 @@ def _tar(stream: LimitedReader) -> tarfile.TarFile:
     return tarfile.open(fileobj=stream, mode="r|")  # type: ignore[call-overload, no-any-return]
 
 
-def _stored(name: str, stored: dict[str, bytes], file: Path) -> Picture:
+def _stored(name: str, stored: dict[str, bytes], file: Path) -> MethodPicture:
     short = name.removeprefix(COLOR)
 
     def read(key: str) -> NDArray[np.uint8]:
         return read_rgb(io.BytesIO(stored[key]), name=f"{file}: {key}")
 
-    return Picture(
+    return MethodPicture(
         short,
         lambda: Frame(read(name)),
         partial(read, TRUTH + short) if TRUTH + short in stored else None,
@@ -455,17 +455,17 @@ def open_pictures(path: Path) -> PictureSet:
     return PictureSet(path, "plain folder", tuple(_plain(file, path) for file in files))
 
 
-def _plain(file: Path, folder: Path) -> Picture:
+def _plain(file: Path, folder: Path) -> MethodPicture:
     if file.with_suffix(".depth.npz").is_file():
         return _rendered(file, folder, file.suffix)
-    return Picture(file.relative_to(folder).as_posix(), lambda: Frame(read_rgb(file)))
+    return MethodPicture(file.relative_to(folder).as_posix(), lambda: Frame(read_rgb(file)))
 
 
-def _rendered(file: Path, folder: Path, ending: str) -> Picture:
+def _rendered(file: Path, folder: Path, ending: str) -> MethodPicture:
     """A picture with its depth beside it, if there is any; named without ``ending``."""
     stem = file.name.removesuffix(ending)
     depth = file.with_name(f"{stem}.depth.npz")
-    return Picture(
+    return MethodPicture(
         file.relative_to(folder).with_name(stem + file.suffix).as_posix(),
         lambda: Frame(read_rgb(file), read_depth(depth) if depth.is_file() else None),
     )

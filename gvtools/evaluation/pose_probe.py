@@ -16,7 +16,7 @@ from pydantic import Field
 from gvtools.cameras import Cameras, Float64, concatenate
 from gvtools.errors import DegenerateError, OptionError
 from gvtools.evaluation.posed_picture import PosedPicture
-from gvtools.evaluation.trajectories import AUC_THRESHOLDS, Statistics, area_under_recall
+from gvtools.evaluation.trajectories import AUC_THRESHOLDS, ErrorStatistics, area_under_recall
 from gvtools.features import FeatureMatcher, Features, SiftMatcher, mutual_nearest
 from gvtools.settings import Settings
 
@@ -231,15 +231,15 @@ class PoseSummary:
     located: int  # how many of them were located
     success_share: float | None  # located per picture; None without pictures
     failures: tuple[tuple[str, str], ...]  # name and status of every picture that was not
-    rotation_error_deg: Statistics | None  # over the located; None when there are none
-    center_error: Statistics | None  # likewise, scene units
+    rotation_error_deg: ErrorStatistics | None  # over the located; None when there are none
+    center_error: ErrorStatistics | None  # likewise, scene units
     # Likewise, divided by the extent of the context's centres.
-    center_error_share: Statistics | None
+    center_error_share: ErrorStatistics | None
     # By threshold in degrees, the area under the share of *all* pictures that are located with a
     # rotation error below x, for x up to the threshold; None without pictures.
     rotation_auc: dict[float, float | None]
-    inliers: Statistics | None  # over the located, places of a picture that agree with its pose
-    inlier_share: Statistics | None  # over the located, those per match
+    inliers: ErrorStatistics | None  # over the located, places that agree with the pose
+    inlier_share: ErrorStatistics | None  # over the located, those per match
 
 
 def summarise(found: Sequence[Located]) -> PoseSummary:
@@ -263,8 +263,8 @@ def summarise(found: Sequence[Located]) -> PoseSummary:
     )
 
 
-def _statistics(values: Sequence[float | None]) -> Statistics | None:
-    return Statistics.of([value for value in values if value is not None])
+def _statistics(values: Sequence[float | None]) -> ErrorStatistics | None:
+    return ErrorStatistics.of([value for value in values if value is not None])
 
 
 class PoseProbeOptions(Settings):

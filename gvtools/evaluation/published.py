@@ -65,7 +65,7 @@ class PublishedRow(SpecRecord):
     differs: str = ""
 
 
-class Source(SpecRecord):
+class Publication(SpecRecord):
     """Title of the publication, its table, and where that was read."""
 
     title: str  # of the publication
@@ -105,14 +105,14 @@ class Benchmark(SpecRecord):
     # One a system and number of context views, in the table's order.
     rows: Annotated[tuple[PublishedRow, ...], Field(strict=False)]
     # Where rows are published, by the rows' names for it; "" is the only one.
-    sources: dict[str, Source]
+    sources: dict[str, Publication]
     data_set: DataSet  # what is measured on
     stated: Texts  # what the source says of the protocol
     not_stated: Texts  # what it leaves open there
     notes: Texts  # what does not fit together in the source
 
     @property
-    def source(self) -> Source:
+    def source(self) -> Publication:
         """The publication, of a benchmark with one."""
         return next(iter(self.sources.values()))
 

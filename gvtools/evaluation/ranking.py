@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from gvtools.evaluation.published import ASPECTS, Benchmark, Figure, PublishedRow, name_key
-from gvtools.evaluation.tables import Cell, Column, Table, Value
+from gvtools.evaluation.tables import Column, Ranked, Table, Value
 
 PUBLISHED = "published"
 MEASURED = "measured here"
@@ -151,7 +151,11 @@ def comparison_table(rows: Sequence[SideBySideRow], benchmark: Benchmark) -> Tab
     columns = [Column("System"), Column("Origin")]
     columns += [Column(f.label, unit=f.unit, better=f.better, digits=f.digits) for f in figures]
     cells: list[tuple[Value, ...]] = [
-        (row.system, row.origin, *(Cell(row.figures[f.name], row.ranks[f.name]) for f in figures))
+        (
+            row.system,
+            row.origin,
+            *(Ranked(row.figures[f.name], row.ranks[f.name]) for f in figures),
+        )
         for row in rows
     ]
     return Table(

@@ -38,14 +38,14 @@ class Column:
 
 
 @dataclass(frozen=True)
-class Cell:
+class Ranked:
     """A value with its rank in the column, 1 the best; None for no rank."""
 
     value: float | None
     rank: int | None = None
 
 
-Value = str | int | float | Cell | None
+Value = str | int | float | Ranked | None
 
 
 @dataclass(frozen=True)
@@ -139,12 +139,12 @@ def render(table: Table, form: str) -> str:
 
 def _plain(value: Value) -> str | int | float | None:
     """Without rank; NaN is no value."""
-    plain = value.value if isinstance(value, Cell) else value
+    plain = value.value if isinstance(value, Ranked) else value
     return None if not isinstance(plain, str | Integral | None) and math.isnan(plain) else plain
 
 
 def _rank(value: Value) -> int | None:
-    return value.rank if isinstance(value, Cell) and _plain(value) is not None else None
+    return value.rank if isinstance(value, Ranked) and _plain(value) is not None else None
 
 
 def _numeric(table: Table, index: int) -> bool:

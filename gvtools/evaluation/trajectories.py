@@ -33,7 +33,7 @@ STILL = 1e-12
 
 
 @dataclass(frozen=True)
-class Statistics:
+class ErrorStatistics:
     """What a set of errors sums up to; the unit is that of the errors."""
 
     rmse: float  # root of the mean square
@@ -45,12 +45,12 @@ class Statistics:
     n: int  # how many
 
     @staticmethod
-    def of(errors: ArrayLike) -> Statistics | None:
+    def of(errors: ArrayLike) -> ErrorStatistics | None:
         """Of (N,) errors; None when there are none."""
         values = np.asarray(errors, np.float64)
         if not values.size:
             return None
-        return Statistics(
+        return ErrorStatistics(
             float(np.sqrt(np.mean(values**2))),
             float(values.mean()),
             float(np.median(values)),
@@ -68,10 +68,10 @@ class PoseErrors:
     # "aligned", "not aligned" (none was asked for), or "degenerate: ..." with the reason; then
     # every figure is None.
     status: str
-    translation: Statistics | None  # scene units of the reference
+    translation: ErrorStatistics | None  # scene units of the reference
     # The same, divided by ``extent``; None also when the extent is 0.
-    translation_share: Statistics | None
-    rotation_deg: Statistics | None  # degrees
+    translation_share: ErrorStatistics | None
+    rotation_deg: ErrorStatistics | None  # degrees
     scale: float | None  # reference units per unit of the estimate; 1 when it was not fitted
     extent: float  # twice the largest distance of a reference centre from their mean, scene units
     translation_errors: Float64  # (N,) float64 of each pose or pair; empty without figures
@@ -325,9 +325,9 @@ def _figures(
 ) -> PoseErrors:
     return PoseErrors(
         status,
-        Statistics.of(translation),
-        Statistics.of(translation / extent) if extent > 0 else None,
-        Statistics.of(rotation),
+        ErrorStatistics.of(translation),
+        ErrorStatistics.of(translation / extent) if extent > 0 else None,
+        ErrorStatistics.of(rotation),
         1.0 if fit is None else fit.scale,
         extent,
         translation,

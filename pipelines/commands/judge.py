@@ -17,7 +17,7 @@ from pipelines.commands.arguments import (
 
 if TYPE_CHECKING:
     from pipelines.console import Console
-    from pipelines.scoring.method_pictures import Reference
+    from pipelines.scoring.method_pictures import JudgeReference
 
 SUMMARY = "judge pictures of any method, several side by side, with the figures of evaluate"
 EXAMPLES = (
@@ -122,7 +122,7 @@ def _check_apart(pictures: Sequence[Path], out: Path) -> None:
             raise OptionError(f"--out {out}: lies in the pictures {path}; give a folder elsewhere")
 
 
-def _reference(args: argparse.Namespace, console: Console) -> Reference:
+def _reference(args: argparse.Namespace, console: Console) -> JudgeReference:
     from gvtools.runs.layout import RECORD
     from pipelines.commands.arguments import open_scene, reading_of
     from pipelines.scoring.method_pictures import open_reference, reference_from_context

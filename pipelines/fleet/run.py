@@ -50,11 +50,11 @@ def jobs_of(tasks: Sequence[Task]) -> list[Job[Task]]:
 
 def run_fleet(jobs: Sequence[Job[Task]], pool: Pool, *, console: Console) -> None:
     """Run the tasks that are not finished; at the end every task has a record."""
-    with Progress(jobs, console) as progress:
+    with FleetProgress(jobs, console) as progress:
         sweep(jobs, pool, progress)
 
 
-class Progress(Watch[Task]):
+class FleetProgress(Watch[Task]):
     """Counts by stage: one table on a terminal, a line for each event elsewhere."""
 
     def __init__(self, jobs: Sequence[Job[Task]], console: Console) -> None:
@@ -66,7 +66,7 @@ class Progress(Watch[Task]):
         before = sum(job.record is not None for job in jobs)
         console.line(f"{self._total} tasks" + (f", {before} finished before" if before else ""))
 
-    def __enter__(self) -> Progress:
+    def __enter__(self) -> FleetProgress:
         if self._console.interactive:
             from rich.live import Live
 

@@ -429,13 +429,8 @@ def measure_cells(
 ) -> None:
     """Measure those that are not measured yet; what fails leaves its reason, and is tried again.
 
-    Pictures of other methods are always measured: they may have changed, and it takes no time.
-
-    Args:
-        cells: in the order in which they are measured.
-        console: is told of each.
-        measure: measures one and writes its file.
-        after: called after each.
+    ``measure`` writes a cell's file, ``after`` is called behind each. Pictures of other methods are
+    always measured: they may have changed, and it takes no time.
     """
 
     def run(cell: BenchmarkCell) -> Record:

@@ -18,8 +18,7 @@ from gvtools.evaluation.ranking import (
     comparison_notes,
     side_by_side,
 )
-from gvtools.evaluation.tables import Cell as Ranked
-from gvtools.evaluation.tables import Column, Table, Value, markdown
+from gvtools.evaluation.tables import Column, Ranked, Table, Value, markdown
 from gvtools.files import write_json, write_text
 from pipelines.console import Console
 from pipelines.scoring.benchmark import BenchmarkCell, read_cell

@@ -98,17 +98,8 @@ def run_protocol(
 ) -> Path:
     """Split the views by one of PROTOCOLS, run, and write the split beside the run; its folder.
 
-    Args:
-        scene: the project.
-        out: folder for the run and its split.
-        protocol: one of PROTOCOLS.
-        stride: views from one to the next; None takes the widest.
-        seed: of the split and the run.
-        completer: its name; None takes the default.
-        profile: its name; None takes the default.
-        changes: settings as KEY=VALUE.
-        reading: how the user said the project is to be read, JSON-ready.
-        console: where progress goes.
+    Defaults: the widest stride, and the settings' completer and profile. Changes are settings as
+    KEY=VALUE.
     """
     from gvtools.runs.folder import RunDirectory
     from gvtools.settings import with_texts, with_values
@@ -252,14 +243,7 @@ def write_evaluation(
 ) -> dict[str, Any]:
     """Write evaluation.json and the tables, print the summary, and return the figures.
 
-    Args:
-        runs: that were measured.
-        evaluations: of these, see ``evaluate_runs``.
-        options: what was measured.
-        benchmarks: published rows by name.
-        shown: names of those that are printed.
-        out: folder.
-        console: where the tables go.
+    The tables of all benchmarks are written, those shown are printed as well.
     """
     setting = _setting(options, runs, evaluations)
     row = measured_row(options.name, evaluations, setting)

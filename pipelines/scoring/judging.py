@@ -21,7 +21,7 @@ from pipelines.scoring.measurement import (
     matcher_called,
     true_pictures,
 )
-from pipelines.scoring.method_pictures import MethodPictures, Reference, open_method
+from pipelines.scoring.method_pictures import JudgeReference, MethodPictures, open_method
 from pipelines.scoring.tables import differences, judge_markdown, judge_tables, print_judgement
 from viz.report.pictures import JudgedView, method_sheet
 
@@ -49,7 +49,7 @@ class JudgeOptions:
 def judge(
     paths: Sequence[Path],
     names: Sequence[str],
-    reference: Reference,
+    reference: JudgeReference,
     *,
     options: JudgeOptions,
     lpips: Lpips | None,
@@ -59,18 +59,7 @@ def judge(
 ) -> dict[str, Any]:
     """Measure the methods, write figures, tables and sheets, print the table.
 
-    Args:
-        paths: of the methods' pictures.
-        names: of the methods.
-        reference: what they are judged against.
-        options: what to measure.
-        lpips: the network, or None.
-        no_lpips: why there is none.
-        out: folder for the results.
-        console: for progress and the table.
-
-    Returns:
-        What ``judge.json`` holds.
+    The figures are what ``judge.json`` holds.
     """
     targets = reference.targets
     measurement = Measurement(
@@ -115,7 +104,7 @@ def judge(
 
 
 def _open(
-    path: Path, name: str, reference: Reference, *, options: JudgeOptions, console: Console
+    path: Path, name: str, reference: JudgeReference, *, options: JudgeOptions, console: Console
 ) -> MethodPictures:
     """The method's pictures; those without depth get the memory's, where it is needed."""
     method = open_method(path, name, reference.targets, rule=options.rule)

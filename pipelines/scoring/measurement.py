@@ -23,7 +23,7 @@ from gvtools.evaluation.posed_picture import PosedPicture
 if TYPE_CHECKING:
     from gvtools.evaluation.lpips_distance import Lpips
     from gvtools.evaluation.pose_probe import Located, PoseProbe
-    from gvtools.evaluation.trajectories import PoseAuc, PoseErrors, Statistics
+    from gvtools.evaluation.trajectories import ErrorStatistics, PoseAuc, PoseErrors
     from gvtools.features import FeatureMatcher
     from gvtools.memory.spatial_memory import SpatialMemory
     from gvtools.runs.run import Run
@@ -334,7 +334,7 @@ def pose_figures(errors: PoseErrors, auc: PoseAuc | None = None) -> dict[str, An
     return {**out, "notes": notes}
 
 
-def statistics_figures(statistics: Statistics | None) -> dict[str, Any]:
+def statistics_figures(statistics: ErrorStatistics | None) -> dict[str, Any]:
     """Statistics by name; null, and n 0, where there are none."""
     return asdict(statistics) if statistics else dict.fromkeys(POSE_STATISTICS) | {"n": 0}
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from gvtools.errors import OptionError, ProjectError
 from gvtools.evaluation.picture_sets import (
     Matching,
-    Picture,
+    MethodPicture,
     PictureSet,
     match_pictures,
     open_pictures,
@@ -50,7 +50,7 @@ CLEARLY = 2.0
 
 
 @dataclass(frozen=True, eq=False)
-class Reference:
+class JudgeReference:
     """A run with a memory, seen as what other methods' pictures are compared with."""
 
     run: Run
@@ -99,14 +99,14 @@ class Reference:
         return targets
 
 
-def open_reference(path: Path, *, cameras: Path | None) -> Reference:
-    """The run at ``path``; ``cameras`` as of Reference."""
+def open_reference(path: Path, *, cameras: Path | None) -> JudgeReference:
+    """The run at ``path``; ``cameras`` as of JudgeReference."""
     run = load_run(path)
     if cameras is None and len(run.rounds) < 2:
         raise ProjectError(
             f"{path}: no round of targets is done; expected one; add --resume to reconstruct"
         )
-    return Reference(run, cameras)
+    return JudgeReference(run, cameras)
 
 
 def reference_from_context(
@@ -118,17 +118,11 @@ def reference_from_context(
     cameras: Path | None,
     reading: Mapping[str, Any],
     console: Console,
-) -> Reference:
+) -> JudgeReference:
     """A run in ``out`` of a project's context alone; one that is there is resumed.
 
-    Args:
-        scene: the project.
-        out: folder of the run that keeps the memory.
-        context: selection of the given views.
-        targets: selection of the views that the pictures stand for.
-        cameras: trajectory file with the cameras of the pictures, instead of ``targets``.
-        reading: how the user said the project is to be read, JSON-ready.
-        console: where progress goes.
+    Context and targets select views: those given, and those that the pictures stand for, unless a
+    trajectory file has the cameras of the pictures.
     """
     from gvtools.runs.folder import RunDirectory
     from gvtools.settings import with_values
@@ -157,7 +151,7 @@ def reference_from_context(
     # What a run says of the memory's own pictures would be mistaken for a judgement.
     quiet = Console(quiet=True)
     reconstruct(scene, config, out, console=quiet, resume=resume, reading=reading)
-    return Reference(load_run(out))
+    return JudgeReference(load_run(out))
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,13 +206,9 @@ def method_names(paths: Sequence[Path], names: Sequence[str]) -> list[str]:
 def open_method(
     path: Path, name: str, targets: Sequence[MeasuredTarget], *, rule: str
 ) -> MethodPictures:
-    """The pictures at ``path``, matched with the targets and resized to them.
+    """The pictures of a run of gvtools, or those that ``open_pictures`` reads, for the targets.
 
-    Args:
-        path: a run of gvtools, or what ``open_pictures`` reads.
-        name: of the method.
-        targets: all of them; the picture that each holds is replaced.
-        rule: how to match, see ``match_pictures``.
+    They are matched by a rule of ``match_pictures``, and resized to their targets.
     """
     pictures = _run_pictures(path) if (path / RECORD).is_file() else open_pictures(path)
     views = [target.picture.name for target in targets]
@@ -247,7 +237,7 @@ def _run_pictures(path: Path) -> PictureSet:
         files = view.read()
         return Frame(files.picture, files.depth)
 
-    pictures = tuple(Picture(view.name, partial(load, view)) for view in run.views)
+    pictures = tuple(MethodPicture(view.name, partial(load, view)) for view in run.views)
     return PictureSet(path, OWN_LAYOUT, pictures)
 
 

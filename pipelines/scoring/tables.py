@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from gvtools.evaluation.images import FIGURES
 from gvtools.evaluation.intervals import mean_interval
 from gvtools.evaluation.ranking import MeasuredRow, Setting
-from gvtools.evaluation.tables import Cell, Column, Table, Value, markdown, render
+from gvtools.evaluation.tables import Column, Ranked, Table, Value, markdown, render
 from gvtools.files import write_text
 from pipelines.report import nested
 from pipelines.scoring.measurement import JUDGED
@@ -203,7 +203,7 @@ def print_table(table: Table, console: Console, *, ranks: bool = False) -> None:
     """Print a table with its notes, with ranks as #1 behind the values if they are asked for."""
 
     def shown(value: Any) -> Any:
-        if not isinstance(value, Cell):
+        if not isinstance(value, Ranked):
             return value
         if not ranks or value.value is None or value.rank is None:
             return value.value
@@ -265,7 +265,7 @@ def side_by_side(figures: Figures) -> Table:
     rows: list[tuple[Value, ...]] = []
     for number, method in enumerate(methods):
         cells = [
-            Cell(nested(method, *path), rank[number])
+            Ranked(nested(method, *path), rank[number])
             for (_, _, _, _, path), rank in zip(shown, ranks, strict=True)
         ]
         views = f"{method['views']} of {total}"

@@ -71,12 +71,8 @@ def planned_trials(
 ) -> dict[str, Settings]:
     """Settings of each trial by its label, the start first; those that are like another are absent.
 
-    Every trial completes pictures of the start's size.
-
-    Args:
-        plan: of a run with the settings that the sweep starts from and a voxel edge.
-        profiles: settings that make the start to each of them.
-        budget: seconds of a run; longer fits are not planned.
+    Profiles hold the settings that make the start, a plan with a voxel edge, to each of them. Every
+    trial completes pictures of the start's size. Fits longer than the budget [s] are not planned.
     """
     trials: dict[str, Settings] = {
         f"profile {name}": {key: value for key, value in settings.items() if key != "max_side"}
@@ -148,10 +144,8 @@ def changed(config: RunSettings, settings: Settings) -> RunSettings:
 class Trials:
     """Runs with changed settings, each made once and stored in a JSON file.
 
-    Args:
-        config: of the start; its voxel edge is set and its targets are held out.
-        identity: of the start, see ``run_identity``: other pictures, masks, weights or units are
-            other trials.
+    The start's voxel edge is set and its targets are held out. Other pictures, masks, weights or
+    units, by ``run_identity`` of the start, are other trials.
     """
 
     def __init__(

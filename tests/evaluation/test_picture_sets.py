@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from gvtools.errors import ProjectError
-from gvtools.evaluation.picture_sets import Picture, open_pictures
+from gvtools.evaluation.picture_sets import MethodPicture, open_pictures
 
 NAMES = ("cam/2.jpg", "cam/10.jpg", "cam/30.jpg")
 
@@ -30,13 +30,13 @@ def png(rgb) -> bytes:
     return out.getvalue()
 
 
-def truth_of(one: Picture) -> np.ndarray:
+def truth_of(one: MethodPicture) -> np.ndarray:
     """What the tool kept as the truth."""
     assert one.load_truth is not None
     return one.load_truth()
 
 
-def depth_of(one: Picture) -> np.ndarray:
+def depth_of(one: MethodPicture) -> np.ndarray:
     """The depth beside the picture."""
     depth = one.load().depth
     assert depth is not None

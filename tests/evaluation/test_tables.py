@@ -9,8 +9,8 @@ import pytest
 
 from gvtools.errors import OptionError, ShapeError
 from gvtools.evaluation.tables import (
-    Cell,
     Column,
+    Ranked,
     Table,
     csv_text,
     latex,
@@ -26,8 +26,8 @@ FIGURES = Table(
         Column("n"),
     ),
     (
-        ("ours", Cell(19.605, 1), Cell(0.0281234567, 1), 3),
-        ("theirs", Cell(17.0, 2), Cell(None), 12),
+        ("ours", Ranked(19.605, 1), Ranked(0.0281234567, 1), 3),
+        ("theirs", Ranked(17.0, 2), Ranked(None), 12),
         ("none", None, float("nan"), None),
     ),
     caption="A comparison",
@@ -100,7 +100,7 @@ def test_latex():
     ],
 )
 def test_numbers_as_readers_see_them(value, digits, shown, in_latex):
-    table = Table((Column("x", digits=digits),), ((Cell(value),),))
+    table = Table((Column("x", digits=digits),), ((Ranked(value),),))
     assert markdown(table).splitlines()[-1] == f"| {shown} |"
     assert latex(table).splitlines()[6].strip() == f"{in_latex} \\\\"
     assert float(next(csv.reader([csv_text(table).splitlines()[1]]))[0]) == value

@@ -10,7 +10,7 @@ import pytest
 from oracle import ABSENT, ORACLE, arrays, expected_values
 
 from gvtools.evaluation.trajectories import (
-    Statistics,
+    ErrorStatistics,
     absolute_errors,
     by_index,
     by_time,
@@ -59,7 +59,9 @@ def loaded() -> dict[tuple[Path, str], tuple[np.ndarray, np.ndarray]]:
     return {}
 
 
-def agree(ours: Statistics | None, theirs: dict[str, float], *, relative: float, absolute: float):
+def agree(
+    ours: ErrorStatistics | None, theirs: dict[str, float], *, relative: float, absolute: float
+):
     assert ours is not None
     for key in ("rmse", "mean", "median", "max", "min", "std"):
         if key in theirs:

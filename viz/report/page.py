@@ -12,7 +12,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gvtools.evaluation.tables import Cell, Table, shown
+from gvtools.evaluation.tables import Ranked, Table, shown
 from viz.plots.canvas import Rounds, check_rounds, png
 from viz.plots.comparisons import Point, draw_by_views
 from viz.plots.rounds import draw_growth, draw_quality, draw_timing, is_measured
@@ -288,7 +288,7 @@ def _ranked(content: Table) -> Grid:
     rows = [
         [
             shown(column, value)
-            + (f" #{value.rank}" if isinstance(value, Cell) and value.rank is not None else "")
+            + (f" #{value.rank}" if isinstance(value, Ranked) and value.rank is not None else "")
             for column, value in zip(content.columns, row, strict=True)
         ]
         for row in content.rows
