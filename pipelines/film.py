@@ -24,7 +24,7 @@ from gvtools.runs.memory_file import load_appearance, load_memory
 from gvtools.trajectories import PATHS, named_path
 from pipelines.reconstruction.rounds import CachedProjection, Clock, complete_targets
 from pipelines.reconstruction.settings import RunSettings
-from viz.run_view.render import picture_of
+from viz.viewer.render import picture_of
 
 Picture = NDArray[np.uint8]
 

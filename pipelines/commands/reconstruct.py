@@ -91,7 +91,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
     from pipelines.commands.capture import open_or_capture
     from pipelines.reconstruction.run import reconstruct
     from pipelines.report import draw_run
-    from pipelines.viewing.live import live_viewer
+    from pipelines.viewing.serve import live_viewer
 
     config = config_from(args)
     scene, reading = open_or_capture(args, console)

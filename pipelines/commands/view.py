@@ -17,7 +17,7 @@ EXAMPLES = (
     "gvtools view runs/kitchen --screenshot kitchen.png --color source",
     "gvtools view kitchen.spz",
 )
-# As viz.web.viewer and viz.run_view.point_colors have them, which are not loaded for the parser.
+# As viz.viewer.web and viz.viewer.colors have them, which are not loaded for the parser.
 LOCAL, PORT, MAX_POINTS = "127.0.0.1", 8080, 1_000_000
 COLORS = ("color", "round", "source", "confidence", "views", "depth-error")
 
@@ -61,12 +61,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace, console: Console) -> None:
     """Show the run."""
-    from pipelines.viewing.rerun import SUFFIX, open_recording
-    from pipelines.viewing.serve import read_round, serve
+    from pipelines.viewing.serve import RECORDING, open_recording, read_round, serve
     from pipelines.viewing.source import ViewSource
 
     _check(args)
-    if args.run.suffix.lower() == SUFFIX:
+    if args.run.suffix.lower() == RECORDING:
         if args.screenshot is not None or args.open3d:
             raise OptionError(
                 f"{args.run}: recordings open in rerun's own viewer; leave --screenshot and "
@@ -92,13 +91,13 @@ def run(args: argparse.Namespace, console: Console) -> None:
         return
     shown, number = read_round(source, args.round)
     if args.screenshot is not None:
-        from viz.run_view.screenshot import chosen_camera, write_screenshot
+        from viz.viewer.render import chosen_camera, write_screenshot
 
         camera = chosen_camera(shown, args.camera)
         write_screenshot(args.screenshot, shown, camera, round=number, mode=mode)
         console.line(f"{args.screenshot}: round {number} from {camera.name}")
     else:
-        from viz.open3d.window import Open3dViewer
+        from viz.viewer.window import Open3dViewer
 
         Open3dViewer(shown, round=number, mode=mode, say=console.line).run_until_closed()
 

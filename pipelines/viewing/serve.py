@@ -1,16 +1,31 @@
-"""A run on a web page, also while it grows."""
+"""Viewers at work: a run on a web page, also while it grows; a page beside a run; rerun's own."""
 
 from __future__ import annotations
 
+import os
+import shutil
+import subprocess
+import sys
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import IO
 
-from gvtools.errors import GvError, OptionError
+from gvtools.errors import GvError, OptionError, ProjectError
 from pipelines.console import Console
 from pipelines.viewing.source import ViewSource
-from viz.run_view.view import RunView
+from viz.viewer.run_view import RunView
+from viz.viewer.window import has_display
 
 POLL_SECONDS = 1.0
+RECORDING = ".rrd"
+# The run that a viewer belongs to ends it; a terminal's Ctrl-C is not for it.
+CHILD = (
+    "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN); import sys; "
+    "from pipelines.cli import main; sys.exit(main())"
+)
 
 
 def serve(
@@ -24,23 +39,16 @@ def serve(
     live: bool,
     console: Console,
 ) -> None:
-    """Serve a run's web page until an interrupt.
+    """Serve a run's web page until an interrupt; arguments are those of ``gvtools view``.
 
-    Args:
-        source: of the run.
-        host: address to serve at.
-        port: the first one that is tried.
-        max_points: points drawn of the whole at most.
-        round: number of the first round shown; None takes the last.
-        mode: colour mode to begin with, see viz.run_view.point_colors.
-        live: wait for the first round, and show new ones as they come.
-        console: told of the address, of new rounds and of problems.
+    ``live``: wait for the first round, and show new ones as they come.
     """
-    from viz.web.server import is_loopback
-    from viz.web.viewer import WebViewer
+    from viz.viewer.web import WebViewer, is_loopback
 
-    if live:
-        _wait_for_round(source, console)
+    if live and not source.rounds():
+        console.line(f"{source.path}: waiting for its first round")
+        while not source.rounds():
+            time.sleep(POLL_SECONDS)
     shown, number = read_round(source, round)
     viewer = WebViewer(shown, host=host, port=port, budget=max_points, round=number, mode=mode)
     try:
@@ -61,12 +69,7 @@ def serve(
 
 
 def read_round(source: ViewSource, round: int | None) -> tuple[RunView, int]:
-    """A run, and the round to begin with.
-
-    Args:
-        source: of the run.
-        round: its number; None takes the last.
-    """
+    """A run, and the number of the round to begin with; None takes the last."""
     shown = source.read()
     if not len(shown.memory):
         raise OptionError(f"{source.path}: an empty memory; expected one that views were fused in")
@@ -79,11 +82,7 @@ def read_round(source: ViewSource, round: int | None) -> tuple[RunView, int]:
 class Following:
     """A viewer that goes along with a run that grows.
 
-    Args:
-        source: of the run.
-        shown: the run as the viewer shows it by now.
-        update: shows it as it has become.
-        console: told of new rounds, and once of each problem.
+    The console is told of new rounds, and once of each problem.
     """
 
     def __init__(
@@ -115,8 +114,52 @@ class Following:
         self._console.line(f"round {shown.last_round} is there")
 
 
-def _wait_for_round(source: ViewSource, console: Console) -> None:
-    if not source.rounds():
-        console.line(f"{source.path}: waiting for its first round")
-    while not source.rounds():
-        time.sleep(POLL_SECONDS)
+@contextmanager
+def live_viewer(out: Path, console: Console, *options: str) -> Iterator[None]:
+    """A web viewer of the run in ``out``, in a process of its own, as long as the block lasts.
+
+    It only reads the folder. On a terminal it stays when the block has ended well, until Ctrl-C.
+    ``options`` are more words of ``gvtools view``.
+    """
+    command = [sys.executable, "-c", CHILD, "view", str(out), "--live", *options]
+    command += ["--quiet"] if console.quiet else []
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    # What it says has to go around a progress bar of this process.
+    teller = threading.Thread(target=_relay, args=(process.stdout, console), daemon=True)
+    teller.start()
+    try:
+        yield
+        if console.interactive and process.poll() is None:
+            console.line("the run is done; Ctrl-C ends the viewer")
+            with suppress(KeyboardInterrupt):
+                process.wait()
+    finally:
+        # It only reads, and libraries that it has loaded would report a milder signal at length.
+        process.kill()
+        process.wait()
+        teller.join()
+
+
+def _relay(lines: IO[str] | None, console: Console) -> None:
+    for line in lines or ():
+        console.line(line.rstrip("\n"))
+
+
+def open_recording(path: Path, *, host: str, port: int) -> None:
+    """Show a recording in rerun's window, or without a display on its web page, until it ends."""
+    if not path.is_file():
+        raise ProjectError(f"{path}: no such file; expected a recording for rerun")
+    # That of this Python before any other, which may be of another version.
+    places = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
+    program = shutil.which("rerun", path=places)
+    if program is None:
+        raise OptionError(
+            f"{path}: a recording for rerun, which is not installed here; run 'pip install "
+            '"gvtools[export]"\', or open the file at https://rerun.io/viewer'
+        )
+    command = [program, str(path.resolve()), "--bind", host]
+    if not has_display():
+        command += ["--web-viewer", "--web-viewer-port", str(port)]
+    status = subprocess.run(command, check=False).returncode
+    if status:
+        raise OptionError(f"{path}: rerun ended with status {status}; it says more above")

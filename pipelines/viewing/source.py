@@ -1,33 +1,55 @@
-"""What ``gvtools view`` reads: a run's folder, also while it grows, or a memory alone."""
+"""Sources of ``gvtools view``: a run's folder, also while it grows, a memory, or an exported file.
+
+An exported file becomes a memory of its points, and keeps its Gaussians or its mesh beside it. Axes
+are the file's, which for exports are the input's.
+"""
 
 from __future__ import annotations
 
 import threading
-from functools import lru_cache, partial
+from collections.abc import Callable, Mapping
+from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from gvtools.errors import GvError, ProjectError
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.errors import GvError, MemoryFileError, ProjectError
+from gvtools.memory.spatial_memory import SpatialMemory
+from gvtools.optional import require
+from gvtools.ply import read_header
 from gvtools.runs.layout import RECORD
 from gvtools.runs.memory_file import load_memory
 from gvtools.runs.run import Run, count_rounds, load_growing_run
-from pipelines.viewing.files import open_file
-from pipelines.viewing.gaussians import run_gaussians
-from viz.run_view.view import POINTS, RENDERED, SPLATS, RunView, cameras_of
+from pipelines.export import splat, spz
+from pipelines.export.source import ExportOptions, Source
+from pipelines.export.splats import Splats, splats_of
+from pipelines.viewing.readers import GREY, load_mesh, read_usd
+from viz.viewer.run_view import (
+    MESH,
+    POINTS,
+    RENDERED,
+    SPLATS,
+    ColoredMesh,
+    RunView,
+    ShownGaussians,
+    cameras_of,
+)
 
 if TYPE_CHECKING:
+    import trimesh
+
     from gvtools.scenes.scene import Frame, Scene
 
 KEPT_FRAMES = 8
-LOOKS = (POINTS, SPLATS, RENDERED)
 
 
 class ViewSource:
     """A run or a memory that can be read again and again.
 
-    Args:
-        path: a run's folder, a memory file, or what ``gvtools export`` writes.
-        project: where the run's project lies now; None: where it lay.
+    ``path`` is a run's folder, a memory file, or what ``gvtools export`` writes; ``project`` where
+    the run's project lies now, None: where it lay.
     """
 
     def __init__(self, path: Path, *, project: Path | None = None) -> None:
@@ -43,41 +65,45 @@ class ViewSource:
         """The run as it is now."""
         if not (self.path / RECORD).is_file():
             shown = open_file(self.path)
-            if shown is not None:
-                return shown
-            memory = load_memory(self.path).overview()
-            cameras = cameras_of(memory, ())
-            return RunView(
-                self.path, memory, (), cameras, self._frames, None, LOOKS,
-                partial(run_gaussians, self.path, memory),
-            )  # fmt: skip
+            return self._run_view(load_memory(self.path)) if shown is None else shown
         run = load_growing_run(self.path, project=self.project)
         if self._frames.run is None:
             self._frames = ProjectFrames(run)
         try:
-            memory = run.memory.overview()
-            cameras = cameras_of(memory, run.rounds)
+            return self._run_view(run.memory, run.rounds, planned=run.planned)
         except GvError as error:
             raise ProjectError(
                 f"{self.path}: its rounds' reports hold a camera that is none ({error}); run "
                 "reconstruct again"
             ) from None
-        return RunView(
-            self.path, memory, run.rounds, cameras, self._frames, run.planned, LOOKS,
-            partial(run_gaussians, self.path, memory),
-        )  # fmt: skip
 
     def lacking(self) -> str | None:
         """Why the project's own pictures cannot be shown; None when they can."""
         return self._frames.lacking()
 
+    def _run_view(
+        self,
+        whole: SpatialMemory,
+        reports: tuple[Mapping[str, Any], ...] = (),
+        *,
+        planned: int | None = None,
+    ) -> RunView:
+        memory = whole.overview()
+
+        def gaussians_of(most: int) -> ShownGaussians:
+            """Fitted Gaussians, which are always whole, and those of so many points at most."""
+            source = Source(self.path, memory)
+            fitted = 0 if source.appearance is None else len(source.appearance.gaussians)
+            return _shown(splats_of(source, ExportOptions(max_points=fitted + most)))
+
+        return RunView(
+            self.path, memory, reports, cameras_of(memory, reports), self._frames, planned,
+            (POINTS, SPLATS, RENDERED), gaussians_of,
+        )  # fmt: skip
+
 
 class ProjectFrames:
-    """The project's pixels by a view's name. The project is opened when it is first asked for.
-
-    Args:
-        run: whose project it is; None where there is none.
-    """
+    """A project's pixels by a view's name, None where there are none; opened when first asked."""
 
     def __init__(self, run: Run | None) -> None:
         self.run = run
@@ -121,3 +147,97 @@ class ProjectFrames:
             return scene[name].load()
         except GvError:
             return None
+
+
+def open_file(path: Path) -> RunView | None:
+    """What a file shows; None where it is no export but, perhaps, a memory or a run."""
+    suffix = path.suffix.lower()
+    if not path.is_file() or suffix not in OPENERS:
+        return None
+    try:
+        return OPENERS[suffix](path)
+    except GvError:
+        raise
+    except Exception as error:  # Readers of other packages raise what they please.
+        raise MemoryFileError(
+            f"{path}: cannot be read as {suffix} ({type(error).__name__}); expected a file as "
+            "gvtools export writes it; export it again"
+        ) from error
+
+
+def _open_ply(path: Path) -> RunView | None:
+    header = read_header(path)
+    if header.holds("face"):
+        return _open_mesh(path)
+    names = {name for element in header.elements for name, _ in element.columns}
+    return _splat_view(path, splat.read(path)) if splat.is_splat(names) else None
+
+
+def _open_mesh(path: Path) -> RunView:
+    require("trimesh", extra="export", purpose=f"{path}: {path.suffix}")
+    import trimesh
+
+    loaded = load_mesh(path)
+    if isinstance(loaded, trimesh.PointCloud):
+        colors = np.asarray(loaded.colors)[:, :3] if len(loaded.colors) else None
+        return _points_view(path, np.asarray(loaded.vertices), colors)
+    vertices, colors = np.asarray(loaded.vertices, np.float64), _vertex_colors(loaded)
+    mesh = ColoredMesh(vertices, np.asarray(loaded.faces), colors)
+    return RunView(path, _memory(path, vertices, colors), looks=(MESH, POINTS), surface=mesh)
+
+
+def _vertex_colors(mesh: trimesh.Trimesh) -> NDArray[np.uint8]:
+    """(V, 3) of any mesh; of a texture, those at the vertices."""
+    visual: Any = mesh.visual
+    if visual.kind == "texture":
+        visual = visual.to_color()
+    if visual.kind is None:
+        return np.full((len(mesh.vertices), 3), GREY, np.uint8)
+    return np.asarray(visual.vertex_colors, np.uint8)[:, :3]
+
+
+def _open_las(path: Path) -> RunView:
+    from gvtools.scans.read import read_scan
+
+    require("laspy", extra="export", purpose=f"{path}: {path.suffix}")
+    scan = read_scan(path, generated=True)
+    return _points_view(path, scan.positions + scan.origin, scan.colors)
+
+
+def _points_view(path: Path, positions: NDArray[Any], colors: NDArray[Any] | None) -> RunView:
+    return RunView(path, _memory(path, positions, colors))
+
+
+def _splat_view(path: Path, splats: Splats) -> RunView:
+    if not len(splats):
+        raise MemoryFileError(f"{path}: no Gaussians; expected some")
+    gaussians = _shown(splats)
+    memory = _memory(path, gaussians.centers, gaussians.colors)
+    return RunView(path, memory, looks=(SPLATS, POINTS), gaussians_of=lambda most: gaussians)
+
+
+def _shown(splats: Splats) -> ShownGaussians:
+    return ShownGaussians(splats.values, splats.origin, splats.rounds)
+
+
+def _memory(path: Path, positions: NDArray[Any], colors: NDArray[Any] | None) -> SpatialMemory:
+    import open3d as o3d
+
+    cloud = o3d.t.geometry.PointCloud()
+    if colors is None:
+        colors = np.full((len(positions), 3), GREY, np.uint8)
+    cloud.point.positions = o3d.core.Tensor(np.ascontiguousarray(positions, np.float64))
+    cloud.point.colors = o3d.core.Tensor(np.ascontiguousarray(colors, np.uint8))
+    try:
+        return SpatialMemory.from_point_cloud(cloud, name=path.name)
+    except GvError as error:
+        raise MemoryFileError(f"{path}: {error}") from None
+
+
+OPENERS: Mapping[str, Callable[[Path], RunView | None]] = {
+    ".ply": _open_ply,
+    ".spz": lambda path: _splat_view(path, spz.read(path)),
+    **dict.fromkeys((".glb", ".obj"), _open_mesh),
+    **dict.fromkeys((".las", ".laz"), _open_las),
+    **dict.fromkeys((".usd", ".usda", ".usdc"), lambda path: _points_view(path, *read_usd(path))),
+}

@@ -9,7 +9,7 @@ from memory_scenes import camera, plane_view, points, random_memory, saved_bytes
 from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory
 from gvtools.memory.store.voxel_levels import VoxelLevels
 from gvtools.memory.thinning import thinned
-from viz.run_view.point_colors import view_counts
+from viz.viewer.colors import view_counts
 
 ONE_EDGE = MemoryOptions(voxels_per_footprint=0.0)
 PLACE = (0.3, 0.3, 10.3)

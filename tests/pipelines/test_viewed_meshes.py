@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from pipelines.viewing import meshes
+from pipelines.viewing import readers
 
 TRIANGLE = """mtllib m.mtl
 usemtl a
@@ -22,13 +22,13 @@ f 1/1 2/2 3/3
 
 
 def test_a_texture_is_measured_by_its_own_file(tmp_path, monkeypatch):
-    monkeypatch.setattr(meshes, "PIXEL_BYTES", 0)
+    monkeypatch.setattr(readers, "PIXEL_BYTES", 0)
     noise = np.random.default_rng(0).integers(0, 255, (256, 256, 3), np.uint8)
     Image.fromarray(noise).save(tmp_path / "t.png")
     (tmp_path / "m.mtl").write_text("newmtl a\nmap_Kd t.png\n")
     (tmp_path / "m.obj").write_text(TRIANGLE)
     before = Image.MAX_IMAGE_PIXELS
-    mesh: Any = meshes.load_mesh(tmp_path / "m.obj")
+    mesh: Any = readers.load_mesh(tmp_path / "m.obj")
     assert mesh.visual.material.image.size == (256, 256)
     assert before == Image.MAX_IMAGE_PIXELS
 
@@ -38,4 +38,4 @@ def test_a_glb_of_more_than_a_million_points_opens(tmp_path):
 
     points = np.random.default_rng(0).random((1_200_000, 3), np.float32)
     trimesh.PointCloud(points).export(tmp_path / "p.glb")
-    assert len(meshes.load_mesh(tmp_path / "p.glb").vertices) == 1_200_000
+    assert len(readers.load_mesh(tmp_path / "p.glb").vertices) == 1_200_000

@@ -20,9 +20,9 @@ from pipelines.viewing.source import ViewSource
 
 pytest.importorskip("viser", reason="viser is not installed (extra web)")
 
-from viz.web.camera_path import FRAMES
-from viz.web.cameras import vertical_field_of_view
-from viz.web.viewer import WebViewer
+from viz.viewer.camera_path import FRAMES
+from viz.viewer.nodes import vertical_field_of_view
+from viz.viewer.web import WebViewer
 
 
 class Client:
@@ -113,12 +113,12 @@ def test_film_draws_a_saved_path(viewer, folder):
 
 def test_the_last_key_frame_is_taken_back(viewer):
     client = with_keys(viewer)
-    assert "3 key frames" in viewer.path._told.content
+    assert "3 key frames" in viewer.path._status.content
     viewer.path.remove_last()
     np.testing.assert_allclose(viewer.path.cameras(2).centers[1], POSES[1].centers[0], atol=1e-9)
     for _ in range(3):
         viewer.path.remove_last()
-    assert "no key frames" in viewer.path._told.content
+    assert "no key frames" in viewer.path._status.content
     assert not viewer.path._nodes
     with pytest.raises(OptionError, match="2 or more"):
         viewer.path.save(client)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from viz.run_view.upright import guessed_up
+from viz.viewer.standpoint import guess_up
 
 
 def room(rng, *, wide=5.0, deep=4.0, high=2.5, noise=0.01):
@@ -28,22 +28,22 @@ def test_the_floor_is_level_though_the_scenes_frame_is_tilted(tilt):
     turn = Rotation.from_euler("xyz", tilt, degrees=True).as_matrix()
     points = room(np.random.default_rng(0))
     expected = turn @ [0, 0, 1]
-    assert degrees(guessed_up(points @ turn.T), expected) < 1
+    assert degrees(guess_up(points @ turn.T), expected) < 1
     # The same in the frame of a camera, whose y runs downwards; seen steeply from above, as well.
     for pitch in (0, 15):
         camera = Rotation.from_euler("x", 90 + pitch, degrees=True).as_matrix() @ turn
         seen = points @ camera.T + (0, 0, 40)
-        assert degrees(guessed_up(seen), camera @ [0, 0, 1]) < 1
+        assert degrees(guess_up(seen), camera @ [0, 0, 1]) < 1
 
 
 @pytest.mark.parametrize(("size", "up"), [((4, 5, 2), (0, 0, 1)), ((4, 2, 5), (0, -1, 0))])
 def test_without_surfaces_it_is_an_axis(size, up):
     points = np.random.default_rng(1).uniform(0, 1, (20000, 3)) * size
-    np.testing.assert_array_equal(guessed_up(points), up)
-    np.testing.assert_array_equal(guessed_up(points[:5]), up)
+    np.testing.assert_array_equal(guess_up(points), up)
+    np.testing.assert_array_equal(guess_up(points[:5]), up)
 
 
 def test_a_wall_is_no_floor():
     rng = np.random.default_rng(2)
     wall = rng.uniform(0, 1, (20000, 3)) * (0, 5, 2) + rng.normal(0, 0.005, (20000, 3))
-    np.testing.assert_array_equal(guessed_up(wall), (0, 0, 1))
+    np.testing.assert_array_equal(guess_up(wall), (0, 0, 1))

@@ -22,11 +22,11 @@ from gvtools.memory.spatial_memory import SpatialMemory
 from pipelines.cli import main
 from pipelines.commands import view
 from pipelines.console import Console
-from pipelines.viewing import live, serve
+from pipelines.viewing import serve
 from pipelines.viewing.source import ViewSource
-from viz.run_view.point_colors import MODES
-from viz.run_view.render import picture_of
-from viz.web.viewer import BUDGET, LOCAL, PORT
+from viz.viewer.colors import MODES
+from viz.viewer.render import picture_of
+from viz.viewer.web import BUDGET, LOCAL, PORT
 
 CAMERA = "frame-000004.color.png"
 
@@ -91,7 +91,7 @@ def test_the_open3d_window_shows_the_run_and_steps_through_it(small_run, tmp_pat
 from pathlib import Path
 import numpy as np
 from pipelines.viewing.source import ViewSource
-from viz.open3d.window import Open3dViewer
+from viz.viewer.window import Open3dViewer
 
 said = []
 viewer = Open3dViewer(ViewSource(Path({str(small_run)!r})).read(), say=said.append)
@@ -142,7 +142,7 @@ def test_the_live_viewer_is_there_as_long_as_the_run_is_at_work(small_run, tmp_p
         with socket.socket() as probe:
             return probe.connect_ex(("127.0.0.1", port)) == 0
 
-    with live.live_viewer(later, Console(), "--port", str(port)):
+    with serve.live_viewer(later, Console(), "--port", str(port)):
         end = time.monotonic() + 60
         while not reached():
             assert time.monotonic() < end
@@ -157,7 +157,7 @@ def test_the_live_viewer_is_there_as_long_as_the_run_is_at_work(small_run, tmp_p
 
 
 def test_a_run_that_fails_at_once_says_no_more_than_why(tmp_path, capfd):
-    with pytest.raises(OptionError), live.live_viewer(tmp_path / "run", Console()):
+    with pytest.raises(OptionError), serve.live_viewer(tmp_path / "run", Console()):
         # While the viewer is still starting.
         time.sleep(0.3)
         raise OptionError("no such project")

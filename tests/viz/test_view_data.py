@@ -17,16 +17,15 @@ from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.runs.layout import inside
 from pipelines.viewing.source import ViewSource
 from viz.plots.canvas import COLORS, GREY
-from viz.run_view.detail import detail
-from viz.run_view.point_colors import (
+from viz.viewer.colors import (
     MODES,
     VIRIDIS,
     depth_errors,
     point_colors,
     view_counts,
 )
-from viz.run_view.render import RunRenderer, picture_of
-from viz.run_view.view import CONTEXT, TARGET
+from viz.viewer.render import RunRenderer, picture_of
+from viz.viewer.run_view import CONTEXT, TARGET, detail
 
 
 @pytest.fixture(scope="module")
@@ -220,7 +219,7 @@ def test_starting_a_viewer_imports_neither_torch_nor_matplotlib(small_run):
         "import sys; from pathlib import Path\n"
         "import pipelines.cli; pipelines.cli.build_parser()\n"
         "from pipelines.viewing.source import ViewSource\n"
-        "from viz.web.viewer import WebViewer\n"
+        "from viz.viewer.web import WebViewer\n"
         f"source = ViewSource(Path({str(small_run)!r}))\n"
         "viewer = WebViewer(source.read(), port=18230)\n"
         "source.lacking(); viewer.stop()\n"

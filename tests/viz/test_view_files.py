@@ -23,9 +23,9 @@ from gvtools.memory.thinning import thinned
 from pipelines.cli import main
 from pipelines.export import splat, spz
 from pipelines.viewing.source import ViewSource
-from viz.run_view.from_outside import camera_outside
-from viz.run_view.screenshot import chosen_camera
-from viz.run_view.view import MESH, POINTS, RENDERED, SPLATS, TARGET
+from viz.viewer.render import chosen_camera
+from viz.viewer.run_view import MESH, POINTS, RENDERED, SPLATS, TARGET
+from viz.viewer.standpoint import camera_outside
 
 
 @pytest.fixture(scope="module")

@@ -12,12 +12,12 @@ from plain_splats import draw, read_splats
 from web_page import SCENE, close_notes, steady, wait
 
 from pipelines.viewing.source import ViewSource
-from viz.run_view.view import POINTS, SPLATS
+from viz.viewer.run_view import POINTS, SPLATS
 
 pytest.importorskip("viser", reason="viser is not installed (extra web)")
 
-from viz.web.gaussians import MAGNIFIED
-from viz.web.viewer import WebViewer
+from viz.viewer.nodes import MAGNIFIED
+from viz.viewer.web import WebViewer
 
 
 @pytest.fixture(scope="module")

@@ -14,8 +14,7 @@ from pipelines.viewing.source import ViewSource
 
 pytest.importorskip("viser", reason="viser is not installed (extra web)")
 
-from viz.web.server import address_of, is_loopback, may_read
-from viz.web.viewer import WebViewer
+from viz.viewer.web import WebViewer, address_of, is_loopback, may_read
 
 
 @pytest.fixture(scope="module")

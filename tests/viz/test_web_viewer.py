@@ -21,16 +21,15 @@ from web_page import PATIENCE, choose, close_notes, steady, wait
 
 from gvtools.ply import write_ply
 from pipelines.viewing.source import ViewSource
-from viz.run_view.render import RunRenderer, picture_of
-from viz.run_view.view import TARGET
+from viz.viewer.render import RunRenderer, picture_of
+from viz.viewer.run_view import TARGET
 
 pytest.importorskip("viser", reason="viser is not installed (extra web)")
 
-from viz.run_view.from_outside import FIELD_OF_VIEW
-from viz.web.frame import PageFrame, home
-from viz.web.pictures import GAP, ROW_WIDTH
-from viz.web.rendered import LONGEST
-from viz.web.viewer import WebViewer
+from viz.viewer.nodes import LONGEST
+from viz.viewer.panel import GAP, ROW_WIDTH
+from viz.viewer.standpoint import FIELD_OF_VIEW, PageFrame, home
+from viz.viewer.web import WebViewer
 
 
 @pytest.fixture(scope="module")
@@ -278,7 +277,7 @@ def test_points_cost_fifteen_bytes_and_stay_within_the_budget(small_run):
         drawn = sum(len(node.points) for node in nodes)
         assert 300 < drawn <= 900
         assert sum(n.points.nbytes + n.colors.nbytes for n in nodes) == 15 * drawn
-        assert viewer._points.drawn(0) < viewer._points.drawn(2) == drawn
+        assert viewer._points.count(0) < viewer._points.count(2) == drawn
     finally:
         viewer.stop()
 

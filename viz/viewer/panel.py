@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable
+from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gvtools.errors import GvError
-from viz.run_view.detail import Detail
-from viz.run_view.point_colors import MODES, VIRIDIS, Legend
-from viz.run_view.view import CONTEXT, TARGET, RunView, ShownCamera
-from viz.web.cameras import KINDS
-from viz.web.pictures import ShownPictures
+from viz.viewer.colors import CONTEXT, KINDS, MODES, TARGET, VIRIDIS, Legend
+from viz.viewer.nodes import thumbnail
+from viz.viewer.run_view import TRUTH, Detail, RunView, ShownCamera
 
 if TYPE_CHECKING:
     import viser
@@ -25,21 +25,70 @@ LOOKS_HINT = "splats: as exported; rendered: as gvtools render draws this view"
 # Of the panel with the selected camera's pictures, CSS pixels: a little over half of the scene in a
 # window of 1280. It can be moved, made larger and folded away.
 PICTURES_WIDTH = 500
+# Of the pictures that stand side by side, in order.
+SHOWN = ("guidance", "completion", TRUTH)
+PICTURE_SIDE = 640
+# Of the row of pictures at least, pixels.
+ROW_WIDTH = 760
+GAP = 8
+
+
+@dataclass(frozen=True, eq=False)
+class ShownPictures:
+    """The pictures of a camera."""
+
+    title: str  # HTML, what they are of and what is not there
+    names: tuple[str, ...]  # left to right, "" where there is none
+    row: NDArray[np.uint8] | None  # (H, W, 3), side by side; None where there are none
+
+
+def shown_pictures(run: RunView, shown: ShownCamera) -> ShownPictures:
+    """Read the pictures of a camera; what cannot be read is said in the title."""
+    title = f"<b>{escape(shown.name)}</b>, {shown.kind}, round {shown.round}"
+    if shown.coverage is not None:
+        before, after = (f"{100 * share:.1f} %" for share in shown.coverage)
+        title += f", coverage {before} before the round, {after} after it"
+    try:
+        pictures = run.pictures(shown)
+    except GvError as error:
+        pictures = {}
+        title += f"<br>{escape(str(error))}"
+    there = [name for name in SHOWN if name in pictures]
+    absent = [name for name in SHOWN if name not in pictures and shown.kind == TARGET]
+    if absent:
+        title += f"<br>not there: {', '.join(absent)}"
+    names = {TRUTH: "given picture"} if shown.kind == CONTEXT else {}
+    padded = (*(names.get(name, name) for name in there), *[""] * (len(SHOWN) - len(there)))
+    row = side_by_side([pictures[name] for name in there]) if there else None
+    return ShownPictures(title, padded, row)
+
+
+def side_by_side(pictures: list[NDArray[np.uint8]]) -> NDArray[np.uint8]:
+    """Up to three pictures (H, W, 3) in a row of three, as high as the first.
+
+    Small ones are enlarged by a whole factor, so that the row fills its panel.
+    """
+    from PIL import Image
+
+    small = [thumbnail(picture, PICTURE_SIDE) for picture in pictures]
+    factor = -(-ROW_WIDTH // (len(SHOWN) * small[0].shape[1]))
+    first = small[0].repeat(factor, axis=0).repeat(factor, axis=1)
+    height = len(first)
+    cells = [first]
+    for picture in small[1:]:
+        width = max(1, round(picture.shape[1] * height / picture.shape[0]))
+        image = Image.fromarray(picture).resize((width, height), Image.Resampling.NEAREST)
+        cells.append(np.array(image))
+    cells += [np.full_like(first, 255)] * (len(SHOWN) - len(cells))
+    gap = np.full((height, GAP, 3), 255, np.uint8)
+    return np.concatenate([part for cell in cells for part in (cell, gap)][:-1], axis=1)
 
 
 class Panel:
     """Controls on the right, pictures below left.
 
-    Args:
-        server: that shows them.
-        mode: colours to begin with.
-        looks: to choose from.
-        on_round: told the round to show.
-        on_mode: told the colour mode, of MODES.
-        on_look: told which of the looks.
-        on_camera: told the camera that was chosen, and by whom.
-        on_size: told the points' size in spacings.
-        on_kinds: told which kinds of cameras to show.
+    ``on_round`` and its like are told what was chosen: the round, the colour mode, the look, the
+    camera and by whom, the points' size in spacings, the kinds of cameras to show.
     """
 
     def __init__(
@@ -109,10 +158,10 @@ class Panel:
         """The colour mode that is looked at, of MODES."""
         return next(mode for mode, label in MODES.items() if label == self._mode.value)
 
-    def set_run(self, run: RunView, drawn: Detail, *, go_to: int) -> None:
+    def set_run(self, run: RunView, detail: Detail, *, go_to: int) -> None:
         """Take a run, or its growth, over, and go to a round."""
         self._run = run
-        self._drawn = drawn
+        self._detail = detail
         if run.last_round:
             self._round.max = run.last_round
             self._round.disabled = False
@@ -129,7 +178,7 @@ class Panel:
         """Say what a size of 1 is."""
         self._size.hint = f"in spacings of {spacing:.3g} scene units"
 
-    def set_counts(self, run: RunView, number: int, drawn: int) -> None:
+    def set_counts(self, run: RunView, number: int, points: int) -> None:
         """Say what the memory holds after a round, and how much of it is drawn."""
         counts = run.counts(number)
         lines = [
@@ -138,8 +187,8 @@ class Panel:
         ]
         if counts.voxels is not None:
             lines.append(f"{counts.voxels:,} voxels")
-        if self._drawn.edge:
-            lines.append(f"{drawn:,} points drawn, one a cell of {self._drawn.edge:.3g}")
+        if self._detail.edge:
+            lines.append(f"{points:,} points drawn, one a cell of {self._detail.edge:.3g}")
         if not run.whole:
             lines.append(f"not finished: {run.last_round} of {(run.planned or 1) - 1} rounds done")
         self._counts.content = _small("<br>".join(lines))

@@ -1,6 +1,6 @@
-"""What viewers show of a run: its memory, its rounds, its cameras and their pictures.
+"""A run as viewers show it: memory, rounds, cameras and their pictures, Gaussians, level of detail.
 
-Nothing here knows a viewer; the web page and the Open3D window stand on the same data.
+Nothing here knows a viewer; the web page, the Open3D window and screenshots stand on the same data.
 """
 
 from __future__ import annotations
@@ -14,51 +14,47 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gvtools.appearance.splat.project_kernels import HARMONICS, LOG_SCALE, LOGIT, QUATERNION, SH
 from gvtools.cameras import Cameras
 from gvtools.errors import ProjectError
 from gvtools.runs.layout import AFTER, COMPLETION, GUIDANCE, round_folder
 from gvtools.runs.target_files import entry_camera, read_picture
-from viz.run_view.gaussians import ShownGaussians, Surface
-from viz.run_view.point_colors import PointColors, point_colors, view_counts
-from viz.run_view.upright import STRAY, guessed_up
+from viz.viewer.colors import CONTEXT, TARGET, PointColors, point_colors, view_counts
+from viz.viewer.standpoint import STRAY, guess_up
 
 if TYPE_CHECKING:
     from gvtools.memory.spatial_memory import SpatialMemory
     from gvtools.scenes.scene import Frame
 
-CONTEXT, TARGET = "context", "target"
 # The pictures that a round leaves of a target, by the title that a viewer gives them.
 PICTURES = {"guidance": GUIDANCE, "completion": COMPLETION, "memory after": AFTER}
 TRUTH = "truth"
-# How a viewer may show it: as points, as the Gaussians of an export, as the project's own splatter
-# renders it, or as a file's mesh.
+# Looks: points, Gaussians of an export, as the project's own splatter renders it, a file's mesh.
 POINTS, SPLATS, RENDERED, MESH = "points", "splats", "rendered", "mesh"
+# A Gaussian's least standard deviation in shares of its largest: viewers keep covariances in
+# half precision, in which thinner ones would not stay positive definite.
+THINNEST = 1 / 32
+# Bits of a cell's place along an axis: three of them, and two for the source, fit a signed 64-bit
+# key.
+AXIS_BITS = 20
 
 
 @dataclass(frozen=True, eq=False)
 class ShownCamera:
-    """A camera of a run.
+    """A camera of a run."""
 
-    Attributes:
-        name: of its view.
-        kind: "context" (its picture was given) or "target" (its picture was completed).
-        round: the round it was fused or completed in.
-        camera: a batch of one.
-        stem: part of the names of the files that its round left; None where there are none.
-        coverage: the shares of its pixels that memory supports before and after the round.
-    """
-
-    name: str
-    kind: str
-    round: int
-    camera: Cameras
-    stem: str | None = None
+    name: str  # of its view
+    kind: str  # CONTEXT (its picture was given) or TARGET (its picture was completed)
+    round: int  # that it was fused or completed in
+    camera: Cameras  # a batch of one
+    stem: str | None = None  # part of the names of the files that its round left, if any
+    # The shares of its pixels that memory supports before and after the round.
     coverage: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
 class Counts:
-    """What the memory holds after a round: observations by their source, and voxels if known."""
+    """Observations of a memory after a round by their source, and voxels if known."""
 
     observed: int
     generated: int
@@ -77,30 +73,75 @@ class Counts:
 
 
 @dataclass(frozen=True, eq=False)
+class ShownGaussians:
+    """N Gaussians with the world's axes, drawn without harmonics."""
+
+    # (N, VALUES), see appearance.splat.project_kernels; positions count from ``origin``.
+    values: NDArray[np.float32]
+    origin: NDArray[np.float64]  # (3,) world frame, scene units
+    rounds: NDArray[np.int32]  # (N,) that each came with
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    @property
+    def centers(self) -> NDArray[np.float64]:
+        """(N, 3) in the world frame, scene units."""
+        return self.values[:, :LOG_SCALE].astype(np.float64) + self.origin
+
+    @property
+    def opacities(self) -> NDArray[np.float32]:
+        """(N, 1) from 0 to 1."""
+        logits = np.clip(self.values[:, LOGIT : LOGIT + 1], -30, 30)
+        return np.asarray(1 / (1 + np.exp(-logits)), np.float32)
+
+    def covariances(self, scale: float, *, largest: float) -> NDArray[np.float32]:
+        """(N, 3, 3) in units of which a scene unit has ``scale``.
+
+        Standard deviations are at most ``largest`` such units.
+        """
+        from scipy.spatial.transform import Rotation
+
+        w, x, y, z = self.values[:, QUATERNION:LOGIT].astype(np.float64).T
+        axes = Rotation.from_quat(np.stack([x, y, z, w], axis=1)).as_matrix()
+        log_sizes = self.values[:, LOG_SCALE:QUATERNION].astype(np.float64) + np.log(scale)
+        sizes = np.exp(np.minimum(log_sizes, np.log(largest)))
+        sizes = np.maximum(sizes, THINNEST * sizes.max(axis=1, keepdims=True))
+        half = axes * sizes[:, None]
+        return np.asarray(half @ half.transpose(0, 2, 1), np.float32)
+
+    @property
+    def colors(self) -> NDArray[np.uint8]:
+        """(N, 3) uint8: the mean over all directions."""
+        shown = 0.5 + HARMONICS[0] * self.values[:, SH : SH + 3]
+        return np.rint(255 * np.clip(shown, 0, 1)).astype(np.uint8)
+
+
+@dataclass(frozen=True, eq=False)
+class ColoredMesh:
+    """Triangles with colours at their vertices."""
+
+    vertices: NDArray[np.float64]  # (V, 3) world frame, scene units
+    faces: NDArray[np.int64]  # (F, 3) rows of ``vertices``
+    colors: NDArray[np.uint8]  # (V, 3)
+
+
+@dataclass(frozen=True, eq=False)
 class RunView:
-    """A run, or a memory without one, as it is now.
+    """A run, or a memory without one, as it is now."""
 
-    Attributes:
-        path: the run's folder, or the memory file.
-        memory: after the last whole round.
-        reports: of the whole rounds, in order; none for a memory file.
-        cameras: context first, then targets, in the order of rounds.
-        frame_of: the project's pixels of a view by its name; None where it has none.
-        planned: how many rounds, the context's included, the run is to have; None if unknown.
-        looks: of POINTS, SPLATS, RENDERED and MESH, those that there are; the first to begin with.
-        gaussians_of: the Gaussians to draw for SPLATS, so many of the memory's points at most.
-        surface: to draw for MESH.
-    """
-
-    path: Path
-    memory: SpatialMemory
-    reports: tuple[Mapping[str, Any], ...]
-    cameras: tuple[ShownCamera, ...]
-    frame_of: Callable[[str], Frame | None]
-    planned: int | None = None
-    looks: tuple[str, ...] = (POINTS, RENDERED)
+    path: Path  # the run's folder, or the memory file
+    memory: SpatialMemory  # after the last whole round
+    # Of the whole rounds, in order; none for a memory file.
+    reports: tuple[Mapping[str, Any], ...] = ()
+    cameras: tuple[ShownCamera, ...] = ()  # context first, then targets, in the order of rounds
+    # The project's pixels of a view by its name; None where it has none.
+    frame_of: Callable[[str], Frame | None] = lambda name: None
+    planned: int | None = None  # rounds that the run is to have, the context's included
+    looks: tuple[str, ...] = (POINTS, RENDERED)  # that there are; the first to begin with
+    # The Gaussians to draw for SPLATS, so many of the memory's points at most.
     gaussians_of: Callable[[int], ShownGaussians] | None = None
-    surface: Surface | None = None
+    surface: ColoredMesh | None = None  # to draw for MESH
 
     @property
     def title(self) -> str:
@@ -146,11 +187,10 @@ class RunView:
         )
 
     def pictures(self, shown: ShownCamera) -> dict[str, NDArray[np.uint8]]:
-        """What there is to see of a camera, by title.
+        """(H, W, 3) pictures of a camera by title; what is absent is left out.
 
-        Returns:
-            (H, W, 3) uint8 each: for a target "guidance" (holes black), "completion" and "memory
-            after", for any camera "truth", the project's picture. What is absent is left out.
+        For a target "guidance" (holes black), "completion" and "memory after", for any camera
+        "truth", the project's picture.
         """
         out = {}
         if shown.stem is not None:
@@ -175,10 +215,7 @@ class RunView:
         return None if frame is None else frame.depth
 
     def up(self) -> NDArray[np.float64]:
-        """(3,) unit vector, world frame: what most of the context's cameras hold to be up.
-
-        Without cameras it is a guess, see guessed_up.
-        """
+        """(3,) unit vector, world frame: the context's cameras' mean; without cameras a guess."""
         chosen = [c for c in self.cameras if c.kind == CONTEXT] or list(self.cameras)
         if not chosen:
             return self._guessed_up
@@ -193,7 +230,7 @@ class RunView:
 
     @cached_property
     def _guessed_up(self) -> NDArray[np.float64]:
-        return guessed_up(self.memory.frame.to_world(self._sample()[1]))
+        return guess_up(self.memory.frame.to_world(self._sample()[1]))
 
     @cached_property
     def bounds(self) -> NDArray[np.float64]:
@@ -242,3 +279,51 @@ def cameras_of(
             camera, number = entry_camera(entry), report["round"]
             out.append(ShownCamera(entry["name"], TARGET, number, camera, entry["stem"], coverage))
     return tuple(out)
+
+
+@dataclass(frozen=True, eq=False)
+class Detail:
+    """The observations to draw."""
+
+    rows: NDArray[np.int64]  # (P,) ascending
+    edge: float  # of the cells that were thinned to, scene units; 0 when nothing was left out
+    size: float  # edge of the square to draw a point as, scene units
+
+
+def detail(memory: SpatialMemory, budget: int) -> Detail:
+    """At most ``budget`` observations, spread evenly in space.
+
+    Of each cell the first observation is taken, one of each source: so a later round never changes
+    what is drawn of earlier ones, unless cells have to grow, and generated content stays visible
+    beside observed content. Cells grow from the memory's voxels.
+    """
+    count = len(memory)
+    spacing = memory.columns.spacing[:count][:: max(1, count // 100_000)]
+    size = float(np.median(spacing)) if count else memory.voxel
+    if count <= budget:
+        return Detail(np.arange(count), 0.0, size)
+    positions = memory.columns.positions
+    reach = float(np.abs(positions).max())
+    edge = max(memory.voxel, reach / 2 ** (AXIS_BITS - 2))
+    while True:
+        keys = (_cell_keys(positions, edge) << 2) | memory.generated | (memory.scanned << 1)
+        _, first = np.unique(keys, return_index=True)
+        # Cells that meet at the origin do not become one however large they are.
+        if len(first) <= budget or edge > reach:
+            return Detail(np.sort(first)[:budget], edge, max(size, edge))
+        edge *= max(1.1, float(np.sqrt(len(first) / budget)))
+
+
+def point_pixels(focal: float, chosen: Detail, run: RunView) -> float:
+    """How wide to draw points where all have one size, pixels: as wide as they are at mid depth."""
+    return float(np.clip(1.2 * focal * chosen.size / run.typical_depth, 2.0, 8.0))
+
+
+def _cell_keys(positions: NDArray[np.float32], edge: float) -> NDArray[np.int64]:
+    """(N,) int64 below 2⁶⁰, equal for positions (N, 3) of one cell."""
+    keys = np.zeros(len(positions), np.int64)
+    for axis in positions.T:
+        # Times the inverse, as the memory counts its voxels.
+        cell = np.floor(axis * (1.0 / np.float64(edge))).astype(np.int64)
+        keys = (keys << AXIS_BITS) | (cell - cell.min())
+    return keys

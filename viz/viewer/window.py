@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gvtools.errors import OptionError
-from viz.run_view.detail import detail, point_pixels
-from viz.run_view.point_colors import MODES, point_colors
-from viz.run_view.view import RunView
-from viz.web.cameras import KINDS
-from viz.web.frame import PageFrame, home
+from viz.plots.canvas import rgb_of
+from viz.viewer.colors import KINDS, MODES, point_colors
+from viz.viewer.run_view import RunView, detail, point_pixels
+from viz.viewer.standpoint import PageFrame, home
 
 if TYPE_CHECKING:
     import open3d as o3d
@@ -31,13 +30,10 @@ SHARE = 0.04
 
 
 class Open3dViewer:
-    """One window.
+    """One window on a run.
 
-    Args:
-        run: what to show.
-        round: to begin with; None for the last.
-        mode: of viz.run_view.point_colors.MODES.
-        say: told, in one line, what is shown whenever that has changed.
+    It begins with a round, None for the last, in the colours of a mode; ``say`` is told, in one
+    line, what is shown whenever that has changed.
     """
 
     def __init__(
@@ -56,8 +52,8 @@ class Open3dViewer:
         self._say = say
         self._camera = 0
         self._with_cameras = True
-        self._drawn = detail(run.memory, BUDGET)
-        self._rounds = run.round_of_points()[self._drawn.rows]
+        self._detail = detail(run.memory, BUDGET)
+        self._rounds = run.round_of_points()[self._detail.rows]
         self._cloud = o3d.geometry.PointCloud()
         self._pyramids: list[tuple[int, o3d.geometry.LineSet]] = []
         self._rgb = np.zeros((0, 3))
@@ -113,7 +109,7 @@ class Open3dViewer:
         parameters.intrinsic = o3d.camera.PinholeCameraIntrinsic(
             width, height, focal, focal, width / 2 - 0.5, height / 2 - 0.5
         )
-        self.window.get_render_option().point_size = point_pixels(focal, self._drawn, self.run)
+        self.window.get_render_option().point_size = point_pixels(focal, self._detail, self.run)
         parameters.extrinsic = local.cam_from_world[0]
         view.convert_from_pinhole_camera_parameters(parameters, allow_arbitrary=True)
 
@@ -125,11 +121,10 @@ class Open3dViewer:
     def _fill(self) -> None:
         import open3d as o3d
 
-        memory, rows = self.run.memory, self._drawn.rows
+        memory, rows = self.run.memory, self._detail.rows
         if not len(self._rgb):
-            found = point_colors(memory, self.mode, rows=rows, true_depth=self.run.recorded_depth)
-            self._rgb = found.rgb / 255.0
-            self._legend = found.legend
+            colors = point_colors(memory, self.mode, rows=rows, true_depth=self.run.recorded_depth)
+            self._rgb, self._legend = colors.rgb / 255.0, colors.legend
         there = self._rounds <= self.round
         self._cloud.points = o3d.utility.Vector3dVector(memory.columns.positions[rows[there]])
         self._cloud.colors = o3d.utility.Vector3dVector(self._rgb[there])
@@ -157,8 +152,7 @@ class Open3dViewer:
             local.cam_from_world[0],
             SHARE * self.run.typical_depth,
         )
-        color = KINDS[shown.kind]
-        lines.paint_uniform_color([int(color[k : k + 2], 16) / 255 for k in (1, 3, 5)])
+        lines.paint_uniform_color([value / 255 for value in rgb_of(KINDS[shown.kind])])
         return shown.round, lines
 
     def _bind(self) -> None:

@@ -1,4 +1,6 @@
-"""Colours of observations by what is known of them; a blind eye for red or green tells them apart.
+"""Colours of observations by round, source, confidence, views or depth error, and of cameras.
+
+Eyes that are blind for red or green tell them apart.
 
 Scales run along viridis; unknown is grey. What is coloured by its source keeps some of the
 picture's light and shade, without which nothing could be recognised.
@@ -21,6 +23,9 @@ if TYPE_CHECKING:
 
 TrueDepth = Callable[[str], "NDArray[np.float32] | None"]
 
+CONTEXT, TARGET = "context", "target"
+# Of cameras by their kind.
+KINDS = {CONTEXT: COLORS["observed"], TARGET: COLORS["generated"]}
 # By name, with what a menu calls it.
 MODES = {
     "color": "colour",
@@ -39,17 +44,11 @@ WORST_ERROR = 0.1
 
 @dataclass(frozen=True)
 class Legend:
-    """How to read the colours.
+    """How to read the colours."""
 
-    Attributes:
-        text: what is shown, with its unit.
-        swatches: colours (#rrggbb) with their meaning.
-        scale: what the two ends of viridis stand for; None without a scale.
-    """
-
-    text: str
-    swatches: tuple[tuple[str, str], ...] = ()
-    scale: tuple[str, str] | None = None
+    text: str  # what is shown, with its unit
+    swatches: tuple[tuple[str, str], ...] = ()  # colours (#rrggbb) with their meaning
+    scale: tuple[str, str] | None = None  # what the two ends of viridis stand for
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,9 +70,9 @@ def point_colors(
     """Colours of observations; an observation's is the same whichever others are asked for.
 
     Args:
-        memory: whose they are.
+        memory: of the observations.
         mode: one of MODES.
-        rows: (P,) which observations; None for all.
+        rows: (P,) the observations; None for all.
         true_depth: the recorded depth (H, W) of a view by its name, or None; for "depth-error".
         counts: the memory's view_counts, for "views"; None: they are counted.
     """

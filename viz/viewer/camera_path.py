@@ -20,10 +20,10 @@ from gvtools.cameras import Cameras, concatenate
 from gvtools.errors import GvError, OptionError
 from gvtools.scenes.transforms_json import write_transforms, written_here
 from gvtools.trajectories import interpolate
-from viz.plots.canvas import GREEN
-from viz.run_view.view import RunView
-from viz.web.cameras import SHARE, rgb_of, vertical_field_of_view
-from viz.web.frame import TYPICAL, PageFrame
+from viz.plots.canvas import GREEN, rgb_of
+from viz.viewer.nodes import SHARE, add_frustum, vertical_field_of_view
+from viz.viewer.run_view import RunView
+from viz.viewer.standpoint import TYPICAL, PageFrame, pinhole
 
 if TYPE_CHECKING:
     import viser
@@ -35,18 +35,14 @@ FRAMES, FPS = 120, 24.0
 SIZE = (1280, 720)
 # A file's name comes from a page: letters that mean nothing to a file system.
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
-# Cameras of the line that is drawn.
-DRAWN = 200
+# Cameras of the line through the key frames.
+LINE_CAMERAS = 200
 
 
 class CameraPath:
-    """Key frames, shared by all who look.
+    """Key frames, shared by all who look; the run's first camera gives the frames their size.
 
-    Args:
-        server: that shows them.
-        frame: of the page.
-        run: beside which paths are saved; its first camera gives the frames their size.
-        saves: True writes into the run's folder; False sends the file to the browser.
+    ``saves``: True writes beside the run, False sends the file to the browser.
     """
 
     def __init__(
@@ -67,14 +63,14 @@ class CameraPath:
     def _add_controls(self) -> None:
         gui = self._server.gui
         with gui.add_folder("Camera path", expand_by_default=False):
-            self._told = gui.add_html("")
+            self._status = gui.add_html("")
             add = gui.add_button("Add key frame", hint="at the present view")
             remove = gui.add_button("Remove last")
             self._frames = gui.add_number("Frames", FRAMES, min=2, max=10_000, step=1)
             preview = gui.add_button("Preview", hint=f"{FPS:g} frames a second; again: stop")
             self._name = gui.add_text("Name", "path", hint="letters, digits, - and _")
             save = gui.add_button("Save", hint="for gvtools film --path")
-        self._tell()
+        self._update_status()
 
         @add.on_click
         def _(event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
@@ -105,12 +101,9 @@ class CameraPath:
     def add(self, client: viser.ClientHandle) -> None:
         """A key frame where a client stands."""
         seen = self._frame.client_camera(client, longest=max(self._size))
-        width, height = self._size
-        focal = height / (2 * np.tan(vertical_field_of_view(seen) / 2))
-        K = np.array([[[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]])
+        pose, view = seen.cam_from_world[0], vertical_field_of_view(seen)
         with self._lock:
-            size = np.array([width]), np.array([height])
-            self.keys.append(Cameras(K, seen.cam_from_world, *size, (f"{len(self.keys):05d}",)))
+            self.keys.append(pinhole(pose, self._size, view, name=f"{len(self.keys):05d}"))
             self._draw()
 
     def remove_last(self) -> None:
@@ -180,41 +173,31 @@ class CameraPath:
         """The key frames and the line through them."""
         for node in self._nodes:
             node.remove()
-        color, depth, scene = rgb_of(GREEN), SHARE * TYPICAL, self._server.scene
-        self._nodes = []
-        for number, key in enumerate(self.keys):
-            wxyz, position = self._frame.placement(key)
-            self._nodes.append(
-                scene.add_camera_frustum(
-                    f"/path/keys/{number:05d}",
-                    fov=vertical_field_of_view(key),
-                    aspect=self._size[0] / self._size[1],
-                    scale=depth,
-                    thickness=0.03 * depth,
-                    color=color,
-                    wxyz=wxyz,
-                    position=position,
-                    cast_shadow=False,
-                    receive_shadow=False,
-                )
+        depth = SHARE * TYPICAL
+        self._nodes = [
+            add_frustum(
+                self._server, self._frame, key,
+                name=f"/path/keys/{number:05d}", color=GREEN, depth=depth, thickness=0.03,
             )
+            for number, key in enumerate(self.keys)
+        ]  # fmt: skip
         try:
-            centers = self.cameras(DRAWN).centers
+            centers = self.cameras(LINE_CAMERAS).centers
         except GvError:
-            self._tell()
+            self._update_status()
             return
         page = self._frame.scale * (centers - self._frame.origin)
         self._nodes.append(
-            scene.add_line_segments(
+            self._server.scene.add_line_segments(
                 "/path/line",
                 np.stack([page[:-1], page[1:]], axis=1).astype(np.float32),
-                color,
+                rgb_of(GREEN),
                 thickness=0.03 * depth,
             )
         )
-        self._tell()
+        self._update_status()
 
-    def _tell(self) -> None:
+    def _update_status(self) -> None:
         count = len(self.keys)
         text = "no key frames yet" if not count else f"{count} key frame{'s' * (count > 1)}"
-        self._told.content = f'<div style="padding:0 .8em .4em;font-size:.85em">{text}</div>'
+        self._status.content = f'<div style="padding:0 .8em .4em;font-size:.85em">{text}</div>'

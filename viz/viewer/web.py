@@ -3,34 +3,43 @@
 from __future__ import annotations
 
 import io
+import ipaddress
+import re
+import socket
 import threading
+from collections.abc import Callable
 from contextlib import redirect_stdout
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+from unittest.mock import patch
+from urllib.parse import urlsplit
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.errors import GvError
-from viz.run_view.detail import detail
-from viz.run_view.from_outside import FIELD_OF_VIEW
-from viz.run_view.point_colors import MODES, Legend
-from viz.run_view.view import MESH, POINTS, RENDERED, SPLATS, RunView, ShownCamera
-from viz.web.camera_path import CameraPath
-from viz.web.cameras import CameraNodes, fly_to
-from viz.web.frame import PageFrame, home
-from viz.web.gaussians import GaussianNodes, add_surface
-from viz.web.panel import Panel
-from viz.web.pictures import shown_pictures
-from viz.web.points import PointNodes
-from viz.web.rendered import RenderedLook
-from viz.web.server import LOCAL, address_of, is_loopback, make_server
+from gvtools.errors import GvError, OptionError
+from gvtools.optional import require
+from viz.viewer.camera_path import CameraPath
+from viz.viewer.colors import MODES, Legend
+from viz.viewer.nodes import (
+    CameraNodes,
+    GaussianNodes,
+    PointNodes,
+    RenderedLook,
+    add_surface,
+    fly_to,
+)
+from viz.viewer.panel import Panel, shown_pictures
+from viz.viewer.run_view import MESH, POINTS, RENDERED, SPLATS, RunView, ShownCamera, detail
+from viz.viewer.standpoint import FIELD_OF_VIEW, PageFrame, home
 
 if TYPE_CHECKING:
     import viser
 
-PORT = 8080
-# Of the whole run, 15 bytes each; with all colour modes looked at once, 30 MB.
+LOCAL, PORT = "127.0.0.1", 8080
+# Points of the whole run, 15 bytes each; with all colour modes looked at once, 30 MB.
 BUDGET = 1_000_000
+# Pages that this machine serves itself may read a run, also through a tunnel's port.
+LOCAL_PAGE = re.compile(r"https?://(localhost|127\.0\.0\.1|\[::1\])(:\d+)?")
 
 
 class WebViewer:
@@ -45,7 +54,7 @@ class WebViewer:
         port: the first one tried; where it is taken, the next free one is used.
         budget: points drawn at most; a larger run is thinned evenly in space.
         round: to begin with; None for the last.
-        mode: colours to begin with, of viz.run_view.point_colors.MODES.
+        mode: colours to begin with, of MODES.
     """
 
     def __init__(
@@ -90,7 +99,10 @@ class WebViewer:
         self.path = CameraPath(self.server, self.frame, run, saves=is_loopback(host))
         self.server.scene.set_up_direction(tuple(run.up()))
         self.server.scene.world_axes.visible = False
-        self._set_home()
+        # Where a page starts, and returns to.
+        start = self.server.initial_camera
+        start.position, start.look_at = home(run, self.frame)
+        start.up, start.fov = run.up(), FIELD_OF_VIEW
         self.server.on_client_connect(self._follow)
         self._show(run, go_to=run.last_round if round is None else round)
 
@@ -108,10 +120,10 @@ class WebViewer:
     def _show(self, run: RunView, *, go_to: int) -> None:
         with self._lock:
             self.run = run
-            drawn = detail(run.memory, self.budget)
+            chosen = detail(run.memory, self.budget)
             self._rendered.set_run(run)
-            self._panel.set_run(run, drawn, go_to=go_to)
-            self._points.set_points(run, drawn, self._colors(drawn.rows))
+            self._panel.set_run(run, chosen, go_to=go_to)
+            self._points.set_points(run, chosen, self._colors(chosen.rows))
             self._panel.set_size(self._points.size)
             self._gaussians.clear()
             self._show_look(self._look)
@@ -140,7 +152,7 @@ class WebViewer:
                 self._points.show(number)
                 self._gaussians.show(number)
                 self._cameras.show(number)
-            self._panel.set_counts(self.run, number, self._points.drawn(number))
+            self._panel.set_counts(self.run, number, self._points.count(number))
             self._rendered.set_state(number, self._panel.mode)
 
     def _show_mode(self, mode: str) -> None:
@@ -167,6 +179,9 @@ class WebViewer:
     def _set_size(self, scale: float) -> None:
         with self._lock:
             self._points.set_size(scale)
+
+    def _follow(self, client: viser.ClientHandle) -> None:
+        client.camera.on_update(lambda seen: self._cameras.moved(np.array(seen.position)))
 
     def _clicked(self, shown: ShownCamera, client: viser.ClientHandle | None) -> None:
         self._select(shown, client, clicked=True)
@@ -200,15 +215,71 @@ class WebViewer:
                 goes_on=lambda: self._flights[flight] == number,
             )
 
-    def _follow(self, client: viser.ClientHandle) -> None:
-        def moved(seen: viser.CameraHandle) -> None:
-            self._cameras.moved(np.array(seen.position))
 
-        client.camera.on_update(moved)
+def make_server(host: str, port: int, title: str) -> viser.ViserServer:
+    """A server that refuses WebSockets of pages from elsewhere."""
+    require("viser", extra="web", purpose="the web viewer", instead="or use --open3d")
+    import viser
+    import websockets.asyncio.server as websockets
 
-    def _set_home(self) -> None:
-        """Where a page starts, and returns to."""
-        home_view = self.server.initial_camera
-        home_view.position, home_view.look_at = home(self.run, self.frame)
-        home_view.up = self.run.up()
-        home_view.fov = FIELD_OF_VIEW
+    class Server(viser.ViserServer):
+        """Never publishes itself, whatever a page asks for."""
+
+        def request_share_url(self, verbose: bool = True) -> str | None:
+            return None
+
+    # viser itself would look for a free port for ever.
+    try:
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        with socket.create_server((host, 0), family=family):
+            pass
+    except OSError as error:
+        raise OptionError(
+            f"--host {host}: cannot listen there ({error.strerror or error}); expected an address "
+            "of this machine"
+        ) from None
+    # viser has no option for the origins that it answers.
+    plain = websockets.serve
+
+    def serve(*places: Any, process_request: Callable[..., Any], **options: Any) -> Any:
+        def answer(connection: Any, request: Any) -> Any:
+            origin, asked = (request.headers.get(key) for key in ("Origin", "Host"))
+            if may_read(origin, asked, host):
+                return process_request(connection, request)
+            return connection.respond(403, "a page from elsewhere may not read this run\n")
+
+        return plain(*places, process_request=answer, **options)
+
+    # viser prints where it listens; the command that starts it says more.
+    with redirect_stdout(io.StringIO()), patch.object(websockets, "serve", serve):
+        server = Server(host=host, port=port, label=title, verbose=False)
+    server.gui.configure_theme(show_logo=False, show_share_button=False)
+    return server
+
+
+def may_read(origin: str | None, asked: str | None, host: str) -> bool:
+    """Whether the page that sends a request may read a run.
+
+    Browsers let any page open a WebSocket to any machine, and name the page in the Origin, None
+    where no page asks. ``asked`` is the address as the request has it, ``host`` where the server
+    listens.
+    """
+    if origin is None:
+        return True
+    # On loopback the name that was asked may be another's, who lets it lead to this machine.
+    if is_loopback(host):
+        return LOCAL_PAGE.fullmatch(origin) is not None
+    return urlsplit(origin).netloc == asked
+
+
+def is_loopback(host: str) -> bool:
+    """Whether an address to listen at is reached from this machine alone."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def address_of(host: str, port: int) -> str:
+    """The address of a page, to type into a browser."""
+    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"

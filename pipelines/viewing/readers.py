@@ -1,7 +1,8 @@
-"""Meshes and clouds in PLY, GLB and OBJ, read through trimesh under the guards of untrusted files.
+"""Meshes and clouds in PLY, GLB, OBJ and USD, read under the guards of untrusted files.
 
 trimesh believes a header's counts, makes zeros for arrays that a GLB claims and does not hold, and
-copies a mesh as often as a GLB's nodes name it.
+copies a mesh as often as a GLB's nodes name it. OpenUSD ends its process on some damaged files: it
+reads in a child process.
 """
 
 from __future__ import annotations
@@ -13,9 +14,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gvtools.errors import MemoryFileError
+from gvtools.optional import require
 from gvtools.ply import read_header
+from gvtools.sandbox import Item, ReaderError, read_apart
 from gvtools.untrusted import PIXEL_BYTES, PIXEL_RATIO, parse_json, read_bytes
 
 if TYPE_CHECKING:
@@ -24,6 +28,8 @@ if TYPE_CHECKING:
 GLB, JSON = b"glTF", b"JSON"
 # What a vertex of a GLB takes in RAM, and how much there may be beside twice the file.
 VERTEX_BYTES, SPARE_BYTES = 128, 96 << 20
+# Of points without a colour.
+GREY = 160
 
 
 def load_mesh(path: Path) -> trimesh.Trimesh | trimesh.PointCloud:
@@ -114,3 +120,48 @@ def _check_glb(path: Path, data: bytes) -> None:
         raise MemoryFileError(
             f"{path}: no GLB of meshes or points ({error}); the file is damaged; save it again"
         ) from None
+
+
+def read_usd(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """(N, 3) positions and colours of all UsdGeom.Points, in the file's frame."""
+    require("pxr", extra="export", purpose=f"{path}: {path.suffix}")
+    try:
+        parts = [arrays for _, arrays in read_apart(f"{__name__}:usd_points", path)]
+        positions, colors = (
+            np.concatenate([part[name] for part in parts]) for name in ("positions", "colors")
+        )
+        return positions, colors
+    except (ReaderError, OSError, ValueError, KeyError):
+        raise MemoryFileError(
+            f"{path}: no USD with UsdGeom.Points, or one that is damaged or names other files; "
+            "expected a file as gvtools export writes it; export it again"
+        ) from None
+
+
+def usd_points(path: Path) -> Iterator[Item]:
+    """Positions and colours of each UsdGeom.Points, for ``read_apart``."""
+    from pxr import Sdf, Usd, UsdGeom
+
+    yield {}, {}
+    layer = Sdf.Layer.OpenAsAnonymous(str(path))
+    if layer is None or layer.GetCompositionAssetDependencies():
+        raise ValueError("no layer of its own")
+    cache = UsdGeom.XformCache()
+    # The stage has to outlive its prims.
+    stage = Usd.Stage.Open(layer)
+    for prim in stage.Traverse():
+        if not prim.IsA(UsdGeom.Points):
+            continue
+        local = np.asarray(UsdGeom.Points(prim).GetPointsAttr().Get(), np.float64).reshape(-1, 3)
+        matrix = np.array(cache.GetLocalToWorldTransform(prim))
+        color = UsdGeom.Gprim(prim).GetDisplayColorAttr().Get()
+        linear = np.full((1, 3), GREY / 255) if color is None else np.asarray(color, np.float64)
+        colors = np.broadcast_to(_srgb(linear), local.shape)
+        yield {}, {"positions": local @ matrix[:3, :3] + matrix[3, :3], "colors": colors}
+
+
+def _srgb(linear: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """Linear light as bytes of sRGB."""
+    linear = np.clip(linear, 0, 1)
+    curved = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    return np.rint(255 * curved).astype(np.uint8)

@@ -1,1 +1,0 @@
-"""A window on a run, and pictures of it without a display."""
