@@ -7,12 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from data_sets import (
-    mini_colmap,
-    mini_nerfstudio,
-    mini_realestate10k,
-    mini_stereo_benchmarks,
-)
+from data_sets import mini_captures, mini_mvs, mini_reconstructed
 from data_sets.miniature import compare, layout_named
 from data_sets.miniature import read_miniature as read
 from data_sets.room_frames import room_frames
@@ -32,7 +27,7 @@ def messages(scene: Scene) -> str:
 
 
 def test_realestate10k_intrinsics_are_shares_of_whatever_size_frames_have(tmp_path: Path) -> None:
-    expected = mini_realestate10k.write_frames(tmp_path)
+    expected = mini_captures.write_frames(tmp_path)
     for path in tmp_path.glob("frames/*/*/*.png"):
         Image.open(path).resize((32, 24)).save(path)
     scene = read("realestate10k", tmp_path, expected.scene)
@@ -42,7 +37,7 @@ def test_realestate10k_intrinsics_are_shares_of_whatever_size_frames_have(tmp_pa
 
 
 def test_realestate10k_takes_the_video_frame_nearest_to_a_time_stamp(tmp_path: Path) -> None:
-    expected = mini_realestate10k.write_video(tmp_path)
+    expected = mini_captures.write_video(tmp_path)
     video = next(tmp_path.glob("videos/*"))
     assert expected.rgb is not None
     for seconds, number in ((0.2, 0), (0.24, 0), (0.16, 0), (2.249, 2), (3.151, 3)):
@@ -53,7 +48,7 @@ def test_realestate10k_takes_the_video_frame_nearest_to_a_time_stamp(tmp_path: P
 
 def test_realestate10k_frames_that_a_cut_video_lacks_are_refused(tmp_path: Path) -> None:
     """Its head still tells the whole length; no other frame may stand for a missing one."""
-    expected = mini_realestate10k.write_video(tmp_path)
+    expected = mini_captures.write_video(tmp_path)
     video = next(tmp_path.glob("videos/*"))
     content = video.read_bytes()
     video.write_bytes(content[: len(content) // 2])
@@ -65,7 +60,7 @@ def test_realestate10k_frames_that_a_cut_video_lacks_are_refused(tmp_path: Path)
 
 
 def test_realestate10k_frames_past_the_videos_end_are_left_out(tmp_path: Path) -> None:
-    expected = mini_realestate10k.write_video(tmp_path)
+    expected = mini_captures.write_video(tmp_path)
     path = next(tmp_path.glob("train/*.txt"))
     late = [line.split() for line in path.read_text().splitlines()[1:3]]
     for words in late:
@@ -84,7 +79,7 @@ def test_realestate10k_frames_past_the_videos_end_are_left_out(tmp_path: Path) -
 
 
 def test_mipnerf360_reads_the_largest_pictures_and_others_on_request(tmp_path: Path) -> None:
-    expected = mini_colmap.write_mipnerf360(tmp_path)
+    expected = mini_reconstructed.write_mipnerf360(tmp_path)
     layout = layout_named("mipnerf360")
     tiny = tmp_path / "garden" / "images_8"
     tiny.mkdir()
@@ -102,7 +97,7 @@ def test_mipnerf360_reads_the_largest_pictures_and_others_on_request(tmp_path: P
 
 
 def test_mipnerf360_detections_move_with_the_intrinsics(tmp_path: Path) -> None:
-    mini_colmap.write_mipnerf360(tmp_path)
+    mini_reconstructed.write_mipnerf360(tmp_path)
     scene = read("mipnerf360", tmp_path, "garden")
     assert scene.points is not None
     assert len(scene.points.xy) > 100
@@ -113,7 +108,7 @@ def test_mipnerf360_detections_move_with_the_intrinsics(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("share", [0, 0.5])
 def test_arrays_that_were_cut_off_are_named(tmp_path: Path, share: float) -> None:
-    writers = {"llff": mini_colmap.write_llff, "dtu": mini_stereo_benchmarks.write_dtu_idr}
+    writers = {"llff": mini_reconstructed.write_llff, "dtu": mini_mvs.write_dtu_idr}
     for layout, write in writers.items():
         expected = write(tmp_path / layout)
         path = next((tmp_path / layout).rglob("*.np[yz]"))
@@ -124,7 +119,7 @@ def test_arrays_that_were_cut_off_are_named(tmp_path: Path, share: float) -> Non
 
 
 def test_llff_does_not_guess_which_picture_a_row_is_of(tmp_path: Path) -> None:
-    expected = mini_colmap.write_llff(tmp_path)
+    expected = mini_reconstructed.write_llff(tmp_path)
     folder = tmp_path / "fern" / "images_4"
     for i, path in enumerate(sorted(folder.iterdir())):
         path.rename(folder / f"IMG_{4026 + i}.JPG")
@@ -136,10 +131,10 @@ def test_llff_does_not_guess_which_picture_a_row_is_of(tmp_path: Path) -> None:
     with pytest.raises(ProjectError, match="3 pictures for 4 poses"):
         read("llff", tmp_path, "fern")
     # The model beside it names the pictures.
-    full = mini_colmap.frames_with_copy()[0]
+    full = mini_reconstructed.frames_with_copy()[0]
     names = tuple(f"IMG_{4026 + i}.JPG" for i in range(4))
-    mini_colmap.write_colmap(
-        tmp_path / "fern" / "sparse" / "0", mini_colmap.replace(full, names=names)
+    mini_reconstructed.write_colmap(
+        tmp_path / "fern" / "sparse" / "0", mini_reconstructed.replace(full, names=names)
     )
     scene = read("llff", tmp_path, "fern")
     assert scene.names == (names[0], *names[2:])
@@ -149,7 +144,7 @@ def test_llff_does_not_guess_which_picture_a_row_is_of(tmp_path: Path) -> None:
 
 
 def test_dl3dv_copies_of_another_size_scale_the_files_intrinsics(tmp_path: Path) -> None:
-    expected = mini_nerfstudio.write_dl3dv_960p(tmp_path)
+    expected = mini_reconstructed.write_dl3dv_960p(tmp_path)
     home = tmp_path / expected.scene
     shutil.move(home / "images_4", home / "images_8")
     for path in (home / "images_8").iterdir():
@@ -168,7 +163,7 @@ def test_dl3dv_copies_of_another_size_scale_the_files_intrinsics(tmp_path: Path)
 
 
 def test_dtu_reads_one_light_and_prefers_the_fourth(tmp_path: Path) -> None:
-    expected = mini_stereo_benchmarks.write_dtu_training(tmp_path)
+    expected = mini_mvs.write_dtu_training(tmp_path)
     folder = tmp_path / expected.scene
     for path in list(folder.iterdir()):
         Image.fromarray(np.asarray(Image.open(path)) // 2).save(
@@ -191,14 +186,14 @@ def test_dtu_projection_matrices_of_any_factor_are_split() -> None:
 
 
 def test_tanks_trajectory_without_intrinsics_is_refused(tmp_path: Path) -> None:
-    expected = mini_stereo_benchmarks.write_tanks_official(tmp_path)
+    expected = mini_mvs.write_tanks_official(tmp_path)
     (tmp_path / expected.scene / "intrinsics.txt").unlink()
     with pytest.raises(ProjectError, match="which the data set does not publish"):
         read("tanks_and_temples", tmp_path, expected.scene)
 
 
 def test_eth3d_depth_needs_the_original_calibration(tmp_path: Path) -> None:
-    expected = mini_stereo_benchmarks.write_eth3d_undistorted(tmp_path)
+    expected = mini_reconstructed.write_eth3d_undistorted(tmp_path)
     shutil.rmtree(tmp_path / expected.scene / "dslr_calibration_jpg")
     scene = read("eth3d", tmp_path, expected.scene)
     assert not any(view.has_depth for view in scene)
@@ -207,7 +202,7 @@ def test_eth3d_depth_needs_the_original_calibration(tmp_path: Path) -> None:
 
 def test_eth3d_depth_is_not_that_of_the_same_pixel(tmp_path: Path) -> None:
     """Taken without the lens, the original picture's map would be another scene's."""
-    expected = mini_stereo_benchmarks.write_eth3d_undistorted(tmp_path)
+    expected = mini_reconstructed.write_eth3d_undistorted(tmp_path)
     raw = np.fromfile(next(tmp_path.glob("courtyard/ground_truth_depth/*/*")), "<f4")
     naive = np.asarray(
         Image.fromarray(raw.reshape(60, 80)).resize((64, 48), Image.Resampling.NEAREST)

@@ -10,15 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from data_sets import (
-    mini_aria,
-    mini_arkitscenes,
-    mini_hypersim,
-    mini_nerfstudio,
-    mini_scannet,
-    mini_scannetpp,
-    mini_waymo,
-)
+from data_sets import mini_aria, mini_captures, mini_hypersim, mini_reconstructed, mini_waymo
 from data_sets.aria_stand_in import projectaria_tools
 from data_sets.miniature import compare, layout_named
 from data_sets.miniature import read_miniature as read
@@ -41,7 +33,7 @@ def messages(scene: Scene) -> str:
 
 
 def test_mapfree_poses_that_are_withheld_are_left_out(tmp_path: Path) -> None:
-    expected = mini_nerfstudio.write_mapfree(tmp_path)
+    expected = mini_captures.write_mapfree(tmp_path)
     path = tmp_path / expected.scene / "poses.txt"
     lines = path.read_text().splitlines()
     lines[3] = f"{lines[3].split()[0]} 0 0 0 0 0 0 0"
@@ -55,7 +47,7 @@ def test_mapfree_poses_that_are_withheld_are_left_out(tmp_path: Path) -> None:
 
 
 def test_a_pose_without_numbers_leaves_its_frame_out(tmp_path: Path) -> None:
-    expected = mini_nerfstudio.write_mapfree(tmp_path)
+    expected = mini_captures.write_mapfree(tmp_path)
     path = tmp_path / expected.scene / "poses.txt"
     lines = path.read_text().splitlines()
     lines[3] = f"{lines[3].split()[0]} nan nan nan nan 0 0 0"
@@ -88,7 +80,7 @@ def test_hypersim_tables_that_were_cut_off_are_named(tmp_path: Path, text: str) 
 
 @pytest.mark.parametrize("value", ["-inf", "nan", "2"])
 def test_scannet_frames_that_the_tracker_lost_are_left_out(tmp_path: Path, value: str) -> None:
-    expected = mini_scannet.write_exported(tmp_path)
+    expected = mini_captures.write_exported(tmp_path)
     pose = tmp_path / expected.scene / "pose" / "1.txt"
     pose.write_text("\n".join([" ".join([value] * 4)] * 4))
     scene = read("scannet", tmp_path, expected.scene)
@@ -97,7 +89,7 @@ def test_scannet_frames_that_the_tracker_lost_are_left_out(tmp_path: Path, value
 
 
 def test_scannet_stream_that_ends_early_gives_its_whole_frames(tmp_path: Path) -> None:
-    expected = mini_scannet.write_sens(tmp_path, keep=0.6)
+    expected = mini_captures.write_sens(tmp_path, keep=0.6)
     scene = read("scannet", tmp_path, expected.scene)
     assert scene.names == ("0", "1")
     assert "2 of 4 frames are past the end of scene0000_00.sens: dropped" in messages(scene)
@@ -105,7 +97,7 @@ def test_scannet_stream_that_ends_early_gives_its_whole_frames(tmp_path: Path) -
 
 
 def test_scannet_depth_camera_is_registered_into_the_colour_camera(tmp_path: Path) -> None:
-    expected = mini_scannet.write_exported(tmp_path)
+    expected = mini_captures.write_exported(tmp_path)
     folder = tmp_path / expected.scene
     K = np.loadtxt(folder / "intrinsic" / "intrinsic_depth.txt")
     K[0, 2] += 8  # the depth camera sees 8 pixels more on the left
@@ -122,7 +114,7 @@ def test_scannet_depth_camera_is_registered_into_the_colour_camera(tmp_path: Pat
 
 
 def test_arkitscenes_high_resolution_pair_has_its_own_intrinsics(tmp_path: Path) -> None:
-    expected = mini_arkitscenes.write(tmp_path)
+    expected = mini_captures.write_arkitscenes(tmp_path)
     layout = layout_named("arkitscenes")
     assert layout.variants(tmp_path) == (f"{expected.scene}/wide",)
     scene = read("arkitscenes", tmp_path, f"{expected.scene}/wide")
@@ -140,17 +132,19 @@ def test_arkitscenes_high_resolution_pair_has_its_own_intrinsics(tmp_path: Path)
 def test_arkitscenes_frames_between_poses_are_interpolated_and_others_left_out(
     tmp_path: Path,
 ) -> None:
-    expected = mini_arkitscenes.write(tmp_path)
+    expected = mini_captures.write_arkitscenes(tmp_path)
     folder = tmp_path / expected.scene
     for kind, suffix in (("lowres_wide", "png"), ("lowres_wide_intrinsics", "pincam")):
         for time in (6845.857, 6846.5):
             first = next(iter(sorted((folder / kind).iterdir())))
-            shutil.copy(first, folder / kind / f"{mini_arkitscenes.VIDEO}_{time:.3f}.{suffix}")
+            shutil.copy(
+                first, folder / kind / f"{mini_captures.ARKITSCENES_VIDEO}_{time:.3f}.{suffix}"
+            )
     scene = read("arkitscenes", tmp_path, expected.scene)
     assert len(scene) == 5
     assert "1 of 6 frames have no pose: dropped" in messages(scene)
     assert "1 frames have an interpolated pose" in messages(scene)
-    between = scene[f"{mini_arkitscenes.VIDEO}_6845.857.png"].camera
+    between = scene[f"{mini_captures.ARKITSCENES_VIDEO}_6845.857.png"].camera
     middle = expected.cameras.centers[:2].mean(axis=0)
     # Stamps in the trajectory are 0.4 ms late: a hundredth of the way to the middle.
     assert np.linalg.norm(between.centers[0] - middle) < 0.01 * np.linalg.norm(
@@ -175,7 +169,7 @@ def test_poses_far_apart_are_not_interpolated() -> None:
 
 
 def test_arkitscenes_tells_where_the_sky_is(tmp_path: Path) -> None:
-    expected = mini_arkitscenes.write(tmp_path)
+    expected = mini_captures.write_arkitscenes(tmp_path)
     assert "sky" not in messages(read("arkitscenes", tmp_path, expected.scene))
     from scipy.spatial.transform import Rotation
 
@@ -257,10 +251,10 @@ def test_hypersim_tone_curve_is_that_of_the_data_sets_tools(tmp_path: Path) -> N
 
 
 def test_scannetpp_masks_follow_the_undistortion(tmp_path: Path) -> None:
-    expected = mini_scannetpp.write_fisheye(tmp_path)
+    expected = mini_reconstructed.write_fisheye(tmp_path)
     mask = read("scannetpp", tmp_path, expected.scene).views[0].load().mask
     assert mask is not None
-    lens = mini_scannetpp.fisheye()
+    lens = mini_reconstructed.fisheye_scannetpp()
     # The middle of the masked part of the fisheye picture, in the pinhole's pixels.
     ray = np.append(np.asarray(lens.cam_from_img(np.array([[34.5, 25.0]])))[0], 1)
     x, y, _ = expected.cameras.K[0] @ ray
@@ -269,14 +263,14 @@ def test_scannetpp_masks_follow_the_undistortion(tmp_path: Path) -> None:
 
 
 def test_scannetpp_poses_are_those_of_the_scan_and_not_of_nerfstudio(tmp_path: Path) -> None:
-    expected = mini_scannetpp.write_undistorted(tmp_path)
+    expected = mini_reconstructed.write_undistorted(tmp_path)
     shutil.rmtree(tmp_path / expected.scene / "colmap")
     with pytest.raises(ProjectError, match="no COLMAP model"):
         read("scannetpp", tmp_path, expected.scene)
 
 
 def test_scannetpp_says_how_to_extract_the_iphones_frames(tmp_path: Path) -> None:
-    expected = mini_scannetpp.write_iphone(tmp_path)
+    expected = mini_reconstructed.write_iphone(tmp_path)
     shutil.rmtree(tmp_path / expected.scene / "rgb")
     with pytest.raises(ProjectError, match="extract it from"):
         read("scannetpp", tmp_path, expected.scene)

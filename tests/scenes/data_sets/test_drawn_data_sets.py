@@ -14,16 +14,9 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from data_sets import (
-    mini_gta_sfm,
-    mini_mvs_synth,
-    mini_omniworld,
-    mini_spring,
-    mini_tartanair,
-    mini_virtual_kitti,
-)
-from data_sets.drawn_frames import drawn_frames
+from data_sets import mini_synthetic
 from data_sets.miniature import Expected, layout_named, read_miniature
+from data_sets.room_frames import drawn_frames
 from PIL import Image
 
 from gvtools.errors import OptionError, ProjectError
@@ -42,13 +35,13 @@ from gvtools.scenes.photographs import first_size
 from gvtools.scenes.scene import Scene
 
 WRITERS = {
-    "gta_sfm": mini_gta_sfm.write,
-    "mvs_synth": mini_mvs_synth.write,
-    "omniworld": mini_omniworld.write,
-    "spring": mini_spring.write,
-    "tartanair": mini_tartanair.write_first,
-    "tartanair_v2": mini_tartanair.write_second,
-    "virtual_kitti": mini_virtual_kitti.write,
+    "gta_sfm": mini_synthetic.write_gta_sfm,
+    "mvs_synth": mini_synthetic.write_mvs_synth,
+    "omniworld": mini_synthetic.write_omniworld,
+    "spring": mini_synthetic.write_spring,
+    "tartanair": mini_synthetic.write_first,
+    "tartanair_v2": mini_synthetic.write_second,
+    "virtual_kitti": mini_synthetic.write_virtual_kitti,
 }
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from data_sets.drawn_frames import drawn_frames
+from data_sets.room_frames import drawn_frames
 from PIL import Image
 
 FRAMES = 10_000
