@@ -18,7 +18,7 @@ from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.runs.memory_file import load_memory
 from gvtools.runs.run import RunTarget, load_run
 from gvtools.scenes.scene import View
-from pipelines.blocks.write import read_blocks
+from pipelines.blocks.split import read_blocks
 
 COLUMNS = ("positions", "colors", "confidence", "spacing", "round", "view", "level")
 # Share of what a view sees, and distance from a face as a share of the cameras' extent.

@@ -19,8 +19,7 @@ from gvtools.completers.geoverse.config import named
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.options import OptimizerOptions
-from pipelines.bench.live_bytes import alone, predicted
-from pipelines.bench.memory import pass_peaks, step_peaks
+from pipelines.bench.memory import alone, pass_peaks, predicted, step_peaks
 from pipelines.bench.random_model import random_views
 
 CASES = ("pass", "denoiser", "denoiser, recompute")

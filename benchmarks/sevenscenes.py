@@ -31,9 +31,7 @@ from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory
 from gvtools.memory.store.views import PointSet
 from gvtools.scenes.project import open_project
 from gvtools.scenes.selection import select
-from pipelines.bench import fuse as bench_fuse
-from pipelines.bench import open3d_peers
-from pipelines.bench import splat as bench_splat
+from pipelines.bench import open3d_peers, side_by_side
 from pipelines.bench.side_by_side import alternate
 from pipelines.commands.bench import report
 from pipelines.console import Console
@@ -75,7 +73,7 @@ def main() -> None:
     if "quality" in args.only:
         figures["quality"] = quality(context, shots(scene, "every:2+1"), console)
     if "fuse" in args.only:
-        rows = bench_fuse.compare_fusing(
+        rows = side_by_side.compare_fusing(
             built(context, VOXEL),
             [(s.rgb, s.depth, s.camera) for s in shots(scene, "every:2+1")[: args.repeat + 1]],
             repeat=args.repeat,
@@ -86,13 +84,13 @@ def main() -> None:
         rows = [
             row
             for count in (1_000_000, 4_000_000)
-            for row in bench_splat.one_pixel_rows(count, repeat=args.repeat)
+            for row in side_by_side.one_pixel_rows(count, repeat=args.repeat)
         ]
         target = shots(scene, "first:2")[1].camera
         side = int(min(target.height[0], 504))
         window = target.cropped(0, 0, width=side, height=side)
         points = built(context, VOXEL).columns.positions
-        rows += bench_splat.compare_one_pixel(points, window, repeat=args.repeat)
+        rows += side_by_side.compare_one_pixel(points, window, repeat=args.repeat)
         report(rows, console, None)
         figures["pixel"] = [row.to_dict() for row in rows]
     if "tenfold" in args.only:

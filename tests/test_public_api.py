@@ -55,7 +55,7 @@ DOCTESTED = (
     "gvtools.trajectory_files",
     "gvtools.untrusted",
     "pipelines.blocks.appearance",
-    "pipelines.blocks.cells",
+    "pipelines.blocks.block",
     "pipelines.commands.options",
     "pipelines.data_sets.log_histogram",
 )

@@ -2,23 +2,198 @@
 
 from __future__ import annotations
 
+import gc
 import os
+import resource
+import statistics
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import torch
+from torch.utils.flop_counter import FlopCounterMode, sdpa_flop_count
 
+from gvtools.completers.geoverse.conditioning import ViewBatch
 from gvtools.completers.geoverse.config import GeoVerseConfig
 from gvtools.completers.geoverse.flow import interval_bounds
-from gvtools.completers.geoverse.model import DECODE, GeoVerse
+from gvtools.completers.geoverse.model import DECODE, DECODING, LEVEL0, LEVEL1, GeoVerse, no_clock
+from gvtools.completers.geoverse.video_prior import VideoFeatures
 from gvtools.completers.geoverse.weights import from_pretrained
-from gvtools.networks.compute import name_of
+from gvtools.networks.compute import autocast, name_of
 from pipelines.bench.options import CompleteOptions
 from pipelines.bench.random_model import random_features, random_model, random_video, random_views
-from pipelines.bench.stage_clock import PEAK, forget_peak, peak_bytes, total, within
-from pipelines.bench.timing import BETWEEN, PASS, TimedPass, Times
 
 if TYPE_CHECKING:
     from pipelines.console import Console
+
+
+# Before the name of a part of the decoding.
+INSIDE = f"{DECODE}: "
+
+
+class StageClock:
+    """Given to a model as its clock, it notes by how much ``total`` grows within each stage.
+
+    Attributes:
+        entries: (stage, growth) in the order in which stages began.
+    """
+
+    def __init__(self, total: Callable[[], float]) -> None:
+        self.total = total
+        self.entries: list[tuple[str, float]] = []
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        """Note one stage."""
+        place = len(self.entries)
+        self.entries.append((stage, 0.0))
+        before = self.total()
+        yield
+        self.entries[place] = (stage, self.total() - before)
+
+    def rows(self, steps: Mapping[str, int]) -> dict[str, float]:
+        """Growth by row of the stage table; of several evaluations a step, their sum."""
+        found: dict[str, list[float]] = {}
+        for stage, growth in self.entries:
+            found.setdefault(stage, []).append(growth)
+        rows = {}
+        for stage, values in found.items():
+            if stage not in steps:
+                rows[f"{INSIDE}{stage}" if stage in DECODING else stage] = sum(values)
+                continue
+            share = len(values) // steps[stage]
+            for step in range(steps[stage]):
+                rows[f"{stage} {step + 1}"] = sum(values[step * share : (step + 1) * share])
+        return rows
+
+
+def within(name: str) -> bool:
+    """A row is a part of another one."""
+    return name.startswith(INSIDE)
+
+
+def total(rows: Mapping[str, float]) -> float:
+    """Of all rows; what is within another row is not counted twice."""
+    return sum(value for name, value in rows.items() if not within(name))
+
+
+def seconds(device: torch.device) -> Callable[[], float]:
+    """Wall time in s, after all that was asked of the device is done."""
+
+    def now() -> float:
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
+        return time.perf_counter()
+
+    return now
+
+
+# What ``peak_bytes`` is, by the device's type.
+PEAK = {
+    "cuda": "what tensors held on the device, weights included",
+    "cpu": "the most that the process ever held",
+}
+
+
+def forget_peak(device: torch.device) -> None:
+    """Before what ``peak_bytes`` is asked for."""
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)
+
+
+def peak_bytes(device: torch.device) -> int:
+    """See ``PEAK``."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+
+PASS = "pass"
+BETWEEN = "between stages"
+# torch counts attention on a GPU, not the kernel that it takes on a CPU.
+CPU_ATTENTION = torch.ops.aten._scaled_dot_product_flash_attention_for_cpu
+
+
+@dataclass(frozen=True)
+class Times:
+    """Seconds by row of the stage table, a whole pass under ``PASS``."""
+
+    median: dict[str, float]  # over the passes
+    least: dict[str, float]  # likewise
+
+
+class TimedPass:
+    """A pass of a model over fixed views."""
+
+    def __init__(
+        self,
+        model: GeoVerse,  # on ``device``
+        batch: ViewBatch,
+        *,
+        bounds: Sequence[float],  # of the level-1 steps
+        cascade_bounds: Sequence[float],
+        dtype: torch.dtype = torch.float32,
+        video: VideoFeatures | None = None,
+    ) -> None:
+        self.model, self.batch, self.video = model, batch, video
+        self.bounds, self.cascade_bounds = tuple(bounds), tuple(cascade_bounds)
+        self.dtype = dtype
+        self.device = batch.images.device
+        self.now = seconds(self.device)
+        # How often the stages with numbered steps are stepped through.
+        self.steps = {LEVEL1: len(self.bounds) - 1, LEVEL0: len(self.cascade_bounds) - 1}
+
+    def precision(self) -> AbstractContextManager[Any]:
+        """Autocast where products are rounded."""
+        return autocast(self.device, self.dtype)
+
+    def run(self, clock: StageClock | None = None) -> float:
+        """One pass; the seconds it took."""
+        self.model.clock = clock or no_clock
+        start = self.now()
+        with self.precision():
+            self.model.generate(
+                self.batch,
+                bounds=self.bounds,
+                cascade_bounds=self.cascade_bounds,
+                video=self.video,
+            )
+        return self.now() - start
+
+    def flops(self) -> dict[str, float]:
+        """FLOPs by row of the stage table, counted in one pass.
+
+        A multiplication and an addition count as two. Products, convolutions and attention are
+        counted; what is done to single numbers (norms, activations, gates) is not.
+        """
+        attention = {CPU_ATTENTION: _attention_flops}
+        with FlopCounterMode(display=False, custom_mapping=attention) as counter:
+            clock = StageClock(counter.get_total_flops)
+            self.run(clock)
+        return clock.rows(self.steps)
+
+    def times(self, repeat: int) -> Times:
+        """Passes with a clock; on a GPU, where the clock waits for the device, also without."""
+        found: dict[str, list[float]] = {}
+        for _ in range(repeat):
+            gc.collect()
+            clock = StageClock(self.now)
+            whole = self.run(clock)
+            rows = clock.rows(self.steps)
+            rows[BETWEEN] = whole - total(rows)
+            rows[PASS] = self.run() if self.device.type == "cuda" else whole
+            for name, spent in rows.items():
+                found.setdefault(name, []).append(spent)
+        return Times(
+            {name: statistics.median(values) for name, values in found.items()},
+            {name: min(values) for name, values in found.items()},
+        )
+
+
+def _attention_flops(q: torch.Size, k: torch.Size, v: torch.Size, *_: Any, **options: Any) -> int:
+    return int(sdpa_flop_count(q, k, v))
 
 
 def complete_figures(options: CompleteOptions) -> dict[str, Any]:
@@ -93,12 +268,7 @@ def _model(options: CompleteOptions, config: GeoVerseConfig) -> GeoVerse:
 
 
 def stage_rows(counts: dict[str, float], times: Times) -> list[dict[str, Any]]:
-    """The stage table, the whole pass last.
-
-    Args:
-        counts: FLOPs by row.
-        times: of the same rows.
-    """
+    """The stage table, the whole pass last."""
     counts = counts | {PASS: total(counts)}
     stages = total({name: s for name, s in times.median.items() if name != PASS})
     rows: list[dict[str, Any]] = []

@@ -1,21 +1,32 @@
 """``gvtools bench complete --memory``: the peak memory of a pass and of a training step, predicted.
 
-The library's own code runs on tensors without numbers, whose bytes are counted (``live_bytes``).
-Figures are of one device that holds everything; what its driver takes, and what an allocator loses
-between tensors, comes on top.
+The library's own code runs on tensors without numbers (torch's fake ones: shapes, types and
+lifetimes, but no memory), whose bytes are counted. Figures are of one device that holds everything;
+what its driver takes, and what an allocator loses between tensors, comes on top.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+import multiprocessing
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
+from torch import Tensor, nn
+from torch._subclasses.fake_tensor import (
+    DataDependentOutputException,
+    DynamicOutputShapeException,
+    FakeTensorMode,
+)
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 
 from gvtools.completers.geoverse.conditioning import ViewBatch
 from gvtools.completers.geoverse.config import GeoVerseConfig
@@ -28,10 +39,140 @@ from gvtools.training.distributed import Processes, Replicated
 from gvtools.training.loop import Trainer
 from gvtools.training.options import DenoiserStageOptions, OptimizerOptions, ReflowStageOptions
 from gvtools.training.stages import DenoiserStage, ReflowStage, Stage
-from pipelines.bench.live_bytes import LiveBytes, alone, predicted
+from pipelines.bench.complete import INSIDE
 from pipelines.bench.options import CompleteOptions
 from pipelines.bench.random_model import random_video, random_views
-from pipelines.bench.stage_clock import INSIDE
+
+if TYPE_CHECKING:
+    from pipelines.console import Console
+
+
+_ATEN = torch.ops.aten
+# Of a peak, by which the next one is larger at least; 0 would look through everything at each step.
+NOTICED = 0.002
+_expired = torch.UntypedStorage._expired
+_forget = torch.UntypedStorage._free_weak_ref
+
+
+class LiveBytes(TorchDispatchMode):
+    """Counts the bytes of tensors created within it; views of one memory count once.
+
+    What a kernel takes for itself and gives back before it returns is not seen. A new peak is
+    noticed from ``NOTICED`` above the last one on: whether memory is still held has to be asked for
+    every piece of it.
+    """
+
+    def __init__(self, known: Iterable[nn.Module] = ()) -> None:
+        super().__init__()
+        # Bytes, and torch's own weak reference, of every memory by its address.
+        self._held: dict[int, tuple[int, Any]] = {}
+        self._known = {
+            tensor.untyped_storage()._cdata
+            for module in known
+            for tensor in (*module.parameters(), *module.buffers())
+        }
+        # At most what is held: what was given back since the last look is still in it.
+        self._most = self._peak = 0
+
+    def __torch_dispatch__(  # noqa: PLR0917
+        self, func: Any, types: Any, args: Any = (), kwargs: Any = None
+    ) -> Any:
+        """Run an operation and count what it created."""
+        kwargs = kwargs or {}
+        try:
+            out = func(*args, **kwargs)
+        except (DataDependentOutputException, DynamicOutputShapeException):
+            out = _supposed(func, *args, **kwargs)
+        for leaf in tree_leaves(out):
+            if isinstance(leaf, Tensor):
+                self._hold(leaf)
+        if self._most > self._peak * (1 + NOTICED):
+            self._peak = max(self._peak, self.live)
+        return out
+
+    @property
+    def live(self) -> int:
+        """Bytes held now."""
+        gone = [key for key, (_, weak) in self._held.items() if _expired(weak)]
+        for key in gone:
+            _forget(self._held.pop(key)[1])
+        self._most = sum(size for size, _ in self._held.values())
+        return self._most
+
+    @property
+    def peak(self) -> int:
+        """The most bytes that were held since ``forget_peak``."""
+        return self._peak
+
+    @peak.setter
+    def peak(self, value: int) -> None:
+        self._peak = value
+
+    def forget_peak(self) -> None:
+        """Begin a new peak at what is held now."""
+        self._peak = self.live
+
+    def __exit__(self, *error: Any) -> None:
+        """Let go of what was counted; ``peak`` stays."""
+        super().__exit__(*error)
+        for _, weak in self._held.values():
+            _forget(weak)
+        self._held.clear()
+        self._most = 0
+
+    def _hold(self, tensor: Tensor) -> None:
+        storage = tensor.untyped_storage()
+        key = storage._cdata
+        if key in self._known:
+            return
+        if key in self._held:
+            # The address may be that of memory which was given back: torch's reference tells.
+            if not _expired(self._held[key][1]):
+                return
+            size, weak = self._held.pop(key)
+            _forget(weak)
+            self._most -= size
+        self._held[key] = (storage.nbytes(), storage._weak_ref())
+        self._most += storage.nbytes()
+
+
+@contextmanager
+def predicted() -> Iterator[None]:
+    """Within the block tensors have no numbers; models and views have to be made in it.
+
+    For a process that does nothing else (``alone``): torch 2.13 has crashed where a process went on
+    after training steps without numbers.
+    """
+    with FakeTensorMode(allow_non_fake_inputs=True), warnings.catch_warnings():
+        # torch copies such a tensor by a way that it warns of itself.
+        warnings.filterwarnings("ignore", "Accessing the data pointer of FakeTensor")
+        yield
+
+
+def alone(run: Callable[..., Any], *given: Any, **named: Any) -> Any:
+    """``run(*given, **named)`` in a process of its own; all of it has to be picklable."""
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, mp_context=context) as pool:
+        return pool.submit(run, *given, **named).result()
+
+
+def _supposed(func: Any, *args: Any, **kwargs: Any) -> Any:
+    """What an operation that depends on numbers gives in the ordinary, full case.
+
+    Checks pass and every view is informative: a truth is True, a number 0, all places are found.
+    """
+    if func is _ATEN._local_scalar_dense.default:
+        return True if args[0].dtype == torch.bool else 0.0
+    if func is _ATEN.nonzero.default:
+        return args[0].new_empty((args[0].numel(), args[0].ndim), dtype=torch.long)
+    if func is _ATEN.unique_dim.default:
+        index = args[0].new_empty(args[0].shape[args[1]], dtype=torch.long)
+        return args[0].narrow(args[1], 0, 1).clone(), index, index[:1].clone()
+    if func is _ATEN.index.Tensor and [index.dtype for index in args[1]] == [torch.bool]:
+        mask = args[1][0]
+        return args[0].new_empty((mask.numel(), *args[0].shape[mask.ndim :]))
+    raise NotImplementedError(f"{func} depends on numbers, and none are there")
+
 
 CPU = torch.device("cpu")
 FORWARD, BACKWARD, OPTIMISER = "forward", "backward", "optimiser"
@@ -46,9 +187,6 @@ STAGES: dict[str, tuple[type[Stage], Any]] = {
 
 class StagePeaks:
     """Given to a model as its clock, it notes the most bytes that were live within each stage.
-
-    Args:
-        live: counts them.
 
     Attributes:
         rows: bytes by stage; of several runs of a stage the most.
@@ -76,11 +214,7 @@ def pass_peaks(
 ) -> dict[str, int]:
     """Bytes beside the weights at the peak of each stage of a pass.
 
-    Args:
-        model: its video prior, where it needs one, attached.
-        batch: of the pass.
-        steps: of level 1 and of the cascade.
-        dtype: of products.
+    ``steps``: of level 1 and of the cascade.
     """
     shift = model.config.flow.shift
     networks = [] if model.video is None else _networks(model.video)
@@ -102,11 +236,7 @@ def step_peaks(
     Gradients, averages, the optimiser's moments and a teacher are among them; ``held`` is what
     stays between steps. Of two steps the second counts: the first makes the moments.
 
-    Args:
-        model: its video prior, where it needs one, attached.
-        batch: of the step.
-        optimizer: its options.
-        stage: "denoiser" or "reflow".
+    ``stage``: "denoiser" or "reflow".
     """
     networks = [] if model.video is None else _networks(model.video)
     with LiveBytes([model, *networks]) as live:
@@ -251,3 +381,79 @@ def _bytes(*modules: Any) -> int:
 
 def _prior_bytes(model: GeoVerse) -> int:
     return 0 if model.video is None else _bytes(*_networks(model.video))
+
+
+GB = 1e9
+
+
+def show_memory(figures: dict[str, Any], console: Console) -> None:
+    """Tables of a pass and of a training step in GB (10^9 bytes), and a line about the card."""
+    size = "x".join(map(str, figures["size"]))
+    console.line(
+        f"{figures['config']}, {figures['context']} + {figures['targets']} views of {size}, "
+        f"{figures['steps']} + {figures['cascade_steps']} steps, {figures['precision']}: "
+        "peak memory of a pass, GB"
+    )
+    for model in dict.fromkeys(row["model"] for row in figures["inference"]):
+        _show_pass(model, [r for r in figures["inference"] if r["model"] == model], console)
+    console.line(f"a training step of one sample, {figures['training_precision']}: peak memory, GB")
+    console.table(
+        ("stage", "video prior", "recompute", "weights", "lasting", *PARTS, "peak"),
+        [
+            (
+                row["stage"],
+                "yes" if row["model"] == WITH else "no",
+                "yes" if row["recompute"] else "no",
+                row["weights_bytes"] / GB,
+                row["lasting_bytes"] / GB,
+                *(row[f"{part}_bytes"] / GB for part in PARTS),
+                row["total_bytes"] / GB,
+            )
+            for row in figures["training"]
+        ],
+    )
+    if figures["card_gb"] is not None:
+        console.line(card_line(figures, figures["card_gb"]))
+
+
+PARTS = ("forward", "backward", "optimiser")
+
+
+def _show_pass(model: str, rows: list[dict[str, Any]], console: Console) -> None:
+    weights, prior = rows[0]["weights_bytes"] / GB, rows[0]["video_bytes"] / GB
+    beside = f" and {prior:.3g} of the prior's" if prior else ""
+    console.line(f"{model}: {weights:.3g} of weights{beside}")
+    columns = ("prior leaves", "prior stays") if prior else ("all",)
+    console.table(
+        ("stage", "activations", *columns),
+        [
+            (
+                row["stage"],
+                row["activation_bytes"] / GB,
+                row["total_bytes"] / GB,
+                *((row["total_bytes_video_stays"] / GB,) if prior else ()),
+            )
+            for row in rows
+        ],
+    )
+
+
+def card_line(figures: dict[str, Any], card: float) -> str:
+    """What fits a card of so many GB.
+
+    A card of N GB has N GiB: the 7 % above N 10^9 bytes are left to its driver and to what is lost
+    between tensors.
+    """
+    needs: dict[str, float] = {}
+    for row in figures["inference"]:
+        name = f"a pass {row['model']}"
+        needs[name] = max(needs.get(name, 0.0), row["total_bytes"] / GB)
+    for row in figures["training"]:
+        if row["recompute"]:
+            name = f"training {row['stage']} {row['model']} and with recompute"
+            needs[name] = row["total_bytes"] / GB
+    parts = (
+        f"{name} {'fits' if need <= card else 'does not fit'} ({need:.3g})"
+        for name, need in needs.items()
+    )
+    return f"a card of {card:g} GB: {'; '.join(parts)}"

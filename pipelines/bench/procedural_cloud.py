@@ -92,12 +92,7 @@ def layers_in_view(
 ) -> NDArray[np.float32]:
     """(N, 3) float32 points of wavy surfaces behind each other, all in view, in block order.
 
-    Args:
-        count: N.
-        camera: a batch of one; the points are spread evenly over its image.
-        seed: of where in the image they fall.
-        layers: surfaces, a scene unit apart.
-        block: edge of the cubes in whose order the points come, scene units.
+    ``block``: edge of the cubes in whose order the points come, scene units.
     """
     rng = np.random.default_rng(seed)
     width, height = int(camera.width[0]), int(camera.height[0])

@@ -1,9 +1,15 @@
-"""Gaussians that blocks fitted, joined: each block's where its cell is, equally exposed."""
+"""Gaussians that blocks fitted, joined: each block's where its cell is, equally exposed.
+
+A block's Gaussians were fitted together with those behind its faces, which a merge leaves out and
+replaces by another block's. The views that help other blocks see across faces: a short fit to them
+brings both sides together.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,28 +17,30 @@ from numpy.typing import NDArray
 from gvtools.appearance.appearance import Appearance
 from gvtools.appearance.blending import Blend
 from gvtools.appearance.exposures import Exposures
+from gvtools.appearance.fit_options import FitOptions
 from gvtools.appearance.gaussians import Gaussians
 from gvtools.appearance.splat.project_kernels import HARMONICS, LOG_SCALE, SH
 from gvtools.appearance.turning import turned
 from gvtools.memory.store.local_frame import LocalFrame
+from gvtools.view_selection import evenly_spread
 from pipelines.blocks.block import SceneBlock
+from pipelines.reconstruction.fitting import Fitted, fit_appearance
+
+if TYPE_CHECKING:
+    from pipelines.console import Console
+    from pipelines.reconstruction.plan import Plan
+
 
 Float64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class BlockAppearance:
-    """What a block's run fitted.
-
-    Attributes:
-        block: the block.
-        context: its run's context, in the order of the exposures.
-        appearance: its Gaussians.
-    """
+    """What a block's run fitted."""
 
     block: SceneBlock
-    context: tuple[str, ...]
-    appearance: Appearance
+    context: tuple[str, ...]  # its run's context, in the order of the exposures
+    appearance: Appearance  # its Gaussians
 
 
 def join_appearances(parts: Sequence[BlockAppearance], frame: LocalFrame) -> Appearance:
@@ -40,10 +48,6 @@ def join_appearances(parts: Sequence[BlockAppearance], frame: LocalFrame) -> App
 
     Of each block the Gaussians whose centres lie in its cell. Each block's brightness is relative
     to its own photographs; those that several blocks share tell how their scales differ.
-
-    Args:
-        parts: at least one.
-        frame: that the Gaussians are to be in.
     """
     gains = _centred(brightness([_log_gains(part) for part in parts]), parts)
     first = parts[0].appearance
@@ -165,3 +169,77 @@ def _exposures(
     order = np.argsort(names)
     log_gains = np.concatenate(logs)[order]
     return Exposures(np.concatenate(poses)[order], log_gains, float(np.median(depths)))
+
+
+# Of the time, or the steps, that a run would fit to these views for.
+SHARE = 0.5
+# Photographs that are read at once where no steps are given.
+MOST_VIEWS = 1200
+
+
+def rows_across(context: Sequence[str], blocks: Sequence[SceneBlock]) -> list[int]:
+    """Rows of the context views that help another block than their own."""
+    helping = {name for block in blocks for name in block.helpers}
+    return [row for row, name in enumerate(context) if name in helping]
+
+
+def fit_across(
+    plan: Plan, joined: Fitted, blocks: Sequence[SceneBlock], *, console: Console
+) -> Fitted:
+    """Joined Gaussians, fitted further to the views that see across faces; poses stay.
+
+    Only these views are read, no more than there are steps: all of a large project's may not fit
+    into memory.
+    """
+    rows, whole = rows_across(plan.context, blocks), joined.appearance
+    if not rows or whole.exposures is None:
+        return joined
+    options = _options(plan.config.refine, fits=len(whole.fits))
+    rows = list(evenly_spread(rows, options.steps or MOST_VIEWS))
+    console.line(f"fitting: {len(rows)} of {len(plan.context)} views see across blocks")
+    some = replace(
+        plan,
+        context=tuple(plan.context[row] for row in rows),
+        config=plan.config.replaced(refine=options),
+    )
+    # The gains of a fit's photographs have mean zero: what these lack, the Gaussians take on.
+    given = whole.exposures.log_gains
+    level = given[rows].mean(axis=0)
+    exposures = replace(
+        whole.exposures, poses=whole.exposures.poses[rows], log_gains=given[rows] - level
+    )
+    ended = []
+    for fit in whole.fits:
+        start = replace(whole, gaussians=_brighter(fit, level), others=(), exposures=exposures)
+        # The plan has the poses. As if there were no steps, it goes on however far blocks' fits had
+        # converged.
+        earlier = replace(joined, appearance=start, poses=None, steps=0)
+        further = fit_appearance(some, console, earlier=earlier)
+        assert further is not None
+        ended.append(further)
+    fits = [_brighter(further.appearance.gaussians, -level) for further in ended]
+    log_gains, found = given.copy(), ended[0].appearance.exposures
+    assert found is not None
+    log_gains[rows] = found.log_gains + level
+    return replace(
+        joined,
+        appearance=replace(
+            whole,
+            gaussians=fits[0],
+            others=tuple(fits[1:]),
+            exposures=replace(whole.exposures, log_gains=log_gains),
+        ),
+        steps=joined.steps + ended[0].steps,
+    )
+
+
+def _options(refine: FitOptions, *, fits: int) -> FitOptions:
+    """Options of each of some fits that share the time, or the steps, there is."""
+    share = SHARE / fits
+    if refine.limit is not None:
+        return refine.replaced(poses=False, seconds=share * refine.limit, steps=None)
+    return refine.replaced(poses=False, steps=max(1, round(share * (refine.steps or 0))))
+
+
+def _brighter(gaussians: Gaussians, log_gain: NDArray[np.float64]) -> Gaussians:
+    return Gaussians(scale_colors(gaussians.values, log_gain), frame=gaussians.frame)

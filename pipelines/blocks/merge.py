@@ -14,26 +14,28 @@ from __future__ import annotations
 import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from gvtools.cameras import Cameras, concatenate
-from gvtools.errors import ProjectError
+from gvtools.completers.base import Completer, Completion, ContextView, ScaleAlignment, ScaleStatus
+from gvtools.errors import OptionError, ProjectError
 from gvtools.files import link_or_copy
+from gvtools.guidance import Guidance
 from gvtools.runs.context_depth import context_depth_files
 from gvtools.runs.folder import RunDirectory
 from gvtools.runs.layout import APPEARANCE, POSES, round_folder
-from gvtools.runs.poses import RunPoses
-from gvtools.runs.run import RunTarget
+from gvtools.runs.poses import RunPoses, refined_poses_of
+from gvtools.runs.run import Run, RunTarget, load_run
 from gvtools.scenes.project import open_recorded
 from gvtools.settings import dotted, with_values
-from pipelines.blocks.appearance import BlockAppearance, join_appearances
-from pipelines.blocks.completions import BlockCompletions
-from pipelines.blocks.joint_fit import fit_across
-from pipelines.blocks.runs import BlockRun, read_runs
+from pipelines.blocks.appearance import BlockAppearance, fit_across, join_appearances
+from pipelines.blocks.block import FILE, SceneBlock
+from pipelines.blocks.split import by_name, read_blocks
 from pipelines.reconstruction.plan import Plan, Targets, describe, run_identity
 from pipelines.reconstruction.prepare import make_plan, placed_scan
 from pipelines.reconstruction.run import Draw, compile_kernels, complete_run, saved_fit, say_results
@@ -45,26 +47,170 @@ if TYPE_CHECKING:
     from pipelines.reconstruction.fitting import Fitted
 
 
+# What may differ from block to block.
+OF_A_BLOCK = ("context", "targets")
+
+
+@dataclass(frozen=True, eq=False)
+class BlockRun:
+    """A finished run of a block."""
+
+    run: Run
+    block: SceneBlock  # the block that it is of
+
+    @cached_property
+    def poses(self) -> dict[str, np.ndarray]:
+        """(4, 4) cam_from_world that the run built its memory with, of each view of its own."""
+        refined = refined_poses_of(self.run.path)
+        if refined is None:
+            return {name: self.block.poses[name] for name in self.block.owners}
+        found = dict(zip(self.run.context, refined.context, strict=True))
+        return {name: found[name] for name in self.block.owners}
+
+    @property
+    def held(self) -> dict[str, np.ndarray]:
+        """(4, 4) cam_from_world of the views that the block holds out."""
+        return {name: self.block.poses[name] for name in self.block.targets}
+
+    @property
+    def moved(self) -> bool:
+        """Whether the run refined poses of its own."""
+        return refined_poses_of(self.run.path) is not None
+
+    def targets(self, *, held_out: bool) -> list[RunTarget]:
+        """The run's targets that are the block's own."""
+        held = set(self.block.targets)
+        if held_out != self.held_out:
+            return []
+        return [
+            target
+            for target in self.run.views
+            if (target.name in held if held_out else self._inside(target))
+        ]
+
+    def _inside(self, target: RunTarget) -> bool:
+        return bool(self.block.cell.holds(target.camera.centers).all())
+
+    @property
+    def held_out(self) -> bool:
+        """Whether the targets are views of the project."""
+        return bool(self.run.record["targets_kind"] == "hold-out")
+
+
+def read_runs(paths: Sequence[Path], *, blocks: Path | None = None) -> list[BlockRun]:
+    """The runs of all blocks of one split, in order of the blocks' names.
+
+    ``blocks``: where the split lies now; None: where it lay.
+    """
+    known = {} if blocks is None else {path.name: path for path, _ in read_blocks(blocks)}
+    found: dict[str, BlockRun] = {}
+    for path in paths:
+        run = load_run(path)
+        if not run.complete:
+            raise ProjectError(
+                f"{path}: {len(run.rounds)} of {run.planned} rounds; expected a finished run; "
+                "reconstruct with --resume"
+            )
+        place = Path(run.record["project"])
+        place = known.get(place.name, place) if blocks else place
+        if not (place / FILE).is_file():
+            raise ProjectError(
+                f"{path}: its project {place} is no block, or is gone; expected one that gvtools "
+                "split wrote; say by --blocks where the split lies"
+            )
+        block = SceneBlock.load(place)
+        if block.name in found:
+            raise OptionError(
+                f"{found[block.name].run.path} and {path} are both of block {block.name}; expected "
+                "one run of each block"
+            )
+        missing = sorted(set(block.owners) - set(run.context))
+        if missing:
+            raise ProjectError(
+                f"{path}: its context lacks {missing[0]} and {len(missing) - 1} more of block "
+                f"{block.name}; expected --context @{place}/context.txt"
+            )
+        found[block.name] = BlockRun(run, block)
+    order = by_name({name: item.block for name, item in found.items()}, what="the given runs")
+    runs = [found[block.name] for block in order]
+    _check_alike(runs)
+    return runs
+
+
+def _check_alike(runs: Sequence[BlockRun]) -> None:
+    first = _shared(runs[0].run.record["settings"])
+    for item in runs[1:]:
+        other = _shared(item.run.record["settings"])
+        different = sorted(key for key in {*first, *other} if first.get(key) != other.get(key))
+        if different:
+            raise OptionError(
+                f"{item.run.path} and {runs[0].run.path} differ in {', '.join(different)}; "
+                "expected runs of the same settings"
+            )
+    if first.get("protocol") == "paper" or first["fusion"]["generated_as_observed"]:
+        raise OptionError(
+            f"{runs[0].run.path}: its generated points count as observed ones (protocol paper); "
+            "expected them apart, since a merge observes again; reconstruct without"
+        )
+
+
+def _shared(settings: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in settings.items() if key not in OF_A_BLOCK}
+
+
+# Confidence of what a block generated, where its run did not keep it.
+UNKNOWN = np.float32(0.5)
+
+
+class BlockCompletions(Completer):
+    """Fills holes with what the runs of blocks put there; what the memory shows stays."""
+
+    name = "blocks"
+
+    def __init__(self, targets: Mapping[str, RunTarget]) -> None:
+        super().__init__()
+        self.targets = targets
+
+    def complete(
+        self, context: Sequence[ContextView], guidance: Guidance, *, seed: int = 0
+    ) -> Completion:
+        """The completion of one target; see ``Completer.complete``."""
+        name = guidance.cameras.names[0]
+        target = self.targets[name]
+        files = target.read()
+        valid = guidance.valid[0]
+        if files.depth.shape != valid.shape:
+            raise ProjectError(
+                f"{target.folder}: the target {target.name} has {files.depth.shape} pixels; "
+                f"expected {valid.shape}; reconstruct the block again"
+            )
+        scale = target.report["scale"]
+        alignment = ScaleAlignment(ScaleStatus(scale["status"]), overlap_px=scale["overlap_px"])
+        made = ~valid & (files.depth > 0) & alignment.accepted
+        confidence = np.full(valid.shape, UNKNOWN) if files.confidence is None else files.confidence
+        known = np.where(valid, guidance.confidence[0], np.float32(0))
+        picture = files.picture.astype(np.float32) / np.float32(255)
+        rgb = np.where(valid[..., None], guidance.rgb[0], picture)
+        depth = np.where(made, files.depth, np.where(valid, guidance.depth[0], np.float32(0)))
+        return Completion(
+            rgb[None],
+            depth[None].astype(np.float32),
+            np.where(made, confidence, known)[None].astype(np.float32),
+            scale_alignment=(alignment,),
+        )
+
+
 def merge(
     paths: Sequence[Path],
     out: Path,
     *,
-    blocks: Path | None = None,
-    project: Path | None = None,
+    blocks: Path | None = None,  # where the split lies now; None: where it lay
+    project: Path | None = None,  # where the whole project lies now; None: where it lay
     resume: bool = False,
     console: Console,
-    draw: Draw | None = None,
+    draw: Draw | None = None,  # see ``pipelines.reconstruction.run.reconstruct``
 ) -> Path:
     """Merge the runs of all blocks of a split project.
-
-    Args:
-        paths: the runs' folders.
-        out: the merged run's folder.
-        blocks: where the split lies now; None: where it lay.
-        project: where the whole project lies now; None: where it lay.
-        resume: continue a merge after its last complete round.
-        console: where progress and figures go.
-        draw: see ``pipelines.reconstruction.run.reconstruct``.
 
     Returns:
         ``out``.

@@ -82,11 +82,11 @@ def run(args: argparse.Namespace, console: Console) -> None:
     import os
 
     if args.what == "fuse":
-        from pipelines.bench.fuse import fuse_rows
+        from pipelines.bench.side_by_side import fuse_rows
 
         rows = fuse_rows(points, repeat=args.repeat)
     else:
-        from pipelines.bench.splat import splat_rows
+        from pipelines.bench.side_by_side import splat_rows
 
         rows = splat_rows(points, repeat=args.repeat)
     report(rows, console, args.json, bench=args.what, points=points, load=os.getloadavg()[0])
@@ -97,8 +97,7 @@ def _run_complete(args: argparse.Namespace, given: dict[str, Any], console: Cons
 
     chosen = CompleteOptions(repeat=args.repeat, **given)
     if chosen.memory:
-        from pipelines.bench.memory import memory_figures
-        from pipelines.bench.memory_tables import show_memory
+        from pipelines.bench.memory import memory_figures, show_memory
 
         figures = memory_figures(chosen)
         rows = len(figures["inference"]) + len(figures["training"])

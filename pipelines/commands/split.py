@@ -65,8 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace, console: Console) -> None:
     """Run ``gvtools split``."""
     from gvtools.errors import OptionError
-    from pipelines.blocks.split import split
-    from pipelines.blocks.write import block_folder
+    from pipelines.blocks.split import block_folder, split
 
     number = None
     if args.blocks != "auto":

@@ -80,7 +80,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
 
 def _list(args: argparse.Namespace, console: Console) -> None:
     from gvtools.completers.geoverse.config import NAMES
-    from pipelines.weights.report import print_depth, print_needed
+    from pipelines.weights import print_depth, print_needed
 
     names = (DEPTH, *NAMES) if args.config is None else (args.config,)
     for number, name in enumerate(names):
@@ -93,8 +93,7 @@ def _list(args: argparse.Namespace, console: Console) -> None:
 
 
 def _pack(args: argparse.Namespace, console: Console) -> None:
-    from pipelines.weights.pack import pack, packed_bytes
-    from pipelines.weights.report import size_text
+    from pipelines.weights import pack, packed_bytes, size_text
 
     source = pack(args.source, args.folder)
     console.line(f"{args.folder}: {size_text(packed_bytes(args.folder))}, from {source}")
@@ -107,7 +106,7 @@ def _check(args: argparse.Namespace, console: Console) -> None:
         config_of,
     )
     from gvtools.files import write_json
-    from pipelines.weights.report import print_parts
+    from pipelines.weights import print_parts
 
     folder = args.folder
     report: dict[str, Any] = {"folder": str(folder), "config": None, "ok": False, "parts": []}
@@ -143,7 +142,7 @@ def _create(args: argparse.Namespace, console: Console) -> None:
 
     from gvtools.completers.geoverse.model import GeoVerse, empty_model
     from gvtools.completers.geoverse.weights import VIDEO_FOLDER, save_pretrained
-    from pipelines.weights.report import size_text
+    from pipelines.weights import size_text
 
     config, folder = _config(args.config), args.folder
     if folder.is_file() or (
@@ -198,7 +197,7 @@ def _empty_prompt(args: argparse.Namespace, console: Console) -> None:
 
 def _progress(console: Console) -> Callable[[int, int], None]:
     """Bytes done of all, now and then."""
-    from pipelines.weights.report import size_text
+    from pipelines.weights import size_text
 
     last = [time.monotonic()]
 

@@ -8,7 +8,6 @@ import pytest
 
 from gvtools.errors import OptionError
 from pipelines.bench import open3d_peers, procedural_cloud, side_by_side
-from pipelines.bench import splat as bench_splat
 from pipelines.commands import bench
 from pipelines.console import Console
 
@@ -123,7 +122,7 @@ def test_the_peers_see_the_same_scene():
 
 
 def test_one_pixel_winners_agree():
-    rows = bench_splat.one_pixel_rows(30_000, repeat=1)
+    rows = side_by_side.one_pixel_rows(30_000, repeat=1)
     share = float(rows[0].note.split("winner in ")[1].split("%")[0])
     assert share > 99.9
 

@@ -15,11 +15,9 @@ from gvtools.completers.geoverse.model import LEVEL0, LEVEL1
 from gvtools.errors import OptionError
 from gvtools.networks.compute import attend
 from pipelines.bench import side_by_side
-from pipelines.bench.complete import parameters, weight_bytes
+from pipelines.bench.complete import StageClock, TimedPass, parameters, total, weight_bytes
 from pipelines.bench.options import CompleteOptions
 from pipelines.bench.random_model import random_features, random_model, random_video, random_views
-from pipelines.bench.stage_clock import StageClock, total
-from pipelines.bench.timing import TimedPass
 from pipelines.commands import bench
 from pipelines.console import Console
 

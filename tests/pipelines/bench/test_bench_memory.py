@@ -13,9 +13,7 @@ import torch
 
 from benchmarks.memory import CASES, peak, predicted_peak
 from gvtools.errors import OptionError
-from pipelines.bench.live_bytes import LiveBytes, alone, predicted
-from pipelines.bench.memory import StagePeaks
-from pipelines.bench.memory_tables import card_line
+from pipelines.bench.memory import LiveBytes, StagePeaks, alone, card_line, predicted
 from pipelines.commands import bench
 from pipelines.console import Console
 

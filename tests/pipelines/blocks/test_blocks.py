@@ -16,11 +16,9 @@ from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.runs.run import load_run
 from gvtools.scenes.project import open_project
 from gvtools.settings import with_values
-from pipelines.blocks.block import SceneBlock
-from pipelines.blocks.cells import cut_cells
+from pipelines.blocks.block import SceneBlock, cut_cells
 from pipelines.blocks.merge import merge
-from pipelines.blocks.split import split
-from pipelines.blocks.write import read_blocks
+from pipelines.blocks.split import read_blocks, split
 from pipelines.cli import main
 from pipelines.console import Console
 from pipelines.reconstruction import run

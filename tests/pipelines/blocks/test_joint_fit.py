@@ -16,11 +16,10 @@ from gvtools.runs.run import load_run
 from gvtools.scenes.project import open_project
 from gvtools.settings import with_values
 from pipelines.blocks import merge as merging
+from pipelines.blocks.appearance import fit_across, rows_across
 from pipelines.blocks.block import SceneBlock
-from pipelines.blocks.joint_fit import fit_across, rows_across
 from pipelines.blocks.merge import merge
-from pipelines.blocks.split import split
-from pipelines.blocks.write import read_blocks
+from pipelines.blocks.split import read_blocks, split
 from pipelines.console import Console
 from pipelines.reconstruction import run
 from pipelines.reconstruction.fitting import Fitted
@@ -64,7 +63,7 @@ def across(folder: Path) -> list[str]:
 def unfitted(folder: Path, out: Path, monkeypatch: pytest.MonkeyPatch) -> Fitted:
     """The same merge without fitting further."""
     with monkeypatch.context() as patch:
-        patch.setattr(merging, "fitted_across", lambda plan, joined, blocks, console: joined)
+        patch.setattr(merging, "fit_across", lambda plan, joined, blocks, console: joined)
         merge(sorted((folder / "runs").iterdir()), out, console=QUIET)
     return Fitted.load(out / SAVED)
 
@@ -132,7 +131,7 @@ def test_a_resumed_merge_has_the_same_bytes_and_fits_no_second_time(
         with pytest.raises(KeyboardInterrupt):
             merge(runs, out, console=QUIET)
     assert len(RunDirectory(out).reports()) == 2
-    monkeypatch.setattr(merging, "fitted_across", stop)
+    monkeypatch.setattr(merging, "fit_across", stop)
     merge(runs, out, resume=True, console=QUIET)
     for name in (SAVED, "memory.npz"):
         assert (out / name).read_bytes() == (fitted / "merged" / name).read_bytes(), name
@@ -148,7 +147,7 @@ def test_poses_and_brightness_stay_where_the_views_across_are_exposed_unlike_oth
         return joined
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(merging, "fitted_across", note)
+        patch.setattr(merging, "fit_across", note)
         merge(sorted((fitted / "runs").iterdir()), tmp_path / "merged", console=QUIET)
     (plan, joined, blocks) = given[0]
     refine = plan.config.refine.replaced(steps=2)

@@ -1,1 +1,0 @@
-"""Published network weights: what a model needs, and whether a folder fits."""
