@@ -1,4 +1,4 @@
-"""Computed depth of context views, which round 0 keeps.
+"""Computed depth of context views in the folder of round 0.
 
 ``context_depth_STEM.npz`` has the keys depth (float32 z-depth, scene units, 0 = none), confidence,
 source, and failed (why there is no depth, or empty); ``context_depth_STEM.png`` shows the depth.
@@ -36,12 +36,7 @@ def context_depth_files(folder: Path, names: Sequence[str]) -> dict[str, Path]:
 
 
 def read_context_depth(path: Path, size: tuple[int, ...]) -> tuple[DepthMap, str]:
-    """A view's depth, and why it is empty, where it is.
-
-    Args:
-        path: the file.
-        size: (H, W) of the view's picture.
-    """
+    """A view's depth, and why it is empty, where it is; ``size`` (H, W) is of its picture."""
     stored = load_arrays(path, "depth", "confidence", "source", "failed")
     for name in ("depth", "confidence"):
         array = stored[name]
@@ -57,14 +52,7 @@ def read_context_depth(path: Path, size: tuple[int, ...]) -> tuple[DepthMap, str
 def write_context_depth(
     path: Path, depth_map: DepthMap, *, failed: str, picture: NDArray[np.uint8]
 ) -> None:
-    """Write a view's depth.
-
-    Args:
-        path: the file.
-        depth_map: the depth.
-        failed: why it is empty, or an empty text.
-        picture: (H, W, 3) that shows it.
-    """
+    """Write a view's depth, why it is empty, or an empty text, and a picture that shows it."""
     # The picture first: where the arrays exist, nothing is missing.
     with replaced_when_written(path.with_suffix(".png")) as temporary:
         write_png(temporary, picture)
@@ -79,11 +67,7 @@ def write_context_depth(
 
 
 def off_scale(reports: Sequence[Mapping[str, Any]]) -> str | None:
-    """One line that names the views whose depth disagrees with the sparse points.
-
-    Args:
-        reports: of the views' depth, as the report of round 0 has them.
-    """
+    """One line that names the views, reported by round 0, whose depth is off the sparse points."""
     names = [report["view"] for report in disagreeing(reports)]
     if not names:
         return None

@@ -1,4 +1,4 @@
-"""A run's folder while it is written: its rounds, when a round is complete, and how to resume.
+"""A run's folder while it is written: rounds, locking and resuming.
 
 A round is written under a temporary name and renamed when it is complete, its memory included, so a
 kill at any moment leaves complete rounds only. Only the last complete round keeps its memory file.
@@ -20,8 +20,8 @@ from typing import Any
 from gvtools.errors import ProjectError
 from gvtools.files import remove, replaced_when_written, write_json, write_text
 from gvtools.memory.io.tile_folder import copy_tiles
+from gvtools.runs.digests import SUMS, check_sums, versions, write_sums
 from gvtools.runs.folder_lock import folder_lock
-from gvtools.runs.identity import versions
 from gvtools.runs.layout import (
     MEMORY,
     METRICS,
@@ -33,7 +33,6 @@ from gvtools.runs.layout import (
     round_folder,
     saved_memory,
 )
-from gvtools.runs.sums import SUMS, check_sums, write_sums
 from gvtools.untrusted import read_json
 
 # Files and folders that are still being written.
@@ -62,11 +61,8 @@ class RunDirectory:
     def open_or_resume(self, identity: dict[str, Any], *, resume: bool) -> Iterator[int]:
         """Make the folder or resume the run in it; gives the number of complete rounds.
 
-        As long as the block lasts, other processes are kept out.
-
-        Args:
-            identity: what decides the result; kept in run.json and compared on resuming.
-            resume: continue after the last complete round.
+        As long as the block lasts, other processes are kept out. ``identity``, which decides the
+        result, is kept in run.json and compared on resuming.
         """
         self.refuse_foreign()
         with folder_lock(self.path):
@@ -191,12 +187,7 @@ class RunDirectory:
         )
 
     def finish(self, number: int, metrics: Mapping[str, Any]) -> None:
-        """Write the run's figures, make the last round's memory the run's own, and write sums.
-
-        Args:
-            number: of the last round.
-            metrics: JSON-ready.
-        """
+        """Write the run's figures, make the last round's memory the run's own, and write sums."""
         write_json(self.path / METRICS, metrics)
         last = self.round_memory(number)
         if last.exists():

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 from gvtools.errors import OptionError, ProjectError
 from gvtools.memory.io.tile_folder import INDEX
+from gvtools.runs.digests import check_sums
 from gvtools.runs.layout import APPEARANCE, MEMORY, POINTS, RECORD, round_folder, saved_memory
-from gvtools.runs.sums import check_sums
 
 if TYPE_CHECKING:
     from gvtools.appearance.appearance import Appearance

@@ -20,16 +20,11 @@ from gvtools.untrusted import load_arrays
 
 @dataclass(frozen=True, eq=False)
 class RunPoses:
-    """Refined poses of a run's context and targets.
-
-    Attributes:
-        context: (C, 4, 4) cam_from_world, in the order of the run's context.
-        targets: (V, 4, 4) of the targets.
-        by_features: whether features told them, to a fraction of a pixel.
-    """
+    """Refined poses (V, 4, 4) cam_from_world of a run's context and targets, in its order."""
 
     context: NDArray[np.float64]
     targets: NDArray[np.float64]
+    # Whether features determined them, to a fraction of a pixel.
     by_features: bool = False
 
     def save(self, path: Path) -> None:

@@ -12,9 +12,9 @@ from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from gvtools.cameras import rigid_transform
 from gvtools.errors import ProjectError, ShapeError
+from gvtools.runs.digests import check_sums
 from gvtools.runs.folder import RunDirectory
 from gvtools.runs.layout import RECORD, REPORT, round_folder
-from gvtools.runs.sums import check_sums
 from gvtools.untrusted import read_json
 
 Row3 = Annotated[list[float], Field(min_length=3, max_length=3)]

@@ -12,12 +12,12 @@ import numpy as np
 
 from gvtools.cameras import Cameras
 from gvtools.errors import MemoryFileError, ProjectError
+from gvtools.runs.digests import check_sums
 from gvtools.runs.folder import RunDirectory
 from gvtools.runs.layout import METRICS, round_folder
 from gvtools.runs.memory_file import load_memory
 from gvtools.runs.poses import refined_poses_of, with_poses
 from gvtools.runs.record import read_record, read_reports, resolved_settings
-from gvtools.runs.sums import check_sums
 from gvtools.runs.target_files import TargetFiles, entry_camera, read_target
 
 if TYPE_CHECKING:
@@ -31,16 +31,12 @@ ATTEMPTS = 5
 
 @dataclass(frozen=True, eq=False)
 class RunTarget:
-    """A target of a run that a round completed.
-
-    Attributes:
-        folder: of its round.
-        round: number of its round, from 1.
-        report: its entry in the round's report.
-    """
+    """A target of a run that a round completed."""
 
     folder: Path
+    # From 1.
     round: int
+    # Its entry in the round's report.
     report: Mapping[str, Any]
 
     @property
@@ -169,12 +165,7 @@ def load_run(path: Path | str, *, project: Path | None = None) -> Run:
 
 
 def load_growing_run(path: Path, *, project: Path | None = None) -> Run:
-    """The run in a folder that another process may add rounds to; its memory is loaded.
-
-    Args:
-        path: the folder.
-        project: where its project lies now; None: where it lay.
-    """
+    """The run in a folder that another process may add rounds to; its memory is loaded."""
     for attempt in range(ATTEMPTS):
         run = load_run(path, project=project)
         try:

@@ -1,4 +1,4 @@
-"""The pictures and arrays that a round leaves of each target: written and read."""
+"""Pictures and arrays that a round leaves of each target."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from gvtools.cameras import Cameras
 from gvtools.errors import ProjectError, ShapeError
 from gvtools.guidance import Guidance
+from gvtools.runs.digests import check_sums
 from gvtools.runs.layout import (
     AFTER,
     COMPLETION,
@@ -26,7 +27,6 @@ from gvtools.runs.layout import (
     target_picture,
     target_stems,
 )
-from gvtools.runs.sums import check_sums
 from gvtools.scenes.images import UNREADABLE
 from gvtools.untrusted import load_arrays, open_picture, read_json
 
@@ -47,19 +47,12 @@ def write_target(
     completion: Completion,
     fused: NDArray[np.bool_],
 ) -> None:
-    """Write the guidance of a target and its completion.
+    """Write the guidance of a target and its completion, batches of one.
 
     ``guidance_STEM.png`` (holes black), ``valid_STEM.png`` (guidance from observations 255, from a
     scan's alone 192, from generated points 128, holes 0), ``generated_STEM.png`` (the completed
     picture), and ``depth_STEM.npz`` with the keys guidance and completion (float32 z-depth, scene
     units, 0 = none), fused (bool) and confidence (of the completion, float32, 0 to 1).
-
-    Args:
-        folder: of the round.
-        stem: of the target's file names, see ``layout.target_stems``.
-        guidance: a batch of one.
-        completion: a batch of one.
-        fused: (H, W), the pixels that were fused.
     """
     support = np.where(guidance.generated[0], SUPPORT_GENERATED, SUPPORT_OBSERVED)
     support = np.where(guidance.scanned[0], SUPPORT_SCANNED, support)
@@ -69,12 +62,9 @@ def write_target(
     write_png(target_picture(folder, COMPLETION, stem), to_bytes(completion.rgb[0]))
     # Compression would save a fifth and take longer than all else of a target.
     np.savez(
-        target_depth(folder, stem),
-        guidance=guidance.depth[0],
-        completion=completion.depth[0],
-        fused=fused,
-        confidence=completion.confidence[0],
-    )
+        target_depth(folder, stem), guidance=guidance.depth[0], completion=completion.depth[0],
+        fused=fused, confidence=completion.confidence[0],
+    )  # fmt: skip
 
 
 def write_after(folder: Path, stem: str, after: Guidance) -> None:
@@ -84,35 +74,23 @@ def write_after(folder: Path, stem: str, after: Guidance) -> None:
 
 @dataclass(frozen=True, eq=False)
 class TargetFiles:
-    """What a round left of one target.
-
-    Attributes:
-        name: of the target.
-        camera: a batch of one.
-        picture: (H, W, 3) uint8, completed; holes are black.
-        depth: (H, W) float32 z-depth of the picture, brought to the memory's scale, scene units,
-            0 = none.
-        observed: (H, W) bool, pixels that stand on observations, a scan's included.
-        generated: (H, W) bool, pixels that a completer made, in this round or an earlier one.
-        confidence: (H, W) float32 of the completion, 0 to 1; None of runs that did not keep it.
-    """
+    """What a round left of one target."""
 
     name: str
     camera: Cameras
+    # (H, W, 3) completed; holes are black.
     picture: NDArray[np.uint8]
+    # (H, W) z-depth of the picture, brought to the memory's scale, scene units, 0 = none.
     depth: NDArray[np.float32]
+    # Pixels that stand on observations, a scan's included; that a completer made in any round.
     observed: NDArray[np.bool_]
     generated: NDArray[np.bool_]
+    # Of the completion, 0 to 1; None of runs that did not keep it.
     confidence: NDArray[np.float32] | None = None
 
 
 def read_target(folder: Path, entry: Mapping[str, Any]) -> TargetFiles:
-    """One target of a round.
-
-    Args:
-        folder: the round's, in the run's.
-        entry: the target's, of the round's report.
-    """
+    """One target of a round by its entry in the round's report."""
     try:
         stem, camera = entry["stem"], entry_camera(entry)
         picture = read_picture(folder, COMPLETION, stem)
@@ -155,22 +133,13 @@ def entry_camera(entry: Mapping[str, Any]) -> Cameras:
     """The camera, a batch of one, of a target's entry in a report."""
     stored = entry["camera"]
     return Cameras(
-        np.array(stored["K"])[None],
-        np.array(stored["cam_from_world"])[None],
-        np.array([stored["width"]]),
-        np.array([stored["height"]]),
-        (entry["name"],),
-    )
+        np.array(stored["K"])[None], np.array(stored["cam_from_world"])[None],
+        np.array([stored["width"]]), np.array([stored["height"]]), (entry["name"],),
+    )  # fmt: skip
 
 
 def completed_picture(run: Path, number: int, name: str) -> Path | None:
-    """The file, absolute, with the completed picture of a target; None where there is none.
-
-    Args:
-        run: the run's folder.
-        number: of the round.
-        name: of the target.
-    """
+    """The file, absolute, with the completed picture of a target; None where there is none."""
     folder = round_folder(run, number)
     try:
         views = read_json(folder / REPORT)["views"]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from gvtools.cameras import Cameras
 from gvtools.completers.base import Completer
 from gvtools.errors import OptionError
-from gvtools.runs.identity import array_digest, fingerprint
+from gvtools.runs.digests import array_digest, fingerprint
 from gvtools.runs.poses import RunPoses, posed, with_poses
 from gvtools.scenes.layout import is_address
 from gvtools.scenes.reduced import reduced

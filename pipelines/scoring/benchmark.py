@@ -276,7 +276,7 @@ def _of_pictures(opened: _OpenCell) -> tuple[dict[str, Any], dict[str, np.ndarra
     What the context observed, and the poses that pictures are located against, come from a memory
     of the context alone, which is kept in the cell's run.
     """
-    from gvtools.runs.identity import versions
+    from gvtools.runs.digests import versions
     from pipelines.scoring.measurement import Measurement
     from pipelines.scoring.method_pictures import open_method, reference_from_context
 

@@ -16,7 +16,7 @@ from gvtools.evaluation.published import Benchmark, benchmark_names, load_benchm
 from gvtools.evaluation.ranking import Setting, comparison_table, side_by_side
 from gvtools.evaluation.splits import protocol_split
 from gvtools.files import write_json
-from gvtools.runs.identity import versions
+from gvtools.runs.digests import versions
 from gvtools.runs.layout import RECORD
 from gvtools.runs.memory_file import load_memory
 from gvtools.runs.run import Run, load_run

@@ -31,7 +31,7 @@ from gvtools.completers.geoverse.weights import (
 )
 from gvtools.errors import CheckpointError, ProjectError
 from gvtools.files import folder_replaced_when_written, make_folder, write_json
-from gvtools.runs.identity import array_digest
+from gvtools.runs.digests import array_digest
 from gvtools.scenes.scene import Scene
 from gvtools.training.distributed import Processes, Replicated
 from gvtools.training.loader import batches

@@ -143,7 +143,7 @@ def test_a_flipped_bit_of_a_training_state_is_named_or_without_effect(tmp_path, 
 
 
 def test_sums_name_no_file_outside_of_their_round(tmp_path):
-    from gvtools.runs.sums import SUMS, check_sums
+    from gvtools.runs.digests import SUMS, check_sums
 
     (tmp_path / "secret").write_text("x")
     folder = tmp_path / "round_000"
