@@ -4,13 +4,7 @@ import numpy as np
 import pytest
 
 from gvtools.cameras import Cameras
-from gvtools.completers.base import (
-    Completer,
-    Completion,
-    ScaleAlignment,
-    ScaleStatus,
-    create,
-)
+from gvtools.completers.base import Completer, Completion, ScaleAlignment, ScaleStatus, create
 from gvtools.completers.effort import EffortPolicy, SmallHolesInpainted
 from gvtools.completers.hole_depth import hole_radius
 from gvtools.completers.inpaint import InpaintCompleter

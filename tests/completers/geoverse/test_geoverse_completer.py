@@ -41,12 +41,7 @@ pytestmark = pytest.mark.usefixtures("one_thread", "unpainted")
 
 
 def complete(
-    weights: Path,
-    context: list[ContextView],
-    known: Guidance,
-    *,
-    seed: int = 0,
-    **options: Any,
+    weights: Path, context: list[ContextView], known: Guidance, *, seed: int = 0, **options: Any
 ) -> Completion:
     options = {"alignment": "hint", "device": "cpu", **options}
     return loaded(weights, **options).complete(context, known, seed=seed)

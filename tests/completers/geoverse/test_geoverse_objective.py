@@ -347,12 +347,7 @@ def _depths(rng: np.random.Generator) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     reference = torch.tensor(rng.uniform(1, 6, (SAMPLES, T, H, W)))
     gaps = torch.tensor(rng.choice([np.nan, np.inf, 0.0, -1.0], (SAMPLES, T, H, W)))
     reference = torch.where(torch.tensor(rng.random((SAMPLES, T, H, W)) < 0.3), gaps, reference)
-    return (
-        predicted,
-        reference,
-        _normal(rng, SAMPLES, VIEWS, 3),
-        _normal(rng, SAMPLES, VIEWS, 3),
-    )
+    return (predicted, reference, _normal(rng, SAMPLES, VIEWS, 3), _normal(rng, SAMPLES, VIEWS, 3))
 
 
 @settings(deadline=None, max_examples=50)

@@ -14,17 +14,7 @@ import geoverse_models as micro
 import published_folder as published
 import pytest
 import torch
-from geoverse_folders import (
-    BARE,
-    CONTROL,
-    PLAIN,
-    SHARED,
-    equal,
-    load,
-    output,
-    refused,
-    report,
-)
+from geoverse_folders import BARE, CONTROL, PLAIN, SHARED, equal, load, output, refused, report
 from oracle import ABSENT, ORACLE
 from published_folder import CASCADE, GEOMETRY, LEVEL1, RGB_HEAD, STATISTICS
 from safetensors.torch import load_file, save_file
