@@ -1,4 +1,4 @@
-"""What the memory knows of target cameras: the hint that completers receive."""
+"""Guidance: the memory projected into target cameras, the hint that completers receive."""
 
 from __future__ import annotations
 

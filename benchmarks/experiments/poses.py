@@ -20,7 +20,7 @@ from benchmarks.experiments.rows import geoverse
 from gvtools.completers.geoverse.conditioning import encode_views
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.evaluation.tables import Column, Table
-from gvtools.networks.depth_anything.geometry_head import Geometry
+from gvtools.networks.depth_anything.geometry_head import ViewGeometry
 from gvtools.networks.depth_anything.rays import poses_least_squares
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.dataset import ContextChoice, ProceduralViews
@@ -44,7 +44,7 @@ def run(options: ExperimentOptions) -> tuple[dict[str, Any], list[Table]]:
     device = next(model.parameters()).device
     told = "cameras told" if model.config.hints.cameras else "no cameras told"
     other: list[Tensor] = []
-    sources: dict[str, Callable[[GeoVerse, TrainingBatch], Geometry]] = {
+    sources: dict[str, Callable[[GeoVerse, TrainingBatch], ViewGeometry]] = {
         f"true pictures, {told}": lambda model, batch: _of_pictures(model, batch, batch.images),
         f"generated pictures, {told}": lambda model, batch: (
             model.generate(batch.views, seed=options.seed).decoded.geometry
@@ -97,7 +97,7 @@ def run(options: ExperimentOptions) -> tuple[dict[str, Any], list[Table]]:
 @torch.no_grad()
 def _of_pictures(
     model: GeoVerse, batch: TrainingBatch, pictures: Tensor, *, cameras: bool = True
-) -> Geometry:
+) -> ViewGeometry:
     """Geometry of the features of pictures (1, V, 3, H, W); ``cameras`` False tells none."""
     grid = model.geometry.encoder.grid(*batch.views.size)
     views = replace(batch.true_views, images=pictures)
@@ -110,7 +110,7 @@ def _of_pictures(
     )
 
 
-def _errors(geometry: Geometry, batch: TrainingBatch) -> Tensor:
+def _errors(geometry: ViewGeometry, batch: TrainingBatch) -> Tensor:
     """(V - 1, 4): degrees, and centre errors of the rays, the first view's place, the mean place.
 
     Lengths are in mean context depths. The first view is the reference and is left out.

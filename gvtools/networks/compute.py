@@ -139,10 +139,10 @@ class Recomputing(nn.Module):
         """``run(*inputs)``, whose activations are kept or not as ``recompute`` says."""
         if not (self.recompute and torch.is_grad_enabled()):
             return run(*inputs)
-        return recomputed(run, *inputs)
+        return recompute(run, *inputs)
 
 
-def recomputed(run: Callable[..., Any], *inputs: Any) -> Any:
+def recompute(run: Callable[..., Any], *inputs: Any) -> Any:
     """``run(*inputs)``, nothing random; only the inputs are kept for the backward pass."""
     return checkpoint(run, *inputs, use_reentrant=False, preserve_rng_state=False)
 
@@ -197,7 +197,5 @@ def _is_fused(q: Tensor) -> bool:
 def _in_chunks(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
     """The same, for as many queries at a time as ``MOST_SCORES`` allows."""
     rows = max(1, MOST_SCORES // (q.shape[0] * q.shape[1] * k.shape[2]))
-    parts = [
-        recomputed(F.scaled_dot_product_attention, part, k, v) for part in q.split(rows, dim=2)
-    ]
+    parts = [recompute(F.scaled_dot_product_attention, part, k, v) for part in q.split(rows, dim=2)]
     return torch.cat(parts, dim=2)

@@ -35,7 +35,7 @@ _ALIGNMENT = 64
 
 
 @dataclass(frozen=True)
-class Fit:
+class TensorFit:
     """How stored tensors fit expected ones."""
 
     expected: int  # how many tensors are asked for
@@ -66,10 +66,10 @@ class Fit:
         return f"of {self.expected} tensors " + "; ".join(problems)
 
 
-def fit(stored: Mapping[str, Tensor], expected: Shapes) -> Fit:
+def compare_tensors(stored: Mapping[str, Tensor], expected: Shapes) -> TensorFit:
     """Compare names, shapes and types."""
     found = shapes(stored)
-    return Fit(
+    return TensorFit(
         expected=len(expected),
         missing=tuple(name for name in expected if name not in found),
         unexpected=tuple(name for name in found if name not in expected),
@@ -102,7 +102,7 @@ def shapes(tensors: Mapping[str, Tensor]) -> dict[str, tuple[int, ...]]:
 
 def check_fit(stored: Mapping[str, Tensor], expected: Shapes, *, where: object) -> None:
     """Refuse tensors (also on the meta device) that are not the expected ones."""
-    found = fit(stored, expected)
+    found = compare_tensors(stored, expected)
     if not found.ok:
         raise CheckpointError(f"{where}: {found}; the file is of another network or version")
 
@@ -117,11 +117,11 @@ def load(
     """Put tensors into a module, in float32; what is so already may stay mapped from its file."""
     check_fit(tensors, shapes(module.state_dict()), where=where)
     module.load_state_dict(
-        {name: _placed(tensor, device) for name, tensor in tensors.items()}, assign=True
+        {name: _place(tensor, device) for name, tensor in tensors.items()}, assign=True
     )
 
 
-def _placed(tensor: Tensor, device: torch.device | str) -> Tensor:
+def _place(tensor: Tensor, device: torch.device | str) -> Tensor:
     """Contiguous float32 on a device, where torch would have put it."""
     placed = tensor.to(device, torch.float32).contiguous()
     # Products depend on the alignment in their last bit, and that of a file's tensors is by chance.
@@ -169,7 +169,7 @@ def save_tensors(
     from safetensors import SafetensorError
     from safetensors.torch import save_file
 
-    stored = _stored(tensors, dtype, exact)
+    stored = _to_store(tensors, dtype, exact)
     # The library gives its files to their owner alone; these get what the folder's others have.
     file.touch()
     mode = file.stat().st_mode
@@ -183,7 +183,9 @@ def save_tensors(
         os.fsync(written.fileno())
 
 
-def _stored(tensors: Mapping[str, Tensor], dtype: str, exact: Collection[str]) -> dict[str, Tensor]:
+def _to_store(
+    tensors: Mapping[str, Tensor], dtype: str, exact: Collection[str]
+) -> dict[str, Tensor]:
     """The tensors as they are to be written, on the CPU; what is so already is not copied."""
     if dtype not in DTYPES:
         raise CheckpointError(f"dtype {dtype!r}; expected one of {', '.join(DTYPES)}")

@@ -20,12 +20,12 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor, nn
 
-from gvtools.completers.geoverse.composition import composed
-from gvtools.completers.geoverse.conditioning import ViewBatch, encode_views, filled
+from gvtools.completers.geoverse.composition import compose
+from gvtools.completers.geoverse.conditioning import ViewBatch, encode_views, fill_holes
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.completers.geoverse.objective import high_gradient_loss, rgb_loss
 from gvtools.networks.depth_anything.encoder import encode_cameras, patch_rays
-from gvtools.networks.depth_anything.geometry_head import Geometry
+from gvtools.networks.depth_anything.geometry_head import ViewGeometry
 from gvtools.training.batch import Draws, TrainingBatch
 from gvtools.training.options import EncoderStageOptions, HeadsStageOptions
 from gvtools.training.stages import Stage
@@ -115,7 +115,7 @@ def head_features(model: GeoVerse, levels: Sequence[Tensor], batch: TrainingBatc
 
 def decode_heads(
     model: GeoVerse, features: HeadFeatures, batch: TrainingBatch
-) -> tuple[Geometry, Tensor]:
+) -> tuple[ViewGeometry, Tensor]:
     """The geometry and the colour (B, V, 3, H, W) that the heads make of features."""
     grid = model.geometry.encoder.grid(*batch.views.size)
     rgb = model.rgb_head(torch.cat(features.levels, dim=-1).flatten(0, 1), grid)
@@ -125,7 +125,7 @@ def decode_heads(
 def _shown(model: GeoVerse, batch: TrainingBatch, draws: Draws, *, share: float) -> ViewBatch:
     """True pictures; a share of the targets shows its projection, filled as inference fills it."""
     views = batch.true_views
-    hints = filled(batch.views, model.config.hints).images
+    hints = fill_holes(batch.views, model.config.hints).images
     swap = draws.uniform("hints", views.images.shape[1]).to(hints.device) < share
     swap[:, : views.context] = False
     images = torch.where(swap[:, :, None, None, None], hints, views.images)
@@ -161,7 +161,7 @@ def ray_error(
     return _weighted((direction.mean(-1) + origin * place.mean(-1)) / 2, confidence)
 
 
-def _depth_error(geometry: Geometry, depth: Tensor) -> Tensor:
+def _depth_error(geometry: ViewGeometry, depth: Tensor) -> Tensor:
     """L1 of the logarithm where depth is known, and the confidence's loss."""
     known = depth > 0
     error = (geometry.depth.log() - torch.where(known, depth, 1.0).log()).abs()
@@ -282,7 +282,7 @@ class HeadsStage(Stage):
             # What memory knows is kept as it is.
             hint = model.decode(prepared, level0, prepared.hints.unmasked, targets_alone=True)
             wanted, judged = depth, ~batch.views.valid[:, context:, 0]
-        image, length = composed(prepared.batch, made, hint)
+        image, length = compose(prepared.batch, made, hint)
         return {
             "rgb": rgb_loss(image, rgb, valid=judged).mean(),
             "hf": high_gradient_loss(image, rgb, valid=judged).mean(),

@@ -14,10 +14,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor, nn
 
-from gvtools.completers.geoverse.composition import composed, corrected_depth, seamless
-from gvtools.completers.geoverse.conditioning import ViewBatch, filled
+from gvtools.completers.geoverse.composition import compose, correct_depth, remove_seams
+from gvtools.completers.geoverse.conditioning import ViewBatch, fill_holes
 from gvtools.completers.geoverse.model import GeoVerse
-from gvtools.completers.geoverse.refiner import CompletedViews, completed_views, cropped
+from gvtools.completers.geoverse.refiner import CompletedViews, completed_views, crop_views
 from gvtools.errors import OptionError
 from gvtools.training.batch import Draws, TrainingBatch
 from gvtools.training.options import RefinerStageOptions
@@ -62,7 +62,7 @@ class RefinerStage(Stage):
         assert self.model.refiner is not None
         context = batch.views.context
         rgb, depth = self._completions(batch.views)
-        shown = completed_views(filled(batch.views, self.model.config.hints), rgb)
+        shown = completed_views(fill_holes(batch.views, self.model.config.hints), rgb)
         truth, true_depth = (
             values[:, context:].flatten(0, 1) for values in (batch.images, batch.depth)
         )
@@ -120,14 +120,14 @@ class RefinerStage(Stage):
         training = model.training
         model.eval()
         found = model.generate(views, names=names, bounds=(1.0, 0.0), targets_alone=True)
-        found = seamless(found, model.config.patch)
+        found = remove_seams(found, model.config.patch)
         model.train(training)
         assert found.hint is not None
-        shown = filled(views, model.config.hints)
-        rgb, _ = composed(shown, found.decoded, found.hint)
+        shown = fill_holes(views, model.config.hints)
+        rgb, _ = compose(shown, found.decoded, found.hint)
         known, valid = (values[:, context:].flatten(0, 1) for values in (shown.depth, shown.valid))
         first, second = (d.depth.flatten(0, 1)[:, None] for d in (found.decoded, found.hint))
-        depth = corrected_depth(known, first, second, valid=valid)
+        depth = correct_depth(known, first, second, valid=valid)
         return rgb.clamp(0, 1), depth.unflatten(0, rgb.shape[:2])[:, :, 0]
 
 
@@ -181,7 +181,7 @@ def augment(
     )
     truth = colored(turned(truth))[..., rows, columns]
     cut = [turned(values)[..., rows, columns] for values in maps]
-    return cropped(views, (rows, columns)), truth, cut
+    return crop_views(views, (rows, columns)), truth, cut
 
 
 def _part(side: int, share: float, place: float) -> slice:

@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras, concatenate
-from gvtools.completers.geoverse.views import resampled
+from gvtools.completers.geoverse.views import resample
 from gvtools.errors import GvError, ProjectError
 from gvtools.scenes.collection import SceneCollection
 from gvtools.scenes.scene import View
@@ -242,7 +242,7 @@ def _resized(
 ) -> Clip:
     """A clip of one view: filtered colours, and the depth of the pixel under each centre."""
     picture = torch.from_numpy(np.ascontiguousarray(rgb)).permute(2, 0, 1)[None].float()
-    picture = resampled(picture, size)[0].permute(1, 2, 0).round().clamp(0, 255)
+    picture = resample(picture, size)[0].permute(1, 2, 0).round().clamp(0, 255)
     lengths = torch.from_numpy(np.ascontiguousarray(depth))[None, None]
     lengths = F.interpolate(lengths, size=size, mode="nearest-exact")[0]
     return Clip(

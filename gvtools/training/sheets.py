@@ -9,8 +9,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gvtools.completers.geoverse.composition import composed
-from gvtools.completers.geoverse.conditioning import encode_views, filled
+from gvtools.completers.geoverse.composition import compose
+from gvtools.completers.geoverse.conditioning import encode_views, fill_holes
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.files import replaced_when_written
 from gvtools.training.batch import TrainingBatch
@@ -34,8 +34,8 @@ def completion_sheet(model: GeoVerse, batch: TrainingBatch, *, seed: int = 0) ->
     made = model.generate(batch.views, seed=seed)
     model.train(training)
     context = batch.views.context
-    shown = filled(batch.views, model.config.hints)
-    rgb, found = composed(shown, made.decoded, made.hint)
+    shown = fill_holes(batch.views, model.config.hints)
+    rgb, found = compose(shown, made.decoded, made.hint)
     pictures = batch.images.clone()
     pictures[:, context:] = rgb.clamp(0, 1)
     depth = made.decoded.geometry.depth[:, :, None].float()

@@ -9,11 +9,11 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from gvtools.completers.geoverse.composition import composed
+from gvtools.completers.geoverse.composition import compose
 from gvtools.completers.geoverse.flow import (
     clean_from_velocity,
     fast_loss,
-    guided,
+    guide,
     interpolate,
     interval_times,
     reflow_pair,
@@ -22,8 +22,8 @@ from gvtools.completers.geoverse.flow import (
 )
 from gvtools.completers.geoverse.model import GeoVerse, Prepared
 from gvtools.completers.geoverse.objective import (
-    Prediction,
-    Reference,
+    PredictedTerms,
+    ReferenceTerms,
     flow_matching_loss,
     objective,
 )
@@ -120,8 +120,8 @@ class DenoiserStage(Stage):
                 holes = ~batch.views.valid[:, context:, 0]
                 wanted |= {"image_valid": holes, "depth_valid": holes}
         result = objective(
-            Prediction(**predicted),
-            Reference(**wanted),
+            PredictedTerms(**predicted),
+            ReferenceTerms(**wanted),
             context=batch.views.context,
             weights=options.weights,
             context_weight=options.context_weight,
@@ -140,7 +140,7 @@ class DenoiserStage(Stage):
             with torch.no_grad():
                 unmasked = prepared.hints.unmasked
                 hint = model.decode(prepared, level0, unmasked, targets_alone=True)
-        image, depth = composed(prepared.batch, decoded, hint)
+        image, depth = compose(prepared.batch, decoded, hint)
         centers = batch.centers
         if not correction:
             # A correction has the scale of the projection; a decoding has that of its centres.
@@ -198,7 +198,7 @@ class ReflowStage(Stage):
 
         without = teacher.without_cameras(known) if options.cfg_scale != 1 else known
         pair = reflow_pair(
-            guided(
+            guide(
                 lambda state, time: taught(known, state, time),
                 lambda state, time: taught(without, state, time),
                 options.cfg_scale,

@@ -10,7 +10,7 @@ import torch
 from safetensors.torch import save_file
 from tiny_scan import SQUARE, WALL, render, write_colmap_scan, write_scan
 
-from gvtools.completers.geoverse.views import resampled
+from gvtools.completers.geoverse.views import resample
 from gvtools.depth.choice import choose_source
 from gvtools.depth.foundation import source as module
 from gvtools.depth.foundation.options import FoundationOptions
@@ -18,7 +18,7 @@ from gvtools.depth.foundation.source import FoundationDepth
 from gvtools.depth.source import MixedDepth
 from gvtools.errors import CheckpointError, DegenerateError, ProjectError
 from gvtools.networks.depth_anything.encoder import EncoderConfig
-from gvtools.networks.depth_anything.geometry_head import Geometry, GeometryHeadConfig
+from gvtools.networks.depth_anything.geometry_head import GeometryHeadConfig, ViewGeometry
 from gvtools.networks.depth_anything.network import (
     RELEASED,
     DepthAnything3,
@@ -53,7 +53,7 @@ class Oracle:
         depths, centres = [], []
         for view in views:
             truth = torch.from_numpy(true_depth(view))[None, None]
-            depths.append(resampled(truth, tuple(size))[0, 0])
+            depths.append(resample(truth, tuple(size))[0, 0])
             centres.append(first[:3, :3] @ view.camera.centers[0] + first[:3, 3])
         seen = self._unit(cam_from_world, np.array(centres))
         depth = torch.stack(depths)[None].float() / seen / UNIT
@@ -66,13 +66,13 @@ class Oracle:
             depth = torch.rand(depth.shape, generator=torch.Generator()) + 0.1
         sure = torch.full_like(depth, 5.0)
         sure[..., :7] = 1.0
-        return Geometry(depth, sure, ray, torch.ones(ray.shape[:-1]))
+        return ViewGeometry(depth, sure, ray, torch.ones(ray.shape[:-1]))
 
     def _recognised(self, image, size) -> int:
         gaps = []
         for view in self.scene.views:
             rgb = torch.from_numpy(view.load().rgb).permute(2, 0, 1)[None].float() / 255
-            gaps.append(float((resampled(rgb, tuple(size))[0] - image).abs().mean()))
+            gaps.append(float((resample(rgb, tuple(size))[0] - image).abs().mean()))
         return int(np.argmin(gaps))
 
     def _unit(self, cam_from_world, centres) -> float:
@@ -179,7 +179,7 @@ class Recorder:
         ray = torch.ones(*images.shape[:2], 4, 4, 6)
         ray[..., 3:] = centres[:, :, None, None]
         depth = 1 + images.mean(2) + centres.norm(dim=-1)[..., None, None]
-        return Geometry(depth, torch.full_like(depth, 5.0), ray, torch.ones(ray.shape[:-1]))
+        return ViewGeometry(depth, torch.full_like(depth, 5.0), ray, torch.ones(ray.shape[:-1]))
 
 
 def in_another_unit(scene: Scene, factor: float) -> Scene:

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from gvtools.completers import Completer, Completion, ContextView, create
-from gvtools.completers.geoverse.composition import MOST, corrected_color, corrected_depth
+from gvtools.completers.geoverse.composition import MOST, correct_color, correct_depth
 from gvtools.completers.push_pull import push_pull, push_pull_depth
 from gvtools.errors import OptionError, ShapeError
 from gvtools.guidance import Guidance
@@ -221,15 +221,15 @@ def halves() -> tuple[torch.Tensor, torch.Tensor]:
 def test_a_pixel_that_went_wrong_spoils_no_other_of_a_correction(bad, side, column):
     filled, valid = halves()
     decoded = {"made": filled * 1.1, "hint": filled.flip(-1)}
-    plain = corrected_color(filled, **decoded, valid=valid)
+    plain = correct_color(filled, **decoded, valid=valid)
     one = first(decoded)
-    plain_depth = corrected_depth(filled[:, :1], one["made"], one["hint"], valid=valid)
+    plain_depth = correct_depth(filled[:, :1], one["made"], one["hint"], valid=valid)
     decoded[side] = decoded[side].clone()
     decoded[side][..., 3, column] = bad
-    color = corrected_color(filled, **decoded, valid=valid)
+    color = correct_color(filled, **decoded, valid=valid)
     assert (~color.isfinite()).any(1).sum() == 1
     one = first(decoded)
-    depth = corrected_depth(filled[:, :1], one["made"], one["hint"], valid=valid)
+    depth = correct_depth(filled[:, :1], one["made"], one["hint"], valid=valid)
     assert (~depth.isfinite()).sum() <= 1
     others = torch.ones(16, 16, dtype=torch.bool)
     others[3, column] = False
@@ -247,6 +247,6 @@ def test_a_correction_of_depth_saturates():
     filled, valid = halves()
     wild = torch.where(valid, filled[:, :1], filled[:, :1] * 1e30)
     for made, hint, factor in ((wild, filled[:, :1], MOST), (filled[:, :1], wild, 1 / MOST)):
-        found = corrected_depth(filled[:, :1], made, hint, valid=valid)
+        found = correct_depth(filled[:, :1], made, hint, valid=valid)
         hole = ~valid
         torch.testing.assert_close(found[hole], factor * filled[:, :1][hole])

@@ -148,7 +148,7 @@ def test_homographies_are_opencvs():
     H = np.eye(3) + rng.normal(0, 0.2, (3, 3))
     target = np.concatenate([source, np.ones((60, 1))], 1) @ H.T
     target = target[:, :2] / target[:, 2:]
-    found, share = ray_fits.fit(*map(torch.from_numpy, (source, target, np.ones(60))))
+    found, share = ray_fits.fit_homography(*map(torch.from_numpy, (source, target, np.ones(60))))
     expected, _ = cv2.findHomography(source, target)
     np.testing.assert_allclose(found / found[2, 2], expected, atol=1e-6)
     assert share > 1e-6
@@ -167,7 +167,7 @@ def test_homographies_of_noisy_points_are_the_singular_vector():
     )
     expected = np.linalg.svd(rows)[2][-1].reshape(3, 3)
     arrays = (np.stack([x, y], 1), np.stack([u, v], 1), weight)
-    found, _ = ray_fits.fit(*map(torch.from_numpy, arrays))
+    found, _ = ray_fits.fit_homography(*map(torch.from_numpy, arrays))
     np.testing.assert_allclose(
         found / found.norm() * np.sign(float(found[2, 2]) * expected[2, 2]), expected, atol=1e-9
     )

@@ -25,16 +25,16 @@ from gvtools.completers.base import (
 )
 from gvtools.completers.geoverse.composition import (
     Completed,
-    averaged,
-    corrected,
-    refined,
-    seamless,
+    average_fill,
+    correct,
+    refine,
+    remove_seams,
     to_scene_scale,
 )
-from gvtools.completers.geoverse.conditioning import filled
+from gvtools.completers.geoverse.conditioning import fill_holes
 from gvtools.completers.geoverse.flow import interval_bounds
 from gvtools.completers.geoverse.model import GeoVerse
-from gvtools.completers.geoverse.views import chosen_views, context_depth, model_size, view_batch
+from gvtools.completers.geoverse.views import choose_views, context_depth, model_size, view_batch
 from gvtools.completers.geoverse.weights import check_headers, from_pretrained
 from gvtools.completers.push_pull import Filled
 from gvtools.completers.settings import CompleterSettings
@@ -183,7 +183,7 @@ class GeoVerseCompleter(Completer):
                 rows = incomplete[first : first + targets_per_pass]
                 part = guidance.select(rows)
                 fill = None if filled is None else filled.rows(range(first, first + len(rows)))
-                chosen = chosen_views(
+                chosen = choose_views(
                     context, part.cameras, part.depth if fill is None else fill.depth,
                     count=context_count, selection=self.settings.context_selection,
                 )  # fmt: skip
@@ -223,7 +223,7 @@ class GeoVerseCompleter(Completer):
         base = None
         corrects = self.config.composition == "correction" and options.composition != "decoded"
         if corrects and options.output == "holes":
-            base = averaged(part) if fill is None else fill
+            base = average_fill(part) if fill is None else fill
         # Depth of ``base`` is in scene units. Only its pixels without depth take decoded depth,
         # which has to be brought to the memory's scale first.
         base_is_complete = base is not None and bool((base.depth > 0).all())
@@ -252,13 +252,13 @@ class GeoVerseCompleter(Completer):
 
         if base is None:
             return decoded_in_scene_units(options.color_alignment or self.config.color_alignment)
-        generated = seamless(generated, self.config.patch)
+        generated = remove_seams(generated, self.config.patch)
         back = None if base_is_complete else decoded_in_scene_units("unchanged")
-        completed = corrected(generated, part, base, back=back)
+        completed = correct(generated, part, base, back=back)
         if self.model.refiner is None:
             return completed
-        batch = filled(batch.to(self._device), self.config.hints)
-        return refined(completed, part, self.model.refiner, batch=batch, generated=generated)
+        batch = fill_holes(batch.to(self._device), self.config.hints)
+        return refine(completed, part, self.model.refiner, batch=batch, generated=generated)
 
     @property
     def _device(self) -> torch.device:

@@ -21,10 +21,10 @@ from torch import Tensor
 from gvtools.cameras import Cameras
 from gvtools.completers.base import Completion, ScaleAlignment, ScaleStatus, camera_rays
 from gvtools.completers.geoverse.conditioning import ViewBatch
-from gvtools.completers.geoverse.depth_scale import MAX_FACTOR, both_known, pass_scale, scaled_depth
+from gvtools.completers.geoverse.depth_scale import MAX_FACTOR, both_known, pass_scale, scale_depth
 from gvtools.completers.geoverse.model import Decoded, Generated
 from gvtools.completers.geoverse.refiner import Refiner, completed_views
-from gvtools.completers.geoverse.views import resampled, resampled_depth
+from gvtools.completers.geoverse.views import resample, resample_depth
 from gvtools.completers.push_pull import Filled, push_pull, push_pull_depth
 from gvtools.guidance import Guidance
 
@@ -62,7 +62,7 @@ def without_seams(values: Tensor, patch: int) -> Tensor:
     return values - steps + F.interpolate(mean, size=size, mode="bilinear", align_corners=False)
 
 
-def seamless(made: Generated, patch: int) -> Generated:
+def remove_seams(made: Generated, patch: int) -> Generated:
     """A pass whose pictures are ``without_seams``."""
 
     def joined(found: Decoded) -> Decoded:
@@ -74,7 +74,7 @@ def seamless(made: Generated, patch: int) -> Generated:
     return replace(made, decoded=joined(made.decoded), hint=hint)
 
 
-def corrected_color(filled: Tensor, made: Tensor, hint: Tensor, *, valid: Tensor) -> Tensor:
+def correct_color(filled: Tensor, made: Tensor, hint: Tensor, *, valid: Tensor) -> Tensor:
     """The filled projection plus what the model changed, (N, 3, H, W) each; not clipped to [0, 1].
 
     A pixel that is not finite in either decoding stays so, alone. ``valid`` is (N, 1, H, W).
@@ -84,7 +84,7 @@ def corrected_color(filled: Tensor, made: Tensor, hint: Tensor, *, valid: Tensor
     return filled + change - push_pull(change, known)
 
 
-def corrected_depth(
+def correct_depth(
     filled: Tensor,  # (N, 1, H, W) z-depth, scene units; 0 = none, and stays so
     made: Tensor,  # likewise, model units, above 0
     hint: Tensor,  # likewise
@@ -105,7 +105,7 @@ def corrected_depth(
     return filled * change.clamp(-limit, limit).exp()
 
 
-def composed(batch: ViewBatch, made: Decoded, hint: Decoded | None) -> tuple[Tensor, Tensor]:
+def compose(batch: ViewBatch, made: Decoded, hint: Decoded | None) -> tuple[Tensor, Tensor]:
     """Pictures (B, T, 3, H, W) and depth (B, T, H, W) of the targets, as training judges them.
 
     At the model's size, every correction of depth counting in full; ``batch`` is filled as the
@@ -119,10 +119,10 @@ def composed(batch: ViewBatch, made: Decoded, hint: Decoded | None) -> tuple[Ten
         value[:, batch.context :].flatten(0, 1)
         for value in (batch.images, batch.depth, batch.valid)
     )
-    color = corrected_color(filled, rgb.flatten(0, 1), hint.rgb.float().flatten(0, 1), valid=valid)
+    color = correct_color(filled, rgb.flatten(0, 1), hint.rgb.float().flatten(0, 1), valid=valid)
     first, second = (found.depth.flatten(0, 1)[:, None] for found in (made, hint))
     # The smallest corrections and the worst would have no gradient.
-    length = corrected_depth(known, first, second, valid=valid, certain=0.0, most=FAR)
+    length = correct_depth(known, first, second, valid=valid, certain=0.0, most=FAR)
     mask = (known > 0).unflatten(0, shape)
     color, length = color.unflatten(0, shape), length.unflatten(0, shape)
     return torch.where(mask, color, rgb), torch.where(mask[:, :, 0], length[:, :, 0], depth)
@@ -160,21 +160,21 @@ def to_scene_scale(
     *,
     known: NDArray[np.float32],  # (C, h, w) depth of the context at the model's size
     alignment: str,  # see ``depth_scale``
-    color_alignment: str,  # "field" for ``aligned_color``, or "unchanged"
+    color_alignment: str,  # "field" for ``align_color``, or "unchanged"
 ) -> Completed:
     """Pictures, depth, confidence and rays of the targets at their own size, in scene units."""
     geometry, context = generated.decoded.geometry, len(known)
     full = (guidance.depth.shape[1], guidance.depth.shape[2])
-    rgb = resampled(generated.decoded.rgb[0].float().cpu(), full).clamp(0, 1)
+    rgb = resample(generated.decoded.rgb[0].float().cpu(), full).clamp(0, 1)
     if color_alignment == "field":
         hint = torch.from_numpy(guidance.rgb).permute(0, 3, 1, 2)
-        rgb = aligned_color(rgb, hint, torch.from_numpy(guidance.valid)[:, None])
-    depth = resampled_depth(generated.decoded.depth[0].float().cpu(), full)
+        rgb = align_color(rgb, hint, torch.from_numpy(guidance.valid)[:, None])
+    depth = resample_depth(generated.decoded.depth[0].float().cpu(), full)
     world_from_cam = cameras.world_from_cam
     whole = pass_scale(geometry, world_from_cam, known)
     # A pixel without a colour has no depth either: nothing of it enters the memory.
     depth = torch.where(rgb.isfinite().all(1), depth, torch.nan)
-    scaled = scaled_depth(depth, guidance.depth, guidance.valid, whole=whole, alignment=alignment)
+    scaled = scale_depth(depth, guidance.depth, guidance.valid, whole=whole, alignment=alignment)
     confidence = _certainty(generated.decoded.depth_confidence[0], full)
     confidence[~((scaled.depth > 0) & np.isfinite(confidence))] = 0
     found = scaled.scale[np.isfinite(scaled.scale)]
@@ -187,7 +187,7 @@ def to_scene_scale(
     return Completed(picture, scaled.depth, confidence, rays, scaled.scale, scaled.alignment)
 
 
-def aligned_color(rgb: Tensor, hint: Tensor, valid: Tensor) -> Tensor:
+def align_color(rgb: Tensor, hint: Tensor, valid: Tensor) -> Tensor:
     """Pictures (T, 3, H, W) plus the push-pull of ``hint - rgb`` over valid pixels, in [0, 1].
 
     What a small network decodes is off by a little all over, and a hole's fill then shows its rim.
@@ -198,7 +198,7 @@ def aligned_color(rgb: Tensor, hint: Tensor, valid: Tensor) -> Tensor:
     return (rgb + offset).clamp(0, 1)
 
 
-def corrected(
+def correct(
     generated: Generated, guidance: Guidance, fill: Filled, *, back: Completed | None = None
 ) -> Completed:
     """The filled projection with what the model changed, in views that memory tells of.
@@ -209,11 +209,11 @@ def corrected(
     full = (guidance.depth.shape[1], guidance.depth.shape[2])
     color, length = torch.from_numpy(fill.rgb).permute(0, 3, 1, 2), torch.from_numpy(fill.depth)
     decoded = (generated.decoded, generated.hint)
-    colors = [resampled(found.rgb[0].float().cpu(), full) for found in decoded]
-    depths = [resampled_depth(found.depth[0].float().cpu(), full)[:, None] for found in decoded]
+    colors = [resample(found.rgb[0].float().cpu(), full) for found in decoded]
+    depths = [resample_depth(found.depth[0].float().cpu(), full)[:, None] for found in decoded]
     valid = torch.from_numpy(guidance.valid)[:, None]
-    rgb = corrected_color(color, *colors, valid=valid).clamp(0, 1).permute(0, 2, 3, 1)
-    depth = corrected_depth(length[:, None], *depths, valid=valid)[:, 0]
+    rgb = correct_color(color, *colors, valid=valid).clamp(0, 1).permute(0, 2, 3, 1)
+    depth = correct_depth(length[:, None], *depths, valid=valid)[:, 0]
     known = ((length > 0) & rgb.isfinite().all(-1) & depth.isfinite()).numpy()
     scales = depth_ratios(guidance, depths[0][:, 0].numpy())
     if back is None:
@@ -242,7 +242,7 @@ def corrected(
 
 
 @torch.no_grad()
-def refined(
+def refine(
     completed: Completed,  # at the targets' size
     guidance: Guidance,  # the targets' projections
     refiner: Refiner,  # on the device of the pass
@@ -252,14 +252,14 @@ def refined(
 ) -> Completed:
     """Completed views with the refiner's colours, and its confidence, in their holes."""
     full = (guidance.depth.shape[1], guidance.depth.shape[2])
-    made, _ = composed(batch, generated.decoded, generated.hint)
+    made, _ = compose(batch, generated.decoded, generated.hint)
     finite = made.isfinite()
     found = refiner(completed_views(batch, torch.where(finite, made, 0.0)))
     found = replace(found, **{name: values.cpu() for name, values in vars(found).items()})
     valid = torch.from_numpy(guidance.valid)[:, None]
     rgb = torch.from_numpy(completed.rgb).permute(0, 3, 1, 2)
     rgb = found.colors(rgb, valid).clamp(0, 1)
-    right = resampled(found.depth_right, full).sigmoid()[:, 0].numpy()
+    right = resample(found.depth_right, full).sigmoid()[:, 0].numpy()
     certain = np.where(completed.depth > 0, REFINED * right**4, 0)
     # Where the model's depth is far from the memory's, what was said before holds, too.
     unscaled = ~np.isfinite(completed.scales)[:, None, None]
@@ -289,11 +289,11 @@ def depth_ratios(guidance: Guidance, generated: NDArray[np.float32]) -> NDArray[
 
 def _certainty(confidence: Tensor, full: tuple[int, int]) -> NDArray[np.float32]:
     """(T, h, w) confidence of a head, from 1, as (T, H, W) in [0, ``GENERATED``]."""
-    certain = resampled(confidence.float().cpu()[:, None], full)[:, 0]
+    certain = resample(confidence.float().cpu()[:, None], full)[:, 0]
     return (GENERATED * (1 - 1 / certain.clamp_min(1))).numpy().astype(np.float32)
 
 
-def averaged(guidance: Guidance) -> Filled:
+def average_fill(guidance: Guidance) -> Filled:
     """Projections filled as the model fills them, at their own size."""
     valid = torch.from_numpy(guidance.valid)[:, None]
     color = push_pull(torch.from_numpy(guidance.rgb).permute(0, 3, 1, 2), valid)
@@ -305,7 +305,7 @@ def _plucker(
     ray: Tensor, world_from_first: NDArray[np.float64], unit: float, *, full: tuple[int, int]
 ) -> NDArray[np.float32]:
     """Predicted (T, h, w, 6) rays of the first view's frame as (T, H, W, 6) world Plücker rays."""
-    maps = resampled(ray.float().cpu().permute(0, 3, 1, 2), full).permute(0, 2, 3, 1).double()
+    maps = resample(ray.float().cpu().permute(0, 3, 1, 2), full).permute(0, 2, 3, 1).double()
     rotation = torch.from_numpy(world_from_first[:3, :3].copy())
     direction = torch.nn.functional.normalize(maps[..., :3] @ rotation.T, dim=-1)
     origin = maps[..., 3:] * unit @ rotation.T

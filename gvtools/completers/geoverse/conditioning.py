@@ -175,7 +175,7 @@ def depth_condition(depth: Tensor, valid: Tensor, scale: Tensor) -> Tensor:
     return torch.cat((log, known.to(log.dtype)), dim=2)
 
 
-def filled(batch: ViewBatch, config: HintConfig) -> ViewBatch:
+def fill_holes(batch: ViewBatch, config: HintConfig) -> ViewBatch:
     """The batch with its holes filled as ``config.fill`` says; what has depth is kept."""
     if config.fill == "none":
         return batch
@@ -192,7 +192,7 @@ def encode_hints(
     level0: LatentStatistics,
     level1: LatentStatistics,
     *,
-    batch: ViewBatch,  # its holes filled already where they should be (``filled``)
+    batch: ViewBatch,  # its holes filled already where they should be (``fill_holes``)
     config: HintConfig,
 ) -> Hints:
     """Eq. 1 for every sample of a batch (see the module)."""

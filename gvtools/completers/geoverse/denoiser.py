@@ -115,9 +115,9 @@ class DenoiserBlock(nn.Module):
     ) -> Tensor:
         """Tokens under their conditioning."""
         shift1, scale1, gate1, shift2, scale2, gate2 = self.adaLN_modulation(c).chunk(6, dim=-1)
-        inner = modulated(self.norm1(x), shift1, scale1).flatten(1, 2)
+        inner = modulate(self.norm1(x), shift1, scale1).flatten(1, 2)
         x = x + gate1 * self.attn(inner, positions, video).view_as(x)
-        return x + gate2 * self.mlp(modulated(self.norm2(x), shift2, scale2))
+        return x + gate2 * self.mlp(modulate(self.norm2(x), shift2, scale2))
 
 
 class FinalLayer(nn.Module):
@@ -132,10 +132,10 @@ class FinalLayer(nn.Module):
     def forward(self, x: Tensor, c: Tensor) -> Tensor:
         """(B, V, N, width) under (B, V, N, width) to (B, V, N, channels)."""
         shift, scale = self.adaLN_modulation(c).chunk(2, dim=-1)
-        return self.linear(modulated(self.norm_final(x), shift, scale))
+        return self.linear(modulate(self.norm_final(x), shift, scale))
 
 
-def modulated(x: Tensor, shift: Tensor, scale: Tensor) -> Tensor:
+def modulate(x: Tensor, shift: Tensor, scale: Tensor) -> Tensor:
     """``x`` (1 + scale) + shift."""
     return x * (1 + scale) + shift
 

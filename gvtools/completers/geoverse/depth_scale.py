@@ -19,7 +19,7 @@ from gvtools.completers.base import ScaleAlignment, ScaleStatus
 from gvtools.completers.geoverse.objective import center_similarity
 from gvtools.completers.push_pull import push_pull
 from gvtools.errors import DegenerateError
-from gvtools.networks.depth_anything.geometry_head import Geometry
+from gvtools.networks.depth_anything.geometry_head import ViewGeometry
 from gvtools.networks.depth_anything.rays import camera_centres
 from gvtools.similarity import ScaleFit, align_depth_scale
 
@@ -61,7 +61,7 @@ class PassScale:
 
 
 def pass_scale(
-    geometry: Geometry,  # (1, V, ...) of a pass
+    geometry: ViewGeometry,  # (1, V, ...) of a pass
     world_from_cam: NDArray[np.float64],  # (V, 4, 4), scene units
     # (C, H, W) depth of the context views at the model's size, scene units; 0 = none.
     known: NDArray[np.float32],
@@ -69,7 +69,7 @@ def pass_scale(
     """s* from the camera centres, unless the context's own depth says otherwise."""
     centres = centre_scale(geometry, world_from_cam)
     generated = geometry.depth[0, : len(known)].float().cpu().numpy().astype(np.float64)
-    fit = _fitted(generated, known, known > 0)
+    fit = _fit_scale(generated, known, known > 0)
     if fit.support < 20 or int((known > 0).sum()) < MIN_SUPPORT:
         return centres
     if not fit.ok:
@@ -80,7 +80,7 @@ def pass_scale(
     return replace(centres, scale=fit.scale, status=ScaleStatus.CONTEXT_DEPTH)
 
 
-def centre_scale(geometry: Geometry, world_from_cam: NDArray[np.float64]) -> PassScale:
+def centre_scale(geometry: ViewGeometry, world_from_cam: NDArray[np.float64]) -> PassScale:
     """s* between predicted and requested camera centres (V), where they support it."""
     refused = PassScale(float("nan"), ScaleStatus.UNSUPPORTED)
     try:
@@ -99,7 +99,7 @@ def centre_scale(geometry: Geometry, world_from_cam: NDArray[np.float64]) -> Pas
     return found
 
 
-def scaled_depth(
+def scale_depth(
     depth: Tensor,  # (T, H, W) of the model, at the hint's resolution
     hint: NDArray[np.float32],  # (T, H, W) the memory's depth, scene units
     valid: NDArray[np.bool_],  # (T, H, W) where it is known
@@ -139,7 +139,7 @@ def _view_scale(
     alignment: str,
 ) -> tuple[float, ScaleAlignment]:
     """Scene units per unit of the model for one view, NaN where refused, and what it rests on."""
-    fit = _fitted(depth, hint, valid)
+    fit = _fit_scale(depth, hint, valid)
     candidates = {
         "centres": (whole.scale, whole.status),
         "hint": (fit.scale, ScaleStatus.MEMORY_DEPTH),
@@ -166,7 +166,7 @@ def _view_scale(
     return np.nan, outcome(status, np.nan, fit.residual, overlap=fit.support)
 
 
-def _fitted(
+def _fit_scale(
     depth: NDArray[np.floating[Any]], known: NDArray[np.float32], valid: NDArray[np.bool_]
 ) -> ScaleFit:
     """The robust scale to what is known, on about ``FITTED`` pixels."""

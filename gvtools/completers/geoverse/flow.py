@@ -148,7 +148,7 @@ def velocity_from_clean(
     return ((state - clean) / time).to(state.dtype)
 
 
-def guided(velocity: Velocity, unconditional: Velocity | None, scale: float) -> Velocity:
+def guide(velocity: Velocity, unconditional: Velocity | None, scale: float) -> Velocity:
     """Classifier-free guidance u = unconditional + scale (conditional - unconditional)."""
     check_range("cfg_scale", scale, ge=0, lt=math.inf)
     if scale == 1:
@@ -198,11 +198,11 @@ def sample(
     *,
     # The network without the condition that ``cfg_scale`` is to strengthen.
     unconditional: Velocity | None = None,
-    cfg_scale: float = 1.0,  # of classifier-free guidance, 1 = none, see ``guided``
+    cfg_scale: float = 1.0,  # of classifier-free guidance, 1 = none, see ``guide``
     callback: Callable[[int, Tensor, Tensor], None] | None = None,
 ) -> Tensor:  # The state (B, ...) at the last bound
     """From noise to clean with one Euler step an interval."""
-    step = guided(velocity, unconditional, cfg_scale)
+    step = guide(velocity, unconditional, cfg_scale)
     return integrate(step, noise, check_bounds(bounds), callback=callback)
 
 
@@ -271,7 +271,7 @@ def teacher_times(upper: Tensor, lower: Tensor, *, steps: int, shift: float = 1.
 
 
 def reflow_pair(
-    # The many-step velocity of (B, ...) and t (B,); with guidance, see ``flow.guided``.
+    # The many-step velocity of (B, ...) and t (B,); with guidance, see ``flow.guide``.
     teacher: Velocity,
     clean: Tensor,  # (B, ...) reference latents F^1
     noise: Tensor,  # (B, ...)

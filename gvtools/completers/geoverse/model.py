@@ -26,7 +26,7 @@ from gvtools.completers.geoverse.conditioning import (
     depth_condition,
     encode_hints,
     encode_latents,
-    filled,
+    fill_holes,
 )
 from gvtools.completers.geoverse.config import GeoVerseConfig
 from gvtools.completers.geoverse.denoiser import Conditions, Denoiser, Positions, VideoKeys
@@ -45,7 +45,7 @@ from gvtools.completers.geoverse.video_injection import ControlBranch, SharedAtt
 from gvtools.completers.geoverse.video_prior import VideoFeatures, VideoPrior
 from gvtools.errors import CheckpointError, GvError, ShapeError
 from gvtools.networks.compute import hold_in
-from gvtools.networks.depth_anything.geometry_head import Geometry
+from gvtools.networks.depth_anything.geometry_head import ViewGeometry
 from gvtools.networks.depth_anything.network import DepthAnything3
 from gvtools.networks.tensors import first_line
 
@@ -97,10 +97,10 @@ class Decoded:
     depth: Tensor  # (B, T, H, W) z-depth of the target views, in the model's unit
     depth_confidence: Tensor  # (B, T, H, W) > 1
     # The geometry of all V views; None where the targets' depth alone was decoded.
-    all_views: Geometry | None = None
+    all_views: ViewGeometry | None = None
 
     @property
-    def geometry(self) -> Geometry:
+    def geometry(self) -> ViewGeometry:
         """Of all V views, in the frame of the first view."""
         if self.all_views is None:
             raise ShapeError("the targets' depth alone was decoded, not the geometry of all views")
@@ -242,7 +242,7 @@ class GeoVerse(nn.Module):
         config = self.config
         with self.clock(HINTS):
             source = batch
-            batch = filled(batch, config.hints)
+            batch = fill_holes(batch, config.hints)
             camera = camera_condition(
                 torch.linalg.inv(batch.cam_from_world),
                 batch.K,

@@ -273,7 +273,7 @@ class LossWeights:
 
 
 @dataclass(frozen=True, eq=False)
-class Prediction:
+class PredictedTerms:
     """What the model gave; what is None has no term. V views, context first; T target views."""
 
     level1: Tensor | None = None  # (B, V, C, h, w) velocity
@@ -284,7 +284,7 @@ class Prediction:
 
 
 @dataclass(frozen=True, eq=False)
-class Reference(Prediction):
+class ReferenceTerms(PredictedTerms):
     """The truth of each; lengths in scene units, depth that is not finite or not above 0 = none."""
 
     image_valid: Tensor | None = None  # (B, T, H, W) bool, None = all
@@ -313,8 +313,8 @@ class Objective:
 
 
 def objective(
-    prediction: Prediction,  # see ``Prediction``
-    reference: Reference,  # has to hold whatever is predicted
+    prediction: PredictedTerms,  # see ``PredictedTerms``
+    reference: ReferenceTerms,  # has to hold whatever is predicted
     *,
     context: int,  # number of context views, which come first
     weights: LossWeights | None = None,  # None is ``LossWeights()``
@@ -338,7 +338,7 @@ def objective(
 
 
 def _parts(
-    prediction: Prediction, reference: Reference, context: int, *, context_weight: float
+    prediction: PredictedTerms, reference: ReferenceTerms, context: int, *, context_weight: float
 ) -> tuple[dict[str, Callable[[], Tensor]], dict[str, Tensor]]:
     """The terms, not yet computed, and what they stand on."""
     parts: dict[str, Callable[[], Tensor]] = {}
@@ -368,7 +368,7 @@ def _parts(
     return parts, counts
 
 
-def _wanted(reference: Reference, name: str) -> Tensor:
+def _wanted(reference: ReferenceTerms, name: str) -> Tensor:
     value: Tensor | None = getattr(reference, name)
     if value is None:
         raise OptionError(f"objective: {name} was predicted but the reference has none")

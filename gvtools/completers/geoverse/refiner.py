@@ -18,7 +18,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from gvtools.completers.geoverse.conditioning import ViewBatch
-from gvtools.completers.geoverse.views import resampled
+from gvtools.completers.geoverse.views import resample
 from gvtools.completers.push_pull import push_pull
 from gvtools.networks.config_json import check_range
 
@@ -78,7 +78,7 @@ class Refinement:
     def colors(self, made: Tensor, valid: Tensor) -> Tensor:
         """(N, 3, H, W) refined pictures of any size; what the memory knows stays."""
         size = (made.shape[-2], made.shape[-1])
-        mixed = resampled(self.share, size) * made + resampled(self.rest, size)
+        mixed = resample(self.share, size) * made + resample(self.rest, size)
         return torch.where(valid, made, mixed)
 
 
@@ -123,7 +123,7 @@ class Refiner(nn.Module):
 
     def forward(self, views: CompletedViews) -> Refinement:
         """What to make of N views."""
-        small = _halved(views)
+        small = _halve(views)
         mean = _mean_color(small)
         guesses = _guesses(small, mean)
         x = self.enter(_inputs(views, small, mean=mean, pulled=guesses[2]))
@@ -174,7 +174,7 @@ class _Half(CompletedViews):
     known: Tensor  # (N, 3, h, w) sum of known colours, in shares of the pixels
 
 
-def _halved(views: CompletedViews) -> _Half:
+def _halve(views: CompletedViews) -> _Half:
     known = views.valid.to(views.filled.dtype)
     filled, evidence, made, share, colors = (
         F.avg_pool2d(values, 2, ceil_mode=True, count_include_pad=False)
@@ -202,13 +202,13 @@ def _some_known(small: _Half) -> Tensor:
 
 def _guesses(small: _Half, mean: Tensor) -> list[Tensor]:
     """GUESSES pictures (N, 3, h, w), from sharp to smooth."""
-    weight = _blurred(small.share, KNOWN) + PRIOR_WEIGHT
+    weight = _blur(small.share, KNOWN) + PRIOR_WEIGHT
     pulled = push_pull(small.known / small.share.clamp_min(1e-6), small.valid)
     return [
-        _blurred(small.made, NARROW),
-        _blurred(small.made, WIDE),
+        _blur(small.made, NARROW),
+        _blur(small.made, WIDE),
         torch.where(_some_known(small), pulled, mean),
-        (_blurred(small.known, KNOWN) + PRIOR_WEIGHT * mean) / weight,
+        (_blur(small.known, KNOWN) + PRIOR_WEIGHT * mean) / weight,
         mean.expand_as(small.made),
     ]
 
@@ -255,7 +255,7 @@ def distance_to(known: Tensor) -> Tensor:
     return (across + along[:, :, None]).amin(3).clamp_max(none).sqrt()[:, None]
 
 
-def _blurred(values: Tensor, share: float) -> Tensor:
+def _blur(values: Tensor, share: float) -> Tensor:
     """Gaussian means within the picture; ``share`` of its longer side is the deviation."""
     height, width = values.shape[-2:]
     deviation = share * max(height, width)
@@ -268,7 +268,7 @@ def _blurred(values: Tensor, share: float) -> Tensor:
     return down @ values @ right.T
 
 
-def cropped(views: CompletedViews, window: tuple[slice, slice]) -> CompletedViews:
+def crop_views(views: CompletedViews, window: tuple[slice, slice]) -> CompletedViews:
     """The same window of all views; its sides are even."""
     rows, columns = window
     names = ("filled", "depth", "valid", "evidence", "made")

@@ -131,7 +131,7 @@ class VideoPriorConfig:
         return max(1, round(rows / unit)) * unit, max(1, round(columns / unit)) * unit
 
 
-def resized(images: Tensor, valid: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+def resize_views(images: Tensor, valid: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """Views (B, V, 3, H, W), 0 where not valid, and validity (B, V, 1, H, W) in another size.
 
     Both float32. Colours of invalid pixels do not bleed in; validity is the nearest pixel's.
@@ -287,7 +287,7 @@ class VideoPrior:
     ) -> tuple[Tensor, Tensor]:
         """Views (B, V, 3, H', W') in [-1, 1], 0 where not shown, and shown (B, V, 1, H', W')."""
         size = self.config.size(images.shape[-2], images.shape[-1])
-        seen, shown = resized(images, valid, size)
+        seen, shown = resize_views(images, valid, size)
         noise = self._noise("rgb", seeds, (3, *size))
         noise[:, :context] = 0
         return (2 * seen - 1 + self.config.proxy_noise * noise) * shown, shown

@@ -38,14 +38,14 @@ def model_size(height: int, width: int, *, longest: int, patch: int) -> tuple[in
     return rows, columns
 
 
-def resampled(x: Tensor, size: tuple[int, int]) -> Tensor:
+def resample(x: Tensor, size: tuple[int, int]) -> Tensor:
     """(B, C, h, w) to (B, C, H, W): bilinear, with an antialias filter where it shrinks."""
     if tuple(x.shape[-2:]) == size:
         return x
     return F.interpolate(x, size=size, mode="bilinear", align_corners=False, antialias=True)
 
 
-def resampled_depth(depth: Tensor, size: tuple[int, int]) -> Tensor:
+def resample_depth(depth: Tensor, size: tuple[int, int]) -> Tensor:
     """(T, h, w) depth > 0 to (T, H, W), with none that lies between two surfaces.
 
     Within a surface the inverse of the depth is interpolated, which keeps a plane a plane; at an
@@ -60,11 +60,11 @@ def resampled_depth(depth: Tensor, size: tuple[int, int]) -> Tensor:
     farthest = F.max_pool2d(depth[:, None], 3, stride=1, padding=1)
     closest = -F.max_pool2d(-depth[:, None], 3, stride=1, padding=1)
     edge = F.interpolate((farthest > EDGE * closest).float(), size=size, mode="nearest-exact")
-    smooth = 1 / resampled(1 / depth[:, None], size)
+    smooth = 1 / resample(1 / depth[:, None], size)
     return torch.where(edge > 0, nearest, smooth)[:, 0]
 
 
-def chosen_views(
+def choose_views(
     context: Sequence[ContextView],  # to choose from
     targets: Cameras,  # V cameras of one picture size
     # (V, H, W) z-depth of the targets, scene units, filled where that is possible.
@@ -102,7 +102,7 @@ def view_batch(
     for view in context:
         picture, observed, camera = _cropped(view, height / width)
         image = torch.from_numpy(np.ascontiguousarray(picture)).permute(2, 0, 1)[None].float()
-        pictures.append(resampled(image, size)[0].clamp(0, 1))
+        pictures.append(resample(image, size)[0].clamp(0, 1))
         depths.append(_nearest(observed, size))
         cameras.append(camera.resized(size[1], size[0]))
     rgb, projected, valid = _reduced(targets, size)
@@ -168,7 +168,7 @@ def _cropped(
 def _over(rgb: Tensor, depth: Tensor, valid: Tensor, *, fill: Filled) -> tuple[Tensor, Tensor]:
     """Projections (T, 3, h, w) and (T, 1, h, w) over a fill of any size, where that has depth."""
     size = (rgb.shape[-2], rgb.shape[-1])
-    color = resampled(torch.from_numpy(fill.rgb).permute(0, 3, 1, 2).float(), size).clamp(0, 1)
+    color = resample(torch.from_numpy(fill.rgb).permute(0, 3, 1, 2).float(), size).clamp(0, 1)
     lengths = torch.from_numpy(fill.depth).float()[:, None]
     lengths = F.interpolate(lengths, size=size, mode="nearest-exact")
     color = torch.where(lengths > 0, color, 0.0)
@@ -179,7 +179,7 @@ def _evidence(fill: Filled, context: int, size: tuple[int, int]) -> Tensor:
     """(1, V, 2, h, w) confidence of the fill and weight of the photographs; 0 on the context."""
     nothing = np.zeros_like(fill.depth)
     maps = [nothing if known is None else known for known in (fill.confidence, fill.looked_up)]
-    evidence = resampled(torch.from_numpy(np.stack(maps, 1)), size).clamp(0, 1)
+    evidence = resample(torch.from_numpy(np.stack(maps, 1)), size).clamp(0, 1)
     return torch.cat((evidence.new_zeros((context, 2, *size)), evidence))[None]
 
 
@@ -200,8 +200,8 @@ def _reduced(targets: Guidance, size: tuple[int, int]) -> tuple[Tensor, Tensor, 
         )
     )
     rgb, depth = rgb.permute(0, 3, 1, 2), depth[:, None]
-    share = resampled(torch.from_numpy(targets.valid).float()[:, None], size)
-    colour = resampled(rgb, size) / share.clamp_min(1e-6)
+    share = resample(torch.from_numpy(targets.valid).float()[:, None], size)
+    colour = resample(rgb, size) / share.clamp_min(1e-6)
     valid = share >= VALID_SHARE
     nearest = F.interpolate(depth, size=size, mode="nearest-exact")
     # Where the centre's own pixel is a hole, the greatest depth under the cell: the far side.

@@ -29,9 +29,9 @@ from gvtools.errors import CheckpointError
 from gvtools.files import replaced_when_written
 from gvtools.networks.depth_anything import network as da3
 from gvtools.networks.tensors import (
-    Fit,
     TensorFiles,
-    fit,
+    TensorFit,
+    compare_tensors,
     load,
     not_finite,
     plain_tensors,
@@ -248,7 +248,7 @@ class PartReport:
     path: Path | None  # its file or folder
     ok: bool  # it can be loaded, or the model does without it
     summary: str
-    fit: Fit | None = None  # names, shapes and types, where a file could be read
+    fit: TensorFit | None = None  # names, shapes and types, where a file could be read
     bytes: int = 0  # on disk
     parameters: int = 0  # numbers in the tensors that fit
     types: tuple[str, ...] = ()  # what they are stored as
@@ -256,7 +256,7 @@ class PartReport:
 
     def to_dict(self) -> dict[str, Any]:
         """For a JSON file."""
-        found = asdict(self.fit or Fit(0, (), (), (), ()))
+        found = asdict(self.fit or TensorFit(0, (), (), (), ()))
         own = {key: value for key, value in vars(self).items() if key != "fit"}
         tensors = found.pop("expected") if self.fit else None
         path = None if self.path is None else str(self.path)
@@ -316,7 +316,7 @@ def examine(
         summary = str(error).removeprefix(f"{path}: ")
         return PartReport(part.name, path, False, summary, bytes=size), {}
     expected = expected_of(model, part)
-    found = fit(tensors, expected)
+    found = compare_tensors(tensors, expected)
     left = {}
     if part.lenient:
         left = {"missing": found.missing, "unexpected": found.unexpected}

@@ -16,13 +16,13 @@ import torch
 
 from gvtools.cameras import concatenate
 from gvtools.completers.geoverse.camera_encoding import normalised_poses
-from gvtools.completers.geoverse.views import model_size, resampled, resampled_depth
+from gvtools.completers.geoverse.views import model_size, resample, resample_depth
 from gvtools.depth.foundation.options import FoundationOptions
 from gvtools.depth.foundation.scale import FoundationScale, Pass, fit_scale
 from gvtools.depth.source import DepthMap
 from gvtools.errors import CheckpointError, DegenerateError, OptionError
 from gvtools.networks.compute import autocast, inference_type
-from gvtools.networks.depth_anything.geometry_head import Geometry
+from gvtools.networks.depth_anything.geometry_head import ViewGeometry
 from gvtools.networks.depth_anything.network import (
     DepthAnything3,
     find_weights,
@@ -95,8 +95,8 @@ class FoundationDepth:
         factor = made.unit * fitted.scale
         small = torch.from_numpy(made.depth[view.name])[None]
         certain = torch.from_numpy(made.confidence[view.name])[None, None]
-        depth = resampled_depth(small, size)[0].numpy() * np.float32(factor)
-        confidence = resampled(certain, size)[0, 0].numpy()
+        depth = resample_depth(small, size)[0].numpy() * np.float32(factor)
+        confidence = resample(certain, size)[0, 0].numpy()
         known = np.isfinite(depth) & (depth > 0) & (confidence >= self.options.min_confidence)
         if frame.mask is not None:
             known &= frame.mask
@@ -166,7 +166,7 @@ class FoundationDepth:
         pictures = []
         for view in views:
             rgb = torch.from_numpy(view.load().rgb).permute(2, 0, 1)[None].float() / 255
-            pictures.append(resampled(rgb, size)[0].clamp(0, 1))
+            pictures.append(resample(rgb, size)[0].clamp(0, 1))
         images = torch.stack(pictures)[None].to(device)
         # The camera encoder's unit has a floor, a tenth of a scene unit: in shares of the views'
         # extent it means the same in every scene.
@@ -180,7 +180,7 @@ class FoundationDepth:
                 "cam_from_world": pose.float().to(device),
                 "K": torch.from_numpy(cameras.K).float()[None].to(device),
             }
-        geometry: Geometry = network(images, **known)
+        geometry: ViewGeometry = network(images, **known)
         centres = camera_centres(geometry.ray, geometry.ray_confidence)[0].double().cpu().numpy()
         depth = geometry.depth[0].float().cpu().numpy()
         confidence = (1 - 1 / geometry.depth_confidence[0].float()).cpu().numpy()

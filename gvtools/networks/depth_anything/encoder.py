@@ -93,7 +93,7 @@ class Mlp(nn.Module):
         return self.fc2(self.act(self.fc1(x)))
 
 
-class Block(nn.Module):
+class TransformerBlock(nn.Module):
     """Pre-norm transformer block with layer scale."""
 
     def __init__(
@@ -134,7 +134,10 @@ class CameraEncoder(nn.Module):
         self.pose_branch = Mlp(POSE_CHANNELS, width // 2, width)
         self.token_norm = nn.LayerNorm(width)
         self.trunk = nn.Sequential(
-            *(Block(width, heads, eps=1e-5, layer_scale=layer_scale) for _ in range(depth))
+            *(
+                TransformerBlock(width, heads, eps=1e-5, layer_scale=layer_scale)
+                for _ in range(depth)
+            )
         )
         self.trunk_norm = nn.LayerNorm(width)
 
@@ -245,7 +248,7 @@ class PatchEmbed(nn.Module):
         return self.proj(x).flatten(2).transpose(1, 2)
 
 
-class Backbone(Recomputing):
+class DepthAnythingBackbone(Recomputing):
     """The vision transformer. The first view's frame is the frame of the predicted rays."""
 
     def __init__(self, config: EncoderConfig) -> None:
@@ -257,7 +260,7 @@ class Backbone(Recomputing):
         self.pos_embed = nn.Parameter(torch.zeros(1, 1 + config.base_grid**2, width))
         self.patch_embed = PatchEmbed(3, width, config.patch)
         self.blocks = nn.ModuleList(
-            Block(
+            TransformerBlock(
                 width,
                 config.heads,
                 mlp_ratio=config.mlp_ratio,
@@ -418,7 +421,7 @@ def patch_rays(
     return torch.cat((direction, origin, torch.linalg.cross(origin, direction)), dim=-1)
 
 
-def imagenet_normalised(images: Tensor) -> Tensor:
+def normalise_imagenet(images: Tensor) -> Tensor:
     """(..., 3, H, W) in [0, 1] to ImageNet's mean 0 and deviation 1."""
     mean = images.new_tensor(IMAGENET_MEAN)[:, None, None]
     std = images.new_tensor(IMAGENET_STD)[:, None, None]

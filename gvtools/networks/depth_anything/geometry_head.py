@@ -28,7 +28,7 @@ class GeometryHeadConfig:
 
 
 @dataclass(frozen=True)
-class Geometry:
+class ViewGeometry:
     """What the geometry head predicts."""
 
     depth: Tensor  # (B, V, H, W) z-depth along the rays, in units of the model
@@ -138,12 +138,12 @@ class GeometryHead(Recomputing):
 
     def forward(
         self, levels: Sequence[Tensor], grid: tuple[int, int], *, views_at_once: int = 8
-    ) -> Geometry:
+    ) -> ViewGeometry:
         """Depth and rays of all views, of four (B, V, N, channels) levels that are ``normed``."""
         depth, ray = self._outputs(
             levels, grid, (self._depth, self._ray), views_at_once=views_at_once
         )
-        return Geometry(
+        return ViewGeometry(
             depth=depth[:, :, 0].exp(),
             depth_confidence=depth[:, :, 1].exp() + 1,
             ray=ray[:, :, :6].permute(0, 1, 3, 4, 2),

@@ -17,14 +17,18 @@ from gvtools.errors import CheckpointError, OptionError
 from gvtools.networks.compute import hold_in
 from gvtools.networks.config_json import from_json
 from gvtools.networks.depth_anything.encoder import (
-    Backbone,
     CameraDecoder,
     CameraEncoder,
+    DepthAnythingBackbone,
     EncoderConfig,
-    imagenet_normalised,
+    normalise_imagenet,
     patch_rays,
 )
-from gvtools.networks.depth_anything.geometry_head import Geometry, GeometryHead, GeometryHeadConfig
+from gvtools.networks.depth_anything.geometry_head import (
+    GeometryHead,
+    GeometryHeadConfig,
+    ViewGeometry,
+)
 from gvtools.networks.tensors import TensorFiles, load, not_finite, read_tensors, share_tied
 from gvtools.untrusted import read_json
 
@@ -45,7 +49,7 @@ class _Named(nn.Module):
 
     def __init__(self, config: EncoderConfig) -> None:
         super().__init__()
-        self.pretrained = Backbone(config)
+        self.pretrained = DepthAnythingBackbone(config)
 
 
 class DepthAnything3(nn.Module):
@@ -69,7 +73,7 @@ class DepthAnything3(nn.Module):
         hold_in(dtype, self.backbone, self.cam_enc, self.cam_dec)
 
     @property
-    def encoder(self) -> Backbone:
+    def encoder(self) -> DepthAnythingBackbone:
         """The backbone itself."""
         return self.backbone.pretrained
 
@@ -89,19 +93,19 @@ class DepthAnything3(nn.Module):
             token = self.cam_enc(cam_from_world, K, size)
             if self.config.encoder.rays:
                 rays = patch_rays(cam_from_world, K, self.encoder.grid(*size), size=size)
-        normalised = imagenet_normalised(images).to(self.encoder.cls_token.dtype)
+        normalised = normalise_imagenet(images).to(self.encoder.cls_token.dtype)
         return self.encoder.encode(normalised, levels=levels, camera_token=token, rays=rays)
 
     def geometry(
         self, levels: list[Tensor], grid: tuple[int, int], *, views_at_once: int = 8
-    ) -> Geometry:
+    ) -> ViewGeometry:
         """Depth and rays of four raw levels, token 0 included."""
         normed = [self.encoder.normed(level[:, :, 1:]) for level in levels]
         return self.head(normed, grid, views_at_once=views_at_once)
 
     def forward(
         self, images: Tensor, *, cam_from_world: Tensor | None = None, K: Tensor | None = None
-    ) -> Geometry:
+    ) -> ViewGeometry:
         """Depth and rays of (B, V, 3, H, W) images in [0, 1], with or without known cameras."""
         levels = self.encode(images, cam_from_world=cam_from_world, K=K)
         return self.geometry(levels, self.encoder.grid(images.shape[-2], images.shape[-1]))

@@ -53,7 +53,7 @@ def draw_samples(count: int, *, seed: int) -> Tensor:
     return torch.stack(draws)
 
 
-def fit(source: Tensor, target: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+def fit_homography(source: Tensor, target: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     """Homographies (..., 3, 3) of least weighted algebraic error, of points (..., N, 2) in float64.
 
     The null direction of the 9x9 normal matrix, which in float64 is as good as the singular vector
@@ -96,13 +96,13 @@ def ransac(
             f"(iterations, {SAMPLE}) below {pool}"
         )
     chosen = weight.argsort(descending=True, stable=True)[samples]
-    tried, _ = fit(source[chosen], target[chosen], weight[chosen])
+    tried, _ = fit_homography(source[chosen], target[chosen], weight[chosen])
     point = torch.cat((source, torch.ones_like(source[:, :1])), dim=-1)
     projected = point @ tried.mT
     error = (projected[..., :2] / projected[..., 2:] - target).square().sum(-1)
     inlier = error < threshold**2
     best = inlier[(inlier * weight).sum(-1).argmax()] & (weight > 0)
-    H, share = fit(source[best], target[best], weight[best])
+    H, share = fit_homography(source[best], target[best], weight[best])
     if int(best.sum()) < 4 or not float(share) > UNIQUE:
         raise DegenerateError(
             f"{int(best.sum())} of {len(source)} agree within {threshold:g} and determine no "

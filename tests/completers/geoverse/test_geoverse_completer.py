@@ -26,7 +26,7 @@ from gvtools.completers.geoverse.composition import GENERATED
 from gvtools.completers.geoverse.conditioning import ViewBatch
 from gvtools.completers.geoverse.depth_scale import PassScale
 from gvtools.completers.geoverse.model import Generated, GeoVerse
-from gvtools.completers.geoverse.views import chosen_views
+from gvtools.completers.geoverse.views import choose_views
 from gvtools.completers.geoverse.weights import config_of
 from gvtools.errors import CheckpointError, OptionError
 from gvtools.guidance import Guidance
@@ -279,7 +279,7 @@ def test_predicted_rays_come_back_to_the_world(weights, monkeypatch, world):
     context, known = micro.moved(micro.context_views(2), micro.guidance(2, share=-1.0), **world)
     # Without any known depth, the centres alone give the scale.
     context = [replace(view, depth=None) for view in context]
-    order = chosen_views(context, known.cameras, known.depth, count=2, selection="nearest")
+    order = choose_views(context, known.cameras, known.depth, count=2, selection="nearest")
 
     def perfect(self: GeoVerse, batch: ViewBatch, **options: Any) -> Generated:
         made = generate(self, batch, **options)

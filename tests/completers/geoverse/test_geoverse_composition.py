@@ -14,12 +14,12 @@ from gvtools.completers.geoverse.composition import (
     CERTAIN,
     DOUBTED,
     MOST,
-    aligned_color,
-    composed,
-    corrected_color,
-    corrected_depth,
+    align_color,
+    compose,
+    correct_color,
+    correct_depth,
     depth_ratios,
-    seamless,
+    remove_seams,
     without_seams,
 )
 from gvtools.completers.geoverse.model import Decoded, Generated
@@ -54,26 +54,24 @@ def stripes(offset: float = 0.0) -> tuple[torch.Tensor, torch.Tensor]:
 def test_a_model_that_changes_nothing_leaves_the_filled_projection():
     filled, valid = stripes()
     made = torch.rand(2, 3, 16, 24)
-    assert torch.equal(corrected_color(filled, made, made, valid=valid), filled)
+    assert torch.equal(correct_color(filled, made, made, valid=valid), filled)
     depth = filled[:, :1] + 1
     assert torch.allclose(
-        corrected_depth(depth, made[:, :1] + 1, made[:, :1] + 1, valid=valid), depth
+        correct_depth(depth, made[:, :1] + 1, made[:, :1] + 1, valid=valid), depth
     )
 
 
 def test_a_change_of_everything_is_none_and_one_of_the_hole_is_whole():
     filled, valid = stripes()
     hint = torch.rand(2, 3, 16, 24)
-    assert torch.allclose(corrected_color(filled, hint + 0.2, hint, valid=valid), filled, atol=1e-5)
+    assert torch.allclose(correct_color(filled, hint + 0.2, hint, valid=valid), filled, atol=1e-5)
     change = torch.where(valid, 0.0, 0.3)
-    found = corrected_color(filled, hint + change, hint, valid=valid)
+    found = correct_color(filled, hint + change, hint, valid=valid)
     assert torch.allclose(found, filled + change, atol=1e-5)
     depth = filled[:, :1] + 1
-    grown = corrected_depth(
-        depth, torch.where(valid, 1.0, 9.0), torch.ones_like(depth), valid=valid
-    )
+    grown = correct_depth(depth, torch.where(valid, 1.0, 9.0), torch.ones_like(depth), valid=valid)
     assert torch.allclose(grown, torch.where(valid, depth, MOST * depth), rtol=1e-4)
-    assert (corrected_depth(torch.zeros_like(depth), depth, depth + 1, valid=valid) == 0).all()
+    assert (correct_depth(torch.zeros_like(depth), depth, depth + 1, valid=valid) == 0).all()
 
 
 def test_a_depth_correction_counts_by_what_exceeds_the_least():
@@ -89,14 +87,14 @@ def test_a_depth_correction_counts_by_what_exceeds_the_least():
         (-3 * CERTAIN, -2 * CERTAIN),
     ):
         made = torch.where(valid, hint, hint * torch.tensor(change).exp())
-        found = corrected_depth(depth, made, hint, valid=valid)
+        found = correct_depth(depth, made, hint, valid=valid)
         expected = torch.where(valid, depth, depth * torch.tensor(wanted).exp())
         assert torch.allclose(found, expected, rtol=1e-5)
-        whole = corrected_depth(depth, made, hint, valid=valid, certain=0)
+        whole = correct_depth(depth, made, hint, valid=valid, certain=0)
         assert torch.allclose(whole, torch.where(valid, depth, depth * made), rtol=1e-5)
     broken = hint.clone()
     broken[..., 3, 3] = torch.nan
-    assert int(corrected_depth(depth, broken, hint, valid=valid).isnan().sum()) == 1
+    assert int(correct_depth(depth, broken, hint, valid=valid).isnan().sum()) == 1
 
 
 def test_every_depth_correction_has_a_gradient_while_training():
@@ -108,7 +106,7 @@ def test_every_depth_correction_has_a_gradient_while_training():
         depth = torch.full(shape, factor, requires_grad=True)
         rgb = torch.zeros((*shape[:2], 3, *shape[2:]))
         one = torch.ones(shape)
-        _, found = composed(batch, Decoded(rgb, depth, one), Decoded(rgb, one, one))
+        _, found = compose(batch, Decoded(rgb, depth, one), Decoded(rgb, one, one))
         holes = ~batch.valid[:, batch.context :, 0]
         assert holes.any()
         found.sum().backward()
@@ -119,11 +117,11 @@ def test_every_depth_correction_has_a_gradient_while_training():
 def test_colours_follow_the_memory():
     hint, valid = stripes()
     made = hint - 0.1
-    found = aligned_color(made, hint.clamp(0, 1), valid)
+    found = align_color(made, hint.clamp(0, 1), valid)
     assert torch.allclose(found, hint.clamp(0, 1), atol=1e-5)
     broken = made.clone()
     broken[0, :, 3, 3] = torch.nan
-    kept = aligned_color(broken, hint, valid)
+    kept = align_color(broken, hint, valid)
     assert kept[0, :, 3, 3].isnan().all() and kept[1].isfinite().all()
 
 
@@ -242,6 +240,6 @@ def test_a_pass_without_a_hint_is_made_seamless_too():
     rgb = torch.rand(1, 2, 3, 12, 12, generator=torch.Generator().manual_seed(5))
     length = torch.ones(1, 2, 12, 12)
     made = Generated(torch.zeros(1), torch.zeros(1), Decoded(rgb, length, length))
-    joined = seamless(made, 6)
+    joined = remove_seams(made, 6)
     assert joined.hint is None and joined.decoded.depth is length
     torch.testing.assert_close(joined.decoded.rgb[0], without_seams(rgb[0], 6))

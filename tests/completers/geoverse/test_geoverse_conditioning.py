@@ -19,7 +19,7 @@ from gvtools.completers.geoverse.conditioning import (
     encode_hints,
     encode_latents,
     feature_mask,
-    filled,
+    fill_holes,
 )
 from gvtools.errors import OptionError, ShapeError
 
@@ -84,13 +84,13 @@ def test_scattered_pixels_that_fill_no_token_are_an_empty_hint_too(model, fill):
     few[..., ::4, ::4] = True
     sparse = with_valid(batch, few)
     config = HintConfig(fill=fill)
-    found = hints(model, filled(sparse, config), config)
+    found = hints(model, fill_holes(sparse, config), config)
     expected = hints(model, no_target(batch))
     for name in ("level1", "unmasked", "level0", "token", "mask"):
         assert torch.equal(getattr(found, name), getattr(expected, name)), name
     # With no threshold their picture counts.
     config = replace(config, mask=0.0)
-    assert hints(model, filled(sparse, config), config).level1[:, 2:].any()
+    assert hints(model, fill_holes(sparse, config), config).level1[:, 2:].any()
 
 
 @torch.no_grad()
@@ -306,8 +306,8 @@ def test_what_stands_in_the_holes_of_depth_does_not_matter(fill):
 
 def test_filling_leaves_the_context_and_the_validity_alone():
     batch = micro.batch(2)
-    assert filled(batch, PAPER) is batch
-    found = filled(batch, HintConfig(fill="push-pull"))
+    assert fill_holes(batch, PAPER) is batch
+    found = fill_holes(batch, HintConfig(fill="push-pull"))
     known = batch.valid.expand_as(batch.images)
     assert torch.equal(found.images[known], batch.images[known])
     assert torch.equal(found.valid, batch.valid)

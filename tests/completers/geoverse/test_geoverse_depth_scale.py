@@ -14,10 +14,10 @@ from gvtools.completers.geoverse.depth_scale import (
     ScaledDepth,
     centre_scale,
     pass_scale,
-    scaled_depth,
+    scale_depth,
 )
-from gvtools.completers.geoverse.views import EDGE, resampled, resampled_depth
-from gvtools.networks.depth_anything.geometry_head import Geometry
+from gvtools.completers.geoverse.views import EDGE, resample, resample_depth
+from gvtools.networks.depth_anything.geometry_head import ViewGeometry
 
 ALIGNMENTS = ("centres", "hint", "field")
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -25,7 +25,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 SIZE = (30, 40)
 
 
-def geometry(origins: np.ndarray, *, seed: int = 0, noise: float = 0.0) -> Geometry:
+def geometry(origins: np.ndarray, *, seed: int = 0, noise: float = 0.0) -> ViewGeometry:
     """Rays that start at (V, 3) origins, noisy where they are not confident."""
     generator = torch.Generator().manual_seed(seed)
     views = len(origins)
@@ -34,7 +34,7 @@ def geometry(origins: np.ndarray, *, seed: int = 0, noise: float = 0.0) -> Geome
     ray[..., 3:] += torch.from_numpy(origins).float()[None, :, None, None]
     certain = 1 + torch.rand(1, views, 4, 5, generator=generator)
     depth = torch.ones(1, views, 8, 10)
-    return Geometry(depth, depth + 1, ray, certain)
+    return ViewGeometry(depth, depth + 1, ray, certain)
 
 
 def poses(count: int) -> np.ndarray:
@@ -68,11 +68,11 @@ def test_a_centre_is_the_mean_of_its_rays_by_their_confidence():
     worse = made.ray.clone()
     worse[:, 1, 0, 0, 3:] = 100.0
     made.ray_confidence[:, 1, 0, 0] = 0.0
-    again = centre_scale(Geometry(made.depth, made.depth, worse, made.ray_confidence), known)
+    again = centre_scale(ViewGeometry(made.depth, made.depth, worse, made.ray_confidence), known)
     assert again.scale == pytest.approx(found.scale, rel=0.02)
 
 
-def refused() -> dict[str, tuple[Geometry, np.ndarray]]:
+def refused() -> dict[str, tuple[ViewGeometry, np.ndarray]]:
     rng = np.random.default_rng(0)
     known = poses(4)
     centres = model_centres(known, 2.0)
@@ -132,7 +132,7 @@ def scene(
 def test_all_alignments_agree_where_everything_fits(alignment, scale):
     made, truth, valid = scene(scale=scale)
     hint = np.where(valid, truth, 0)
-    found = scaled_depth(made, hint, valid, whole=PassScale(scale), alignment=alignment)
+    found = scale_depth(made, hint, valid, whole=PassScale(scale), alignment=alignment)
     np.testing.assert_allclose(found.depth, truth, rtol=1e-4)
     np.testing.assert_allclose(found.scale, scale, rtol=1e-4)
     assert statuses(found) == [METHODS[alignment]] * 2
@@ -147,7 +147,7 @@ def test_each_alignment_uses_its_own_evidence():
     truth[1] *= 1.2
     hint = np.where(valid, truth, 0)
     found = {
-        name: scaled_depth(made, hint, valid, whole=PassScale(3.3), alignment=name)
+        name: scale_depth(made, hint, valid, whole=PassScale(3.3), alignment=name)
         for name in ALIGNMENTS
     }
     np.testing.assert_allclose(found["centres"].scale, [3.3, 3.3])
@@ -163,7 +163,7 @@ def test_a_field_follows_the_memory_and_stays_within_its_limit():
     bent[0, 3, 3] *= 10  # another surface, no error of scale
     valid[0, 3, 3] = True
     hint = np.where(valid, bent, 0)
-    found = scaled_depth(made, hint, valid, whole=PassScale(math.nan), alignment="field")
+    found = scale_depth(made, hint, valid, whole=PassScale(math.nan), alignment="field")
     rest = valid.copy()
     rest[0, 3, 3] = False
     np.testing.assert_allclose(found.depth[rest], hint[rest], rtol=1e-4)
@@ -173,7 +173,7 @@ def test_a_field_follows_the_memory_and_stays_within_its_limit():
     calm = np.ones(SIZE, bool)
     calm[:12, :12] = False
     assert np.abs(found.depth / bent - 1)[0][calm].max() < 0.1
-    plain = scaled_depth(made, hint, valid, whole=PassScale(math.nan), alignment="hint")
+    plain = scale_depth(made, hint, valid, whole=PassScale(math.nan), alignment="hint")
     assert np.abs(plain.depth / bent - 1)[0][calm].max() > 0.12
 
 
@@ -190,7 +190,7 @@ def test_without_support_the_next_one_is_asked_and_at_last_none():
         ("hint", nan, ("hint", "none", "none")),
         ("field", nan, ("field", "none", "none")),
     ):
-        found = scaled_depth(made, hint, valid, whole=PassScale(centres), alignment=alignment)
+        found = scale_depth(made, hint, valid, whole=PassScale(centres), alignment=alignment)
         wanted = [METHODS.get(method, ScaleStatus.UNSUPPORTED) for method in methods]
         assert statuses(found) == wanted
         for view, method in enumerate(methods):
@@ -202,7 +202,7 @@ def test_without_support_the_next_one_is_asked_and_at_last_none():
 def test_depth_that_does_not_follow_the_memory_is_no_support():
     made, truth, valid = scene(views=1)
     truth = np.random.default_rng(3).uniform(0.1, 10, truth.shape).astype(np.float32)
-    found = scaled_depth(made, truth, valid, whole=PassScale(math.nan), alignment="hint")
+    found = scale_depth(made, truth, valid, whole=PassScale(math.nan), alignment="hint")
     (outcome,) = found.alignment
     assert outcome.status is ScaleStatus.CONTRADICTED and not found.depth.any()
     assert outcome.residual > 0.3 and outcome.overlap_px == valid.sum()
@@ -216,19 +216,19 @@ def test_a_scale_that_contradicts_the_memory_is_not_taken():
     # not given a scale that its sibling refutes.
     blind = valid.copy()
     blind[1] = False
-    found = scaled_depth(made, hint, blind, whole=PassScale(90.0), alignment="centres")
+    found = scale_depth(made, hint, blind, whole=PassScale(90.0), alignment="centres")
     assert statuses(found) == [ScaleStatus.MEMORY_DEPTH, ScaleStatus.CONTRADICTED]
-    found = scaled_depth(made, hint, valid, whole=PassScale(90.0), alignment="centres")
+    found = scale_depth(made, hint, valid, whole=PassScale(90.0), alignment="centres")
     assert statuses(found) == [ScaleStatus.MEMORY_DEPTH] * 2
     np.testing.assert_allclose(found.scale, [3, 3], rtol=1e-4)
     # Depth without any relation to the memory is left out, whatever the centres say.
     noise = np.random.default_rng(3).uniform(0.01, 10, truth.shape).astype(np.float32)
     for centres in (3.0, 90.0):
-        found = scaled_depth(made, noise, valid, whole=PassScale(centres), alignment="field")
+        found = scale_depth(made, noise, valid, whole=PassScale(centres), alignment="field")
         assert statuses(found) == [ScaleStatus.CONTRADICTED] * 2 and not found.depth.any()
     # Where the memory knows too little to tell, the centres stand.
     valid[:] = False
-    found = scaled_depth(made, hint, valid, whole=PassScale(90.0), alignment="centres")
+    found = scale_depth(made, hint, valid, whole=PassScale(90.0), alignment="centres")
     assert statuses(found) == [ScaleStatus.CAMERA_CENTRES] * 2
 
 
@@ -241,7 +241,7 @@ def test_damaged_depth_does_no_harm_around_it(alignment):
     damaged = made.clone()
     damaged[0, :4, :4] = math.nan
     damaged[0, 5, 5] = math.inf
-    found = scaled_depth(damaged, hint, valid, whole=PassScale(3.0), alignment=alignment)
+    found = scale_depth(damaged, hint, valid, whole=PassScale(3.0), alignment=alignment)
     assert not found.depth[0, :4, :4].any() and found.depth[0, 5, 5] == 0
     intact = np.isfinite(damaged[0].numpy())
     intact[8:11, 8:11] = False
@@ -254,11 +254,11 @@ def test_depth_at_another_size_never_lies_between_two_surfaces(size):
     near, far = 1.0, 1.0 + 2 * (EDGE - 1)
     depth = torch.where(torch.rand(2, 24, 32, generator=torch.Generator().manual_seed(0)) < 0.5,
                         near, far)  # fmt: skip
-    found = resampled_depth(depth, size)
+    found = resample_depth(depth, size)
     assert found.shape == (2, *size)
     gap = torch.minimum((found - near).abs(), (found - far).abs())
     assert gap.max() < 1e-6
-    mixed = resampled(depth[:, None], size)
+    mixed = resample(depth[:, None], size)
     assert ((mixed - near).abs() > 0.05).logical_and((mixed - far).abs() > 0.05).any()
 
 
@@ -271,7 +271,7 @@ def test_a_plane_stays_a_plane(size):
         x = (torch.arange(columns).double() + 0.5) / columns
         return 1 / (0.3 + 0.1 * x[None] + 0.2 * y[:, None])
 
-    found = resampled_depth(plane(24, 32)[None], size)[0]
+    found = resample_depth(plane(24, 32)[None], size)[0]
     rim = max(1, -(-size[0] // 24))
     inner = np.s_[rim:-rim, rim:-rim]
     torch.testing.assert_close(found[inner], plane(*size)[inner], rtol=1e-9, atol=1e-9)
@@ -280,7 +280,7 @@ def test_a_plane_stays_a_plane(size):
 def test_depth_at_a_smaller_size_is_that_of_a_pixel():
     depth = torch.rand(1, 30, 40, generator=torch.Generator().manual_seed(0)) + 1
     for size in ((7, 9), (30, 39), (60, 20)):
-        found = resampled_depth(depth, size)
+        found = resample_depth(depth, size)
         assert torch.isin(found, depth).all()
 
 
@@ -292,7 +292,7 @@ def test_one_scale_a_pass_stands_on_centres_and_on_the_context():
 
     def of(depth: torch.Tensor, context: np.ndarray, cameras: np.ndarray = known) -> PassScale:
         ray, sure = made.ray[:, : len(cameras)], made.ray_confidence[:, : len(cameras)]
-        return pass_scale(Geometry(depth, depth + 1, ray, sure), cameras, context)
+        return pass_scale(ViewGeometry(depth, depth + 1, ray, sure), cameras, context)
 
     agreed = of(fitting / 2.0, truth)
     assert agreed.status is ScaleStatus.CAMERA_CENTRES

@@ -18,7 +18,7 @@ from gvtools.completers.geoverse.flow import (
     clean_from_velocity,
     fast_loss,
     gld_time_grid,
-    guided,
+    guide,
     integrate,
     interpolate,
     interval_bounds,
@@ -278,7 +278,7 @@ def test_guidance_moves_away_from_the_unconditional_velocity():
     sample(lambda x, t: given_, noise, [1, 0], unconditional=unconditional, cfg_scale=1.0)
     assert not calls
     with pytest.raises(OptionError, match="needs an unconditional"):
-        guided(lambda x, t: x, None, 1.5)
+        guide(lambda x, t: x, None, 1.5)
 
 
 def test_gradients_pass_through_sampling():

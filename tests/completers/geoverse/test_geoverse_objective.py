@@ -16,8 +16,8 @@ from gvtools.completers.geoverse.objective import (
     DEFECTS,
     LossWeights,
     Objective,
-    Prediction,
-    Reference,
+    PredictedTerms,
+    ReferenceTerms,
     center_similarity,
     depth_loss,
     flow_matching_loss,
@@ -41,7 +41,7 @@ T = V - CONTEXT
 TERMS = ["level1", "level0", "rgb", "hf", "depth"]
 
 
-def _batch(seed: int = 0) -> tuple[Prediction, Reference]:
+def _batch(seed: int = 0) -> tuple[PredictedTerms, ReferenceTerms]:
     generator = torch.Generator().manual_seed(seed)
 
     def values(*shape: int, grad: bool = False) -> torch.Tensor:
@@ -56,7 +56,7 @@ def _batch(seed: int = 0) -> tuple[Prediction, Reference]:
             "centers": values(B, V, 3, grad=grad),
         }
 
-    return Prediction(**all_of(True)), Reference(**all_of(False))
+    return PredictedTerms(**all_of(True)), ReferenceTerms(**all_of(False))
 
 
 def test_the_total_is_the_weighted_sum_of_the_terms():
@@ -65,7 +65,7 @@ def test_the_total_is_the_weighted_sum_of_the_terms():
     found = objective(prediction, reference, context=CONTEXT, weights=weights)
     pairs = {
         field.name: (getattr(prediction, field.name), getattr(reference, field.name))
-        for field in fields(Prediction)
+        for field in fields(PredictedTerms)
     }
     similarity = center_similarity(*pairs["centers"])
     expected = {
@@ -96,8 +96,8 @@ def test_samples_are_averaged_not_pixels():
     valid[0, :, 1:] = False
 
     def of(part: slice) -> Objective:
-        reference = Reference(image=wanted[part], image_valid=valid[part])
-        return objective(Prediction(image=image[part]), reference, context=CONTEXT)
+        reference = ReferenceTerms(image=wanted[part], image_valid=valid[part])
+        return objective(PredictedTerms(image=image[part]), reference, context=CONTEXT)
 
     alone = [of(slice(b, b + 1)) for b in range(B)]
     both = of(slice(None))
@@ -108,13 +108,13 @@ def test_samples_are_averaged_not_pixels():
 
 def test_what_is_not_predicted_has_no_term():
     prediction, reference = _batch()
-    only = Prediction(level1=prediction.level1)
+    only = PredictedTerms(level1=prediction.level1)
     found = objective(only, reference, context=CONTEXT)
     assert list(found.terms) == ["level1"] and not found.counts
     torch.testing.assert_close(found.total, found.terms["level1"])
     with pytest.raises(OptionError, match="nothing was predicted"):
-        objective(Prediction(), reference, context=CONTEXT)
-    for field in fields(Prediction):
+        objective(PredictedTerms(), reference, context=CONTEXT)
+    for field in fields(PredictedTerms):
         if field.name != "centers":
             with pytest.raises(OptionError, match=f"{field.name} was predicted"):
                 absent = replace(reference, **{field.name: None})
@@ -181,8 +181,8 @@ def test_the_device_changes_neither_the_terms_nor_the_gradients():
             {name: x.detach().to(device) for name, x in vars(part).items() if x is not None}
             for part in _batch()
         ]
-        prediction = Prediction(**{name: x.requires_grad_() for name, x in values[0].items()})
-        found = objective(prediction, Reference(**values[1]), context=CONTEXT)
+        prediction = PredictedTerms(**{name: x.requires_grad_() for name, x in values[0].items()})
+        found = objective(prediction, ReferenceTerms(**values[1]), context=CONTEXT)
         found.total.backward()
         pulled = [x.grad for x in vars(prediction).values() if x.grad is not None]
         return found.record(), [x.cpu() for x in pulled]
@@ -199,7 +199,7 @@ def test_wrong_coefficients_are_refused(value):
         LossWeights(rgb=value)
 
 
-SAMPLES, VIEWS, KNOWN, H, W = 2, 5, 2, 5, 6
+H, W = 5, 6
 
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -221,18 +221,18 @@ def _outside(values: Tensor, mask: Tensor, poison: float) -> Tensor:
 
 
 @settings(deadline=None)
-@given(SEEDS, st.integers(0, VIEWS), st.floats(0, 2))
+@given(SEEDS, st.integers(0, V), st.floats(0, 2))
 def test_the_flow_loss_is_a_constant_factor_of_the_papers_formula(seed, context, alpha):
     rng = np.random.default_rng(seed)
-    predicted, clean, noise = (_normal(rng, SAMPLES, VIEWS, 3, 2, 2) for _ in range(3))
+    predicted, clean, noise = (_normal(rng, B, V, 3, 2, 2) for _ in range(3))
     options = {"context": context, "context_weight": alpha}
     found = flow_matching_loss(predicted, noise - clean, **options)
-    for b in range(SAMPLES):
-        weights = [alpha] * context + [1.0] * (VIEWS - context)
+    for b in range(B):
+        weights = [alpha] * context + [1.0] * (V - context)
         expected = formula.flow_matching(
             predicted[b].numpy(), clean[b].numpy(), noise[b].numpy(), weights
         )
-        assert float(found[b]) * (3 * 2 * 2 * VIEWS) == pytest.approx(expected)
+        assert float(found[b]) * (3 * 2 * 2 * V) == pytest.approx(expected)
 
 
 def test_context_views_weigh_a_quarter():
@@ -249,11 +249,11 @@ def test_context_views_weigh_a_quarter():
 @given(SEEDS)
 def test_picture_losses_are_the_papers_formulas(seed):
     rng = np.random.default_rng(seed)
-    predicted, image = _normal(rng, SAMPLES, T, 3, H, W), _normal(rng, SAMPLES, T, 3, H, W)
-    valid = _mask(rng, SAMPLES, T, H, W)
+    predicted, image = _normal(rng, B, T, 3, H, W), _normal(rng, B, T, 3, H, W)
+    valid = _mask(rng, B, T, H, W)
     rgb = rgb_loss(predicted, image, valid=valid)
     hf = high_gradient_loss(predicted, image, valid=valid)
-    for b in range(SAMPLES):
+    for b in range(B):
         sample = predicted[b].numpy(), image[b].numpy(), valid[b].numpy()
         assert float(rgb[b]) == pytest.approx(formula.rgb(*sample), rel=1e-9)
         assert float(hf[b]) == pytest.approx(formula.high_gradient(*sample), rel=1e-9)
@@ -263,8 +263,8 @@ def test_picture_losses_are_the_papers_formulas(seed):
 @pytest.mark.parametrize("poison", [np.nan, np.inf])
 def test_what_lies_outside_the_mask_poisons_neither_picture_loss_nor_gradient(loss, poison):
     rng = np.random.default_rng(3)
-    predicted, image = _normal(rng, SAMPLES, T, 3, H, W), _normal(rng, SAMPLES, T, 3, H, W)
-    valid = torch.tensor(rng.random((SAMPLES, T, H, W)) < 0.6)
+    predicted, image = _normal(rng, B, T, 3, H, W), _normal(rng, B, T, 3, H, W)
+    valid = torch.tensor(rng.random((B, T, H, W)) < 0.6)
     shown = valid[:, :, None].expand_as(image)
     expected = loss(predicted, image, valid=valid)
     damaged = _outside(predicted, shown, poison).requires_grad_()
@@ -284,10 +284,10 @@ def test_a_diverged_prediction_is_not_hidden():
 
 @pytest.mark.parametrize("loss", [rgb_loss, high_gradient_loss])
 def test_samples_without_pixels_give_zero_within_the_graph(loss):
-    predicted = torch.rand(SAMPLES, T, 3, H, W, requires_grad=True)
-    valid = torch.zeros(SAMPLES, T, H, W, dtype=torch.bool)
-    found = loss(predicted, torch.full((SAMPLES, T, 3, H, W), np.nan), valid=valid)
-    assert found.tolist() == [0.0] * SAMPLES and found.requires_grad
+    predicted = torch.rand(B, T, 3, H, W, requires_grad=True)
+    valid = torch.zeros(B, T, H, W, dtype=torch.bool)
+    found = loss(predicted, torch.full((B, T, 3, H, W), np.nan), valid=valid)
+    assert found.tolist() == [0.0] * B and found.requires_grad
     found.sum().backward()
     assert predicted.grad is not None and not bool(predicted.grad.any())
 
@@ -343,11 +343,11 @@ def test_half_precision_pictures_are_compared_in_float32():
 
 def _depths(rng: np.random.Generator) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Predicted depth, reference depth with gaps, predicted and reference centres."""
-    predicted = torch.tensor(rng.uniform(0.5, 2, (SAMPLES, T, H, W)))
-    reference = torch.tensor(rng.uniform(1, 6, (SAMPLES, T, H, W)))
-    gaps = torch.tensor(rng.choice([np.nan, np.inf, 0.0, -1.0], (SAMPLES, T, H, W)))
-    reference = torch.where(torch.tensor(rng.random((SAMPLES, T, H, W)) < 0.3), gaps, reference)
-    return (predicted, reference, _normal(rng, SAMPLES, VIEWS, 3), _normal(rng, SAMPLES, VIEWS, 3))
+    predicted = torch.tensor(rng.uniform(0.5, 2, (B, T, H, W)))
+    reference = torch.tensor(rng.uniform(1, 6, (B, T, H, W)))
+    gaps = torch.tensor(rng.choice([np.nan, np.inf, 0.0, -1.0], (B, T, H, W)))
+    reference = torch.where(torch.tensor(rng.random((B, T, H, W)) < 0.3), gaps, reference)
+    return (predicted, reference, _normal(rng, B, V, 3), _normal(rng, B, V, 3))
 
 
 @settings(deadline=None, max_examples=50)
@@ -355,10 +355,10 @@ def _depths(rng: np.random.Generator) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 def test_the_depth_loss_is_the_papers_formula(seed):
     rng = np.random.default_rng(seed)
     predicted, reference, found_centers, centers = _depths(rng)
-    valid = _mask(rng, SAMPLES, T, H, W)
+    valid = _mask(rng, B, T, H, W)
     similarity = center_similarity(found_centers, centers)
     found = depth_loss(predicted, reference, similarity=similarity, valid=valid)
-    for b in range(SAMPLES):
+    for b in range(B):
         scale = formula.scale_of(found_centers[b].numpy(), centers[b].numpy())
         expected = formula.depth(
             predicted[b].numpy(), reference[b].numpy(), scale, valid[b].numpy()
@@ -369,13 +369,13 @@ def test_the_depth_loss_is_the_papers_formula(seed):
 def test_a_scene_of_another_unit_and_frame_has_no_depth_loss():
     rng = np.random.default_rng(0)
     predicted, _, centers, _ = _depths(rng)
-    turn = torch.linalg.qr(_normal(rng, SAMPLES, 3, 3))[0]
+    turn = torch.linalg.qr(_normal(rng, B, 3, 3))[0]
     turn = turn * torch.linalg.det(turn)[:, None, None]
     units = torch.tensor([0.2, 7.0], dtype=torch.float64)
     moved = units[:, None, None] * centers @ turn.mT + 5
     similarity = center_similarity(centers, moved)
     found = depth_loss(predicted, units[:, None, None, None] * predicted, similarity=similarity)
-    torch.testing.assert_close(found, torch.zeros(SAMPLES, dtype=torch.float64), atol=1e-9, rtol=0)
+    torch.testing.assert_close(found, torch.zeros(B, dtype=torch.float64), atol=1e-9, rtol=0)
 
 
 def test_samples_without_a_scale_are_dropped():
@@ -405,10 +405,10 @@ def test_what_lies_outside_the_mask_poisons_neither_depth_loss_nor_gradient(pois
 
 
 def test_a_batch_without_any_depth_gives_zero_within_the_graph():
-    predicted = torch.rand(SAMPLES, T, H, W, requires_grad=True)
-    similarity = center_similarity(torch.randn(SAMPLES, VIEWS, 3), torch.randn(SAMPLES, VIEWS, 3))
-    found = depth_loss(predicted, torch.zeros(SAMPLES, T, H, W), similarity=similarity)
-    assert found.tolist() == [0.0] * SAMPLES
+    predicted = torch.rand(B, T, H, W, requires_grad=True)
+    similarity = center_similarity(torch.randn(B, V, 3), torch.randn(B, V, 3))
+    found = depth_loss(predicted, torch.zeros(B, T, H, W), similarity=similarity)
+    assert found.tolist() == [0.0] * B
     found.sum().backward()
     assert predicted.grad is not None and not bool(predicted.grad.any())
 

@@ -11,14 +11,14 @@ from scipy.ndimage import distance_transform_edt
 
 from gvtools.completers import create
 from gvtools.completers.geoverse.composition import REFINED
-from gvtools.completers.geoverse.conditioning import filled
+from gvtools.completers.geoverse.conditioning import fill_holes
 from gvtools.completers.geoverse.refiner import (
     PRIOR_PIXELS,
     CompletedViews,
     Refiner,
     RefinerConfig,
     completed_views,
-    cropped,
+    crop_views,
     distance_to,
 )
 from gvtools.completers.geoverse.weights import from_pretrained, save_pretrained
@@ -120,14 +120,14 @@ def test_any_size_is_taken_and_any_size_refined(size):
 
 def test_a_part_of_the_views_is_cut_out_alike():
     given = views()
-    part = cropped(given, (slice(2, 12), slice(4, 20)))
+    part = crop_views(given, (slice(2, 12), slice(4, 20)))
     assert torch.equal(part.made, given.made[..., 2:12, 4:20])
     assert torch.equal(part.evidence, given.evidence[..., 2:12, 4:20])
     assert torch.equal(part.mean, given.mean)
 
 
 def test_the_targets_of_a_batch_are_taken_with_their_contexts_mean():
-    batch = filled(micro.batch(2), micro.config(hints={"fill": "push-pull"}).hints)
+    batch = fill_holes(micro.batch(2), micro.config(hints={"fill": "push-pull"}).hints)
     made = torch.rand(2, 2, 3, *micro.SIZE)
     found = completed_views(batch, made)
     assert torch.equal(found.filled, batch.images[:, 2:].flatten(0, 1))

@@ -17,7 +17,7 @@ from gvtools.completers.geoverse.video_prior import (
     VideoPriorConfig,
     _leaves,
     packed_mask,
-    resized,
+    resize_views,
     view_layout,
 )
 from gvtools.errors import CheckpointError, OptionError
@@ -331,17 +331,17 @@ def test_other_sizes_give_the_tokens_of_the_resolution(network: Any) -> None:
 def test_resizing_looks_at_no_invalid_pixel(size: tuple[int, int]) -> None:
     images, valid = tiny.views(3, size=(42, 56))
     junk = torch.where(valid, images, torch.full_like(images, float("nan")))
-    seen, shown = resized(junk, valid, size)
-    assert torch.equal(seen, resized(images, valid.float(), size)[0])
+    seen, shown = resize_views(junk, valid, size)
+    assert torch.equal(seen, resize_views(images, valid.float(), size)[0])
     assert ((seen == 0) | (shown > 0)).all()
     assert seen.max() <= images.max() + 1e-5
     nearest = F.interpolate(valid[0].float(), size=size, mode="nearest-exact")
     assert torch.equal(shown[0], nearest)
     # A flat colour stays what it is up to the border of a hole.
-    flat, shown = resized(torch.full_like(images, 0.75), valid, size)
+    flat, shown = resize_views(torch.full_like(images, 0.75), valid, size)
     torch.testing.assert_close(flat, 0.75 * shown.expand_as(flat))
     # Without holes it is plain resampling.
-    whole = resized(images, torch.ones_like(valid), size)[0]
+    whole = resize_views(images, torch.ones_like(valid), size)[0]
     plain = F.interpolate(images[0], size=size, mode="bilinear", antialias=True)
     torch.testing.assert_close(whole[0], plain)
 
