@@ -218,19 +218,12 @@ AddOption = Callable[..., Any]
 
 
 class Action(NamedTuple):
-    """One of them.
+    """One of them."""
 
-    Attributes:
-        run: does it.
-        add_options: given ``parser.add_argument``.
-        summary: one line.
-        examples: what follows the action's name.
-    """
-
-    run: Callable[[argparse.Namespace, Console], None]
-    add_options: Callable[[AddOption], None]
-    summary: str
-    examples: tuple[str, ...]
+    run: Callable[[argparse.Namespace, Console], None]  # does it
+    add_options: Callable[[AddOption], None]  # given ``parser.add_argument``
+    summary: str  # one line
+    examples: tuple[str, ...]  # what follows the action's name
 
 
 def add_actions(parser: argparse.ArgumentParser, command: str, actions: dict[str, Action]) -> None:

@@ -92,8 +92,6 @@ def capture(
 
     Args:
         source: photographs, a video, or colour and depth.
-        out: a new folder.
-        console: where progress and figures go.
         reading: what the user said of RGB-D, see ``rgbd_reading_of``.
         options: what the user said of photographs and videos, by names of PHOTOGRAPHIC.
     """

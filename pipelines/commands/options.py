@@ -36,8 +36,6 @@ def add_settings(
     {'radius': 2.0}
 
     Args:
-        parser: or a group of one.
-        settings: with the defaults.
         options: dotted settings by the options' names in ``args``.
         metavars: of options, where the unit or the type does not say enough.
     """

@@ -114,10 +114,8 @@ def context_of(scene: Scene, config: RunSettings, folder: Path, *, console: Cons
     """A scene's context with the depth and the poses that a run without a fit would take.
 
     Args:
-        scene: the project.
         config: how a run would read it; its targets are not looked at.
         folder: where computed depth goes.
-        console: where progress goes.
     """
     from gvtools.runs.depth_cache import DepthCache
     from gvtools.settings import with_values

@@ -78,8 +78,6 @@ def associate(
     """Rows of both trajectories that belong together, and how they were found.
 
     Args:
-        reference: N poses.
-        estimate: M poses.
         how: "time", "name", "index", or "auto": names where both have them, times where both have
             them, else the order.
         max_difference: seconds, of an association by time.

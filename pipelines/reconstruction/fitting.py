@@ -50,7 +50,6 @@ from pipelines.reconstruction.voxel import grid_frame
 
 if TYPE_CHECKING:
     from gvtools.memory.store.local_frame import LocalFrame
-    from gvtools.scenes.scene import Scene
     from pipelines.console import Console
     from pipelines.reconstruction.plan import Plan
 
@@ -68,19 +67,25 @@ SWEEP_SECONDS, SWEEP_SHARE, SMALL_SIDE = 0.8, 0.15, 160
 FEWEST_SWEPT = 12
 # A fit needs at least so many sparse points and pixels with depth together.
 FEWEST_POINTS = 100
+# The memory's colours must be better by so much, divided by the number of photographs that judge:
+# pictures of one that is at the border of the others differ by 2 dB from fit to fit [dB].
+MARGIN = 3.0
+# Progress is printed at this interval [s].
+SAY_EVERY = 5.0
+# Least tolerance of the blend with recorded depth. In targets far from all views Gaussians are
+# smeared and the memory is right; validation photographs are too near to other views to show it.
+WITH_DEPTH = 0.4
+# A warning tells of a fit of fewer steps for each photograph. With 50, 100 and 600 steps, 44
+# photographs have 18.8, 21.1 and 29.1 dB in held-out pictures, and 27.3 without a fit.
+SHORT = 7.5
+# A fit whose validation photographs stopped gaining makes this share of its steps or more.
+SKIPPED = 0.9
 
 
 def fit_views(
     plan: Plan, frame: LocalFrame, console: Console, *, sweep: Sweep | None = None
 ) -> list[FitView]:
-    """The context's photographs, with recorded or estimated depth where there is some.
-
-    Args:
-        plan: of the run.
-        frame: poses and Gaussians are fitted in its coordinates.
-        console: is told of views without an estimate.
-        sweep: gives an estimate of depth.
-    """
+    """The context's photographs, with recorded or estimated depth; poses in ``frame``."""
     views = [plan.scene[name] for name in plan.context]
     poses = frame.cam_from_local(plan.scene.subset(plan.context).cameras.cam_from_world)
     frames = prefetch(lambda view: view.load(), views)
@@ -140,10 +145,6 @@ def known_surface(start: Gaussians, views: Sequence[FitView]) -> NDArray[np.floa
 
     Recorded depth keeps Gaussians on surfaces by itself, and where only some views have it, it
     tells nothing of what the others see.
-
-    Args:
-        start: Gaussians at sparse points and pixels with depth.
-        views: of the fit; their estimates tell of surfaces without sparse points.
     """
     if any(view.depth is not None for view in views):
         return None
@@ -174,10 +175,7 @@ class Sweep:
     def of(cls, plan: Plan, *, begins: bool = True) -> Sweep | None:
         """The sweep of a run; None if it has other depth, one view, or too little time.
 
-        Args:
-            plan: of the run.
-            begins: whether a new fit needs points to begin with; with few, some views are swept
-                even if there is no time for all.
+        A fit that ``begins`` needs points: with few, some views are swept however little time.
         """
         recorded = any(is_recorded(plan.source, plan.scene[name]) for name in plan.context)
         estimated = any(is_estimated(plan.source, plan.scene[name]) for name in plan.context)
@@ -214,27 +212,17 @@ class Sweep:
         return view.name in self._names
 
 
-# The memory's colours must be better by so much, divided by the number of photographs that judge:
-# pictures of one that is at the border of the others differ by 2 dB from fit to fit [dB].
-MARGIN = 3.0
-
-
 @dataclass(frozen=True)
 class FitValidation:
     """PSNR of a fit's validation photographs, at the size of its sweep.
-
-    Attributes:
-        gaussians: PSNR of the Gaussians' pictures [dB].
-        memory: of the memory's own colours, and the Gaussians' where it knows nothing [dB].
-        photographs: how many they are.
 
     >>> FitValidation(20.0, 20.1, 5).fit_is_used, str(FitValidation(18.0, 20.0, 5))
     (True, "the memory's own (validation photographs: 20.00 dB, Gaussians 18.00 dB)")
     """
 
-    gaussians: float
-    memory: float
-    photographs: int
+    gaussians: float  # PSNR of the Gaussians' pictures [dB]
+    memory: float  # of the memory's own colours, and the Gaussians' where it knows nothing [dB]
+    photographs: int  # how many they are
 
     @property
     def fit_is_used(self) -> bool:
@@ -242,15 +230,10 @@ class FitValidation:
         return self.memory <= self.gaussians + MARGIN / self.photographs
 
     def __str__(self) -> str:
+        fit, own = f"{self.gaussians:.2f} dB", f"{self.memory:.2f} dB"
         if self.fit_is_used:
-            return (
-                f"Gaussians (validation photographs: {self.gaussians:.2f} dB, the memory's own "
-                f"colours {self.memory:.2f} dB)"
-            )
-        return (
-            f"the memory's own (validation photographs: {self.memory:.2f} dB, Gaussians "
-            f"{self.gaussians:.2f} dB)"
-        )
+            return f"Gaussians (validation photographs: {fit}, the memory's own colours {own})"
+        return f"the memory's own (validation photographs: {own}, Gaussians {fit})"
 
 
 def validate_fit(
@@ -258,10 +241,7 @@ def validate_fit(
 ) -> FitValidation | None:
     """Predict the validation photographs both ways; None where the memory shows nothing of them.
 
-    Args:
-        predicted: pictures of them before they joined the fit, by view.
-        plan: of the run, before the fit's depth is taken.
-        sweep: depth of its context.
+    ``predicted`` are their pictures before they joined the fit; ``plan`` is without its depth.
     """
     assert plan.config.voxel is not None
     scene, place = sweep.scene, grid_frame(plan.scene, plan.context)
@@ -316,38 +296,19 @@ def _square(
     return float(np.square(off).mean(axis=1).sum())
 
 
-# Progress is printed at this interval [s].
-SAY_EVERY = 5.0
-# Least tolerance of the blend with recorded depth. In targets far from all views Gaussians are
-# smeared and the memory is right; validation photographs are too near to other views to show it.
-WITH_DEPTH = 0.4
-# A warning tells of a fit of fewer steps for each photograph. With 50, 100 and 600 steps, 44
-# photographs have 18.8, 21.1 and 29.1 dB in held-out pictures, and 27.3 without a fit.
-SHORT = 7.5
-# A fit whose validation photographs stopped gaining makes this share of its steps or more.
-SKIPPED = 0.9
-
-
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """The results of fitting that a run uses.
+    """The results of fitting that a run uses."""
 
-    Attributes:
-        appearance: the fitted Gaussians.
-        poses: refined poses of context and targets; None where they are as given.
-        spread: whether targets take the pose corrections of the context views near them.
-        predicted: pictures of validation photographs as rendered before these joined, by view.
-        steps: of the first fit, including those of an earlier fit that it continued.
-        sweep: depth that the fit was held to; not kept in files.
-        validation: how it compares to the memory's own colours; not kept in files.
-    """
-
-    appearance: Appearance
+    appearance: Appearance  # the fitted Gaussians
+    # Refined poses of context and targets; None where they are as given.
     poses: RunPoses | None = None
-    spread: bool = False
+    spread: bool = False  # whether targets take the pose corrections of the context views near them
+    # Pictures of validation photographs as rendered before these joined, by view.
     predicted: Mapping[str, Picture] = field(default_factory=dict)
-    steps: int = 0
-    sweep: Sweep | None = None
+    steps: int = 0  # of the first fit, including those of an earlier fit that it continued
+    sweep: Sweep | None = None  # depth that the fit was held to; not kept in files
+    # How it compares to the memory's own colours; not kept in files.
     validation: FitValidation | None = None
 
     def save(self, path: Path) -> None:
@@ -386,8 +347,9 @@ class Fitted:
         fitted = FittedDepth(self.appearance, self.sweep)
         some = any(is_recorded(source, scene[name]) for name in plan.context)
         evidence = scene if some else reduced(scene, SWEPT_SIDE)
-        sizes = (_sizes(each, plan.context) for each in (scene, evidence))
-        factor = float(np.median(np.divide(*sizes)))
+        cameras = [each.subset(plan.context).cameras for each in (scene, evidence)]
+        sides = [np.maximum(each.width, each.height) for each in cameras]
+        factor = float(np.median(np.divide(*sides)))
         assert plan.config.voxel is not None
         return replace(
             plan,
@@ -401,10 +363,6 @@ class Fitted:
 
         Without recorded depth only the Gaussians' colours are used: the memory's depth comes from
         the Gaussians, and its detail lowers structural similarity.
-
-        Args:
-            plan: after ``apply``.
-            memory: of the context.
         """
         if not (_recorded(plan) and self.predicted):
             return self
@@ -428,13 +386,11 @@ class Fitted:
 def fit_appearance(plan: Plan, console: Console, *, earlier: Fitted | None = None) -> Fitted | None:
     """Fit Gaussians to a run's context; None if that is impossible, with a warning that says why.
 
-    Args:
-        plan: of the run.
-        console: prints progress.
-        earlier: fits of this run: the first is continued, or further ones added if it converged.
+    Of ``earlier`` fits the first is continued, or further ones are added if it converged.
     """
     began = time.perf_counter()
-    plan = _posed(plan, earlier)
+    if earlier is not None and earlier.poses is not None:
+        plan = plan.at(earlier.poses)
     sweep = Sweep.of(plan, begins=earlier is None)
     if earlier is None or _converged(plan, earlier):
         fit = _new_fit(plan, console, earlier, sweep=sweep)
@@ -476,10 +432,7 @@ def fit_appearance(plan: Plan, console: Console, *, earlier: Fitted | None = Non
 
 
 def _warn_of_few_steps(fitted: Fitted, plan: Plan, console: Console) -> None:
-    """Say where a fit to photographs is so short that a run without one shows more.
-
-    Recorded depth keeps surfaces where they are, however short the fit.
-    """
+    """Say where a fit is so short that a run without shows more; recorded depth keeps surfaces."""
     needed = round(SHORT * len(plan.context))
     if not _recorded(plan) and fitted.steps < needed:
         console.warn(
@@ -559,18 +512,6 @@ def _recorded(plan: Plan) -> bool:
     return all(is_recorded(plan.source, plan.scene[name]) for name in plan.context)
 
 
-def _first_blend(plan: Plan) -> Blend:
-    """The blend before validation photographs choose one; Gaussians alone without depth."""
-    return Blend() if _recorded(plan) else Blend(share=0.0)
-
-
-def _posed(plan: Plan, earlier: Fitted | None) -> Plan:
-    """The plan with the poses of an earlier fit."""
-    if earlier is None or earlier.poses is None:
-        return plan
-    return plan.at(earlier.poses)
-
-
 @contextmanager
 def _stopped_by_ctrl_c(fit: Fit, console: Console) -> Iterator[None]:
     """Ctrl-C ends the fit and keeps what is fitted; the second time it ends the run, as ever.
@@ -624,7 +565,10 @@ def _fitted(fits: Sequence[Fit], plan: Plan, earlier: Fitted | None) -> Fitted:
             sets, steps = [*sets, *earlier.appearance.others], steps + earlier.steps
         else:
             sets, steps = [*earlier.appearance.fits, *sets], earlier.steps
-    blend = _first_blend(plan) if earlier is None else earlier.appearance.blend
+    # Until validation photographs choose one; Gaussians alone without recorded depth.
+    blend = Blend() if _recorded(plan) else Blend(share=0.0)
+    if earlier is not None:
+        blend = earlier.appearance.blend
     log_gains = cameras.log_gains - cameras.log_gains.mean(axis=0)
     exposures = Exposures(cameras.poses(), log_gains, cameras.depth)
     found = Fitted(
@@ -645,9 +589,3 @@ def _fitted(fits: Sequence[Fit], plan: Plan, earlier: Fitted | None) -> Fitted:
     targets = np.array([cameras.corrected(pose) for pose in given]).reshape(-1, 4, 4)
     poses = RunPoses(frame.cam_from_world(cameras.poses()), frame.cam_from_world(targets))
     return replace(found, poses=poses, spread=cameras.spread)
-
-
-def _sizes(scene: Scene, names: Sequence[str]) -> NDArray[np.int64]:
-    """Longer sides of the pictures."""
-    cameras = scene.subset(names).cameras
-    return np.maximum(cameras.width, cameras.height)

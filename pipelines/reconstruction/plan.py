@@ -48,20 +48,14 @@ FORMS = (
 
 @dataclass(frozen=True, eq=False)
 class Targets:
-    """The cameras to complete, in order.
+    """The cameras to complete, in order."""
 
-    Attributes:
-        cameras: V cameras.
-        truth: per camera the view that shows the truth, None where there is none.
-        kind: "hold-out", the path's name, "trajectory" or "project".
-        files: what was read beside the project.
-        project: what opens the other project that ``truth`` is of; None when it is the run's own.
-    """
-
-    cameras: Cameras
+    cameras: Cameras  # V cameras
+    # Per camera the view that shows the truth, None where there is none.
     truth: tuple[View | None, ...]
-    kind: str
-    files: tuple[Path, ...] = ()
+    kind: str  # "hold-out", the path's name, "trajectory" or "project"
+    files: tuple[Path, ...] = ()  # what was read beside the project
+    # What opens the other project that ``truth`` is of; None when it is the run's own.
     project: str | None = None
 
 
@@ -91,39 +85,23 @@ class PlacedScan:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """A run before its first round.
+    """A run before its first round."""
 
-    Attributes:
-        scene: the project.
-        settings: as the user gave them.
-        config: with everything derived in its place; see ``derived``.
-        context: names of the context views.
-        targets: the cameras to complete.
-        schedule: per round (from 1) the rows of the targets.
-        source: where depth comes from.
-        source_reason: why from there, in words.
-        completer: of the whole run, under its effort policy.
-        ignored: settings of stereo that this source does not look at.
-        weights: files of networks that decide the result.
-        evidence: the scene as it enters the memory, where that is smaller; None for ``scene``.
-        poses: refined ones, which ``posed`` takes instead of the project's.
-        scan: that the memory starts from, placed.
-    """
-
-    scene: Scene
-    settings: RunSettings
-    config: RunSettings
-    context: tuple[str, ...]
-    targets: Targets
-    schedule: tuple[tuple[int, ...], ...]
-    source: DepthSource
-    source_reason: str
-    completer: Completer
-    ignored: tuple[str, ...] = ()
-    weights: tuple[Path, ...] = ()
+    scene: Scene  # the project
+    settings: RunSettings  # as the user gave them
+    config: RunSettings  # with everything derived in its place; see ``derived``
+    context: tuple[str, ...]  # names of the context views
+    targets: Targets  # the cameras to complete
+    schedule: tuple[tuple[int, ...], ...]  # per round (from 1) the rows of the targets
+    source: DepthSource  # where depth comes from
+    source_reason: str  # why from there, in words
+    completer: Completer  # of the whole run, under its effort policy
+    ignored: tuple[str, ...] = ()  # settings of stereo that this source does not look at
+    weights: tuple[Path, ...] = ()  # files of networks that decide the result
+    # The scene as it enters the memory, where that is smaller; None for ``scene``.
     evidence: Scene | None = None
-    poses: RunPoses | None = None
-    scan: PlacedScan | None = None
+    poses: RunPoses | None = None  # refined ones, which ``posed`` takes instead of the project's
+    scan: PlacedScan | None = None  # that the memory starts from, placed
 
     @property
     def derived(self) -> dict[str, Any]:
@@ -154,9 +132,6 @@ def resolve_targets(
 
     Args:
         scene: the project, already of the size that the run works in.
-        context: names of the given views.
-        spec: one of FORMS.
-        allow_overlap: let views be context and target.
         max_side: another project's pictures are reduced to it, pixels.
     """
     context_cameras = scene.subset(context).cameras
@@ -289,7 +264,6 @@ def run_identity(plan: Plan, reading: Mapping[str, Any]) -> dict[str, Any]:
     """What decides a run's result, JSON-ready; a resumed run must have the same.
 
     Args:
-        plan: the run.
         reading: how the user said the project is to be read, JSON-ready.
     """
     scene, targets = plan.scene, plan.targets

@@ -49,9 +49,6 @@ def make_plan(
     """Choose views, depth source, poses, voxel edge and schedule.
 
     Args:
-        scene: the project.
-        settings: as the user gave them.
-        say: is told what is computed meanwhile.
         round_0: folder of round 0 of the run that is gone on with: its poses are taken. Refining
             them again may differ in the last digits, by the order in which threads add.
     """
@@ -228,11 +225,8 @@ def refined_poses_of(
     """Poses on which the context agrees; None where the given ones stay.
 
     Args:
-        scene: the project.
-        context: names of its views.
         targets: move like the context near them, if that errs alike.
         recorded: whether depth is recorded: it tells the scale, and poses where features do not.
-        say: is told what was found.
     """
     from gvtools.appearance.refined_poses import refined_poses
     from gvtools.capture.pose_adjustment import SIDE, adjusted_poses, can_adjust, tracks_of
@@ -419,9 +413,7 @@ def tuned(plan: Plan, cache: DepthCache, directory: RunDirectory, *, console: Co
 
     Args:
         plan: of the run, with its poses; its completer has weights.
-        cache: gives the context's depth.
         directory: of the run; the weights are kept in it.
-        console: where progress goes.
     """
     from pipelines.tuning.tune import previous_tuning, tune
 

@@ -57,7 +57,6 @@ class CachedProjection:
     Args:
         memory: is looked at whenever a guidance is asked for.
         camera: a batch of one.
-        options: of the projection.
         reuse: False splats everything each time that the memory has changed.
         appearance: gives colours of what was observed; None leaves them the memory's.
     """
@@ -130,7 +129,6 @@ def warn_of_depth(reports: Sequence[Mapping[str, Any]], console: Console) -> Non
 
     Args:
         reports: see depth_report, with ``failed``.
-        console: where to.
     """
     failed = [report for report in reports if report["failed"]]
     if failed:
@@ -155,8 +153,6 @@ class RoundTargets:
     projected in another thread, where projections are reused at all: completions do not change it.
 
     Args:
-        plan: of the run.
-        memory: that the rounds add to.
         appearance: shows what was observed; None leaves it to the memory.
     """
 
@@ -488,8 +484,6 @@ def complete_targets(
         memory: generated points are fused into it.
         completer: see ``Completer``.
         context: the observed views that the completer may use.
-        config: settings of the run.
-        clock: receives the stages' times.
     """
     seed, together = config.seed + number, None
     if completer.batches_targets:

@@ -66,8 +66,6 @@ def compile_kernels(
 
     Args:
         config: of the run; its completer and the back end of projection tell which kernels.
-        console: is told what is compiled and how long it took.
-        more: kernels that are needed besides.
     """
     from gvtools.completers.base import completer_type
     from gvtools.depth import view_check
@@ -189,10 +187,6 @@ def reconstruct(
     """Fuse the context, then project, complete and fuse the targets round by round.
 
     Args:
-        scene: the project.
-        config: what to compute.
-        out: the run's folder.
-        console: where progress and figures go.
         resume: continue after the last complete round.
         dry_run: say what would be done, and write nothing.
         reading: how the user said the project is to be read, JSON-ready; part of what a resumed
@@ -241,10 +235,7 @@ def complete_run(
 
     Args:
         plan: with the cameras that were fitted to.
-        directory: of the run, open.
-        done: how many rounds are complete.
         fitted: Gaussians of the run; None leaves the memory's own colours.
-        console: where progress and figures go.
         draw: see ``reconstruct``.
 
     Returns:
@@ -378,7 +369,6 @@ def refine(
         seconds: how long to fit; None counts steps.
         steps: how many steps, where no time is given.
         project: where the run's project lies now; None: where it lay.
-        console: where progress and figures go.
         draw: see ``reconstruct``.
 
     Returns:

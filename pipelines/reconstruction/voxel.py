@@ -46,11 +46,8 @@ def automatic_voxel(
     rough version of the source.
 
     Args:
-        scene: the project.
         context: names of the views that may be looked at.
-        source: the run's source of depth.
         percentile: of each view's footprints, 0 to 100.
-        say: receives a line before depth is computed.
     """
     import numpy as np
 
@@ -171,11 +168,8 @@ def sufficient_scale(
     Of ``SCALES``, it predicts views within ``loss`` of the best.
 
     Args:
-        scene: the project.
-        names: context views with recorded depth.
         config: of the run: the edge to start from, and how points are lifted, kept and projected.
         loss: dB that the mean PSNR of the predicted views may fall behind.
-        say: receives a line with the result.
 
     Returns:
         A share of ``config.voxel``; 1 where there are too few views to tell.
@@ -223,7 +217,6 @@ def _search(look: Callable[[float], dict[float, float]], loss: float) -> dict[fl
 
     Args:
         look: adds a scale; gives the PSNR of all scales so far, empty where too little compares.
-        loss: dB that may be lost.
     """
     psnrs = look(START)
     for scale in [scale for scale in reversed(SCALES) if scale < START]:
@@ -282,21 +275,14 @@ def _nearest(scene: Scene, names: Sequence[str], name: str) -> list[str]:
 
 @dataclass(frozen=True, eq=False)
 class _Probe:
-    """Tiles of a view, and what its neighbours see of the place.
+    """Tiles of a view, and what its neighbours see of the place."""
 
-    Attributes:
-        camera: of the view.
-        rgb: (H, W, 3) uint8, its photograph.
-        tiles: (H, W) bool, which of its pixels count.
-        frame: for the memory of the neighbours.
-        seen: each neighbour's camera and picture, and which of its pixels fall into the tiles or
-            beside them.
-    """
-
-    camera: Cameras
-    rgb: NDArray[np.uint8]
-    tiles: NDArray[np.bool_]
-    frame: LocalFrame
+    camera: Cameras  # of the view
+    rgb: NDArray[np.uint8]  # (H, W, 3) uint8, its photograph
+    tiles: NDArray[np.bool_]  # (H, W) bool, which of its pixels count
+    frame: LocalFrame  # for the memory of the neighbours
+    # Each neighbour's camera and picture, and which of its pixels fall into the tiles or beside
+    # them.
     seen: list[tuple[Cameras, Frame, NDArray[np.bool_]]]
 
 
