@@ -26,8 +26,8 @@ import numpy as np
 from gvtools import open_project
 from gvtools.appearance.appearance import Appearance
 from gvtools.appearance.fit import Fit
-from gvtools.appearance.fit_views import FitView
 from gvtools.appearance.gaussians import Gaussians
+from gvtools.poses.views import FitView
 from gvtools.scenes.reduced import reduced
 
 REPEATS = 5

@@ -5,17 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import torch
-from kornia.geometry.liegroup import Se3
 from numpy.typing import NDArray
+
+from gvtools.poses.motions import mean_near, moved
 
 # Each component of a pose's correction stays below this angle [rad] and share of the typical depth.
 MOST_TURN, MOST_SHIFT = 0.035, 0.03
-# Views that a camera takes its correction from, and how fast their weight falls: it is proportional
-# to exp(-(distance / (NEAR_SHIFT typical depths) + angle of viewing directions [rad] / NEAR_TURN)).
-NEAR_VIEWS, NEAR_SHIFT, NEAR_TURN = 2, 0.03, 0.05
-# Refined poses are kept if the error of predicting neighbouring photographs falls by this share.
-LEAST_BETTER = 0.01
 # Step lengths: of turns [rad], of shifts in shares of the depth, of the logarithm of exposures.
 # Those of poses are at the end smaller by the last number, so that right poses come to rest.
 TURN_RATE, SHIFT_RATE, GAIN_RATE, RATE_END = 1e-3, 1e-3, 6e-3, 0.02
@@ -127,50 +122,6 @@ class CameraCorrections:
         self.log_gains[number] -= GAIN_RATE * _adam(
             self._gain_moments[:, number], gradient, self._gain_steps[number]
         )
-
-
-def mean_near(
-    pose: NDArray[np.float64],
-    poses: NDArray[np.float64],
-    values: NDArray[np.float64],
-    *,
-    depth: float,
-    but: Sequence[int] = (),
-    count: int = NEAR_VIEWS,
-    reach: tuple[float, float] = (NEAR_SHIFT, NEAR_TURN),
-) -> NDArray[np.float64]:
-    """(C,) mean of what belongs to the cameras that stand and look most like a pose.
-
-    Args:
-        pose: (4, 4) camera from any frame.
-        poses: (V, 4, 4) of the cameras, in the same frame.
-        values: (V, C) what belongs to each camera.
-        depth: typical depth, scene units.
-        but: cameras that do not count.
-        count: how many cameras count.
-        reach: how fast weights fall with distance (in shares of the depth) and angle [rad], see
-            ``NEAR_SHIFT``.
-    """
-    centers = -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])
-    center = -pose[:3, :3].T @ pose[:3, 3]
-    angle = np.arccos(np.clip(poses[:, 2, :3] @ pose[2, :3], -1, 1))
-    shift, turn = reach
-    apart = np.linalg.norm(centers - center, axis=1) / (shift * depth) + angle / turn
-    apart[list(but)] = np.inf
-    near = np.argsort(apart, kind="stable")[:count]
-    weight = np.exp(apart[near].min() - apart[near])
-    return np.asarray(weight @ values[near] / weight.sum())
-
-
-def moved(pose: NDArray[np.float64], motion: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A pose (4, 4) after a motion (6,), shift and turn, on the camera's side."""
-    return Se3.exp(torch.from_numpy(motion)[None]).matrix()[0].detach().numpy() @ pose
-
-
-def motions_between(given: NDArray[np.float64], poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(V, 6) shift and turn from poses (V, 4, 4) to others, on the camera's side."""
-    change = torch.from_numpy(poses @ np.linalg.inv(given))
-    return np.asarray(Se3.from_matrix(change).log().detach())
 
 
 def _adam(moments: NDArray, gradient: NDArray, step: int) -> NDArray[np.float64]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.appearance.fit_views import ReducedView
+from gvtools.poses.views import ReducedView
 
 # Weight of depth that a network estimated, and the relative error that is tolerated. Tested with
 # depth of a fit to all photographs, with smooth errors added: fits of three and seven photographs

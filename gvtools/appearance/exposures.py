@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.appearance.camera_corrections import mean_near
+from gvtools.poses.motions import mean_near
 
 # A camera's exposure is predicted from the COUNT photographs nearest to it, weighted by
 # exp(-(distance / (SHIFT typical depths) + angle between viewing directions [rad] / TURN)).

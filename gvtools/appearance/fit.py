@@ -16,21 +16,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.appearance import kernels
-from gvtools.appearance.camera_corrections import LEAST_BETTER, CameraCorrections
+from gvtools.appearance.camera_corrections import CameraCorrections
 from gvtools.appearance.depth_loss import add_depth
 from gvtools.appearance.exposures import Exposures
 from gvtools.appearance.fit_options import FitOptions, converged_steps, most_gaussians
-from gvtools.appearance.fit_views import FitView, ReducedView, pixel_width, reduced
 from gvtools.appearance.free_space import floaters, free_depth
 from gvtools.appearance.gaussians import Gaussians
-from gvtools.appearance.growth import Population
+from gvtools.appearance.growth import Population, pixel_width
 from gvtools.appearance.picture import Picture
-from gvtools.appearance.pose_check import compared, prediction_error
 from gvtools.appearance.sample import Sample
 from gvtools.appearance.smooth_depth import add_bending
 from gvtools.appearance.splat.project_kernels import LOG_SCALE, LOGIT, QUATERNION, SH, VALUES
 from gvtools.appearance.splat.splat import Lens, Splat
 from gvtools.kernels import in_threads
+from gvtools.poses.refinement import LEAST_BETTER, compared, prediction_error
+from gvtools.poses.views import FitView, ReducedView, reduced
 
 # The progress of a fit runs from 0 to 1: the share of its time, not of its steps, that is over.
 # Numbers below that name a part of the fit are progress.

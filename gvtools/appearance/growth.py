@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.appearance.splat.project_kernels import LOG_SCALE, LOGIT, QUATERNION, VALUES
+from gvtools.poses.views import FitView
 
 # Gaussians of a smaller opacity are removed.
 FAINTEST = 0.005
@@ -98,3 +100,22 @@ def rotations(quaternions: NDArray[np.float32]) -> NDArray[np.float32]:
 
     q = torch.from_numpy(quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True))
     return quaternion_to_rotation_matrix(q).numpy()
+
+
+def pixel_width(positions: NDArray[np.float32], views: Sequence[FitView]) -> NDArray[np.float32]:
+    """(N,) width of a pixel at each position in the nearest view that sees it, scene units.
+
+    What no view sees gets the median of the others.
+    """
+    width = np.full(len(positions), np.inf)
+    for view in views:
+        points = positions @ view.cam_from_local[:3, :3].T + view.cam_from_local[:3, 3]
+        z, size = points[:, 2], np.array(view.rgb.shape[1::-1])
+        ahead = z > 0
+        focal = np.array([view.K[0, 0], view.K[1, 1]])
+        xy = points[:, :2] / np.where(ahead, z, 1)[:, None] * focal + view.K[:2, 2]
+        inside = ahead & (xy > -0.3 * size).all(axis=1) & (xy < 1.3 * size).all(axis=1)
+        width[inside] = np.minimum(width[inside], z[inside] / focal[0])
+    seen = np.isfinite(width)
+    width[~seen] = np.median(width[seen]) if seen.any() else 1.0
+    return width.astype(np.float32)

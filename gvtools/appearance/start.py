@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.appearance.fit_views import FitView
 from gvtools.appearance.gaussians import Gaussians
 from gvtools.errors import DegenerateError
 from gvtools.memory.store.local_frame import LocalFrame
+from gvtools.poses.views import FitView
 
 # Points are thinned to fewer than twice as many: few Gaussians are fitted faster, and the fit adds
 # more where they are needed.

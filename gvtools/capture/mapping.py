@@ -19,9 +19,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gvtools.capture.matching import SEED, flat_pairs, match_pictures, only_turned, verified
+from gvtools.capture.matching import flat_pairs, match_pictures, only_turned, verified
 from gvtools.errors import ProjectError
 from gvtools.features import quiet_colmap
+from gvtools.poses.colmap import SEED, adjust, fix_cameras
 
 if TYPE_CHECKING:
     import pycolmap
@@ -285,33 +286,13 @@ def _settle(model: pycolmap.Reconstruction, *, refine: bool) -> None:
     if model.num_reg_images() < 2:
         return
     options = pycolmap.BundleAdjustmentOptions()
-    options.print_summary = False
     if not refine:
         fix_cameras(options)
-    _adjust(model, options)
+    adjust(model, options)
     images = [image for image in model.images.values() if image.has_pose]
     counts = [sum(image.camera_id == camera for image in images) for camera in model.cameras]
     if refine and min(counts) >= REFINED_FROM:
         options.refine_principal_point = True
-        _adjust(model, options)
+        adjust(model, options)
     pycolmap.ObservationManager(model).filter_all_points3D(LOST, 0.0)
     model.update_point_3d_errors()
-
-
-def fix_cameras(options: pycolmap.BundleAdjustmentOptions) -> None:
-    """Hold intrinsics, and the relative poses of a rig's cameras, fixed."""
-    options.refine_focal_length = False
-    options.refine_extra_params = False
-    options.refine_sensor_from_rig = False
-
-
-def _adjust(model: pycolmap.Reconstruction, options: pycolmap.BundleAdjustmentOptions) -> None:
-    """Bundle-adjust all registered pictures, silently, unlike pycolmap.bundle_adjustment."""
-    import pycolmap
-
-    pycolmap.ObservationManager(model).filter_observations_with_negative_depth()
-    config = pycolmap.BundleAdjustmentConfig()
-    for number in model.reg_image_ids():
-        config.add_image(number)
-    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    pycolmap.create_default_bundle_adjuster(options, config, model).solve()

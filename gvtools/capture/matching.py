@@ -1,6 +1,7 @@
 """Features of pictures, their matches and the verification of these, in COLMAP's database.
 
-COLMAP's SIFT, or learned features that LightGlue matches (``learned_matching``).
+COLMAP's SIFT, or learned features that LightGlue matches; where matching all pictures with all
+would take too long, pairs that look alike.
 """
 
 from __future__ import annotations
@@ -12,24 +13,31 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
-from gvtools.capture import learned_matching
-from gvtools.capture.pairs import sift_descriptors, similar_pairs
+from gvtools.errors import ShapeError
+from gvtools.features import FeatureMatcher, Features, root_sift
+from gvtools.poses.colmap import extract_sift, list_pairs, verification
+from gvtools.scenes.images import check_size, read_image, read_mask
 
 if TYPE_CHECKING:
     import pycolmap
 
     from gvtools.capture.panoramas import FaceRig
-    from gvtools.features import FeatureMatcher
 
 # Up to this many pictures, every pair is matched; fewer with LightGlue, which takes a second a pair
 # on a processor.
 EXHAUSTIVE, EXHAUSTIVE_LEARNED = 60, 30
 # A frame of a video is matched with this many after it, and with those 16, 32, 64 and 128 later.
 SEQUENTIAL_OVERLAP = 10
-# Most features of a picture, and the longer side that it is reduced to before, pixels.
-MAX_FEATURES, MAX_SIDE = 8192, 1600
-SEED = 1
+# Learned features: the longer side that pictures are reduced to, pixels, that of the pictures
+# LightGlue's authors test with, and keypoints of a picture, of the highest score.
+LEARNED_SIDE, LEARNED_FEATURES = 1024, 1024
+# Lines about progress come after so many pictures or pairs.
+EVERY = 100
+# Partners that each picture gets where not all are matched with all; centres of the descriptor by
+# which they are found, features of a picture that it is made of, and rounds of k-means.
+NEAREST, WORDS, FEATURES, ROUNDS = 20, 32, 1000, 8
 # Focal lengths that are tried, in lengths of the longer side, and how far homographies may be from
 # rotations (Frobenius norm of R^T R - 1, the median of all pairs): 0.016 of a camera that turned,
 # 0.10 of one that moved by a quarter of the distance before something almost flat. Seen by a long
@@ -75,7 +83,7 @@ def match_pictures(
         if group[0] in given:
             reader.camera_model, reader.camera_params = given[group[0]]
         if learned is None:
-            extract(database, images, group, masks=masks, reader=reader)
+            extract_sift(database, images, group, masks=masks, reader=reader)
         else:
             pycolmap.import_images(
                 database, images, pycolmap.CameraMode.SINGLE, image_names=list(group),
@@ -91,8 +99,8 @@ def match_pictures(
         how = _match(database, work, options=options, count=count, in_order=in_order, say=say)
         return database, how
     names = [name for group in cameras for name in group]
-    features = learned_matching.extract(images, names, learned, masks=masks, say=say)
-    learned_matching.write_keypoints(database, features)
+    features = learned_features(images, names, learned, masks=masks, say=say)
+    write_keypoints(database, features)
     described = {name: found.descriptors for name, found in features.items()}
     chosen, how = _chosen(described, EXHAUSTIVE_LEARNED, in_order=in_order)
     if rigs:
@@ -100,49 +108,9 @@ def match_pictures(
             frame = {image.name: image.frame_id for image in opened.read_all_images()}
         chosen = [(a, b) for a, b in chosen if frame[a] != frame[b]]
     say(f"matching {len(chosen)} pairs")
-    learned_matching.write_matches(database, features, chosen, matcher=learned, say=say)
-    pycolmap.verify_matches(database, listed(chosen, work), verification())
+    _write_matches(database, features, chosen, matcher=learned, say=say)
+    pycolmap.verify_matches(database, list_pairs(chosen, work), verification())
     return database, how
-
-
-def extract(
-    database: Path,
-    images: Path,
-    names: Sequence[str],
-    *,
-    masks: Path | None,
-    reader: pycolmap.ImageReaderOptions,
-    side: int = MAX_SIDE,
-    features: int = MAX_FEATURES,
-    first_octave: int = -1,
-    one_camera: bool = True,
-) -> None:
-    """Find SIFT features of some pictures.
-
-    Args:
-        database: where they go.
-        images: folder of the pictures.
-        names: in it.
-        masks: folder of masks, black where no feature may be.
-        reader: COLMAP's options of cameras.
-        side: longer side that pictures are reduced to before, pixels.
-        features: at most so many of a picture.
-        first_octave: -1 doubles pictures before; 0 takes a quarter of the time.
-        one_camera: whether all of them have one camera, and so one size.
-    """
-    import pycolmap
-
-    options = pycolmap.FeatureExtractionOptions()
-    options.max_image_size = side
-    options.sift.max_num_features = features
-    options.sift.first_octave = first_octave
-    if masks is not None:
-        reader.mask_path = masks
-    mode = pycolmap.CameraMode.SINGLE if one_camera else pycolmap.CameraMode.PER_IMAGE
-    pycolmap.extract_features(
-        database, images, image_names=list(names), camera_mode=mode,
-        reader_options=reader, extraction_options=options, device=pycolmap.Device.auto,
-    )  # fmt: skip
 
 
 def _match(
@@ -166,7 +134,7 @@ def _match(
     pairs, how = _chosen(sift_descriptors(database), EXHAUSTIVE, in_order=in_order)
     say(f"matching {len(pairs)} pairs")
     pairing = pycolmap.ImportedPairingOptions()
-    pairing.match_list_path = listed(pairs, work)
+    pairing.match_list_path = list_pairs(pairs, work)
     pycolmap.match_image_pairs(
         database, matching_options=options, pairing_options=pairing,
         verification_options=verification(),
@@ -201,20 +169,142 @@ def _chosen(
     return sorted(pairs), how
 
 
-def listed(pairs: Sequence[tuple[str, str]], work: Path) -> Path:
-    """A file with the pairs, as COLMAP reads them."""
-    file = work / "pairs.txt"
-    file.write_text("".join(f"{a} {b}\n" for a, b in pairs), encoding="utf-8")
-    return file
+def similar_pairs(
+    described: Mapping[str, NDArray[np.float32]], *, nearest: int = NEAREST
+) -> list[tuple[str, str]]:
+    """Pairs of pictures whose features are alike, by a descriptor learnt from these pictures.
+
+    Each picture is described by VLAD (Jegou et al. 2010): the sum of its features' differences from
+    the nearest of WORDS centres, which k-means finds among all of them.
+
+    Args:
+        described: (N, D) unit descriptors of each picture's features; N may be 0.
+        nearest: how many partners each picture gets; it may be chosen by more.
+    """
+    import cv2
+
+    # In the order of names, so that pairs are chosen alike every time.
+    names = sorted(name for name, rows in described.items() if len(rows))
+    if len(names) < 2:
+        return []
+    features = [
+        rows[np.linspace(0, len(rows) - 1, min(FEATURES, len(rows))).astype(int)]
+        for rows in (described[name] for name in names)
+    ]
+    rng = np.random.default_rng(0)
+    sample = np.concatenate([rows[rng.permutation(len(rows))[:200]] for rows in features])
+    stop = (cv2.TERM_CRITERIA_MAX_ITER, ROUNDS, 0.0)
+    cv2.setRNGSeed(0)
+    words = min(WORDS, len(sample))
+    labels = np.zeros((len(sample), 1), np.int32)
+    _, _, centres = cv2.kmeans(sample, words, labels, stop, 1, cv2.KMEANS_PP_CENTERS)
+    images = np.stack([_vlad(rows, np.asarray(centres, np.float32)) for rows in features])
+    alike = images @ images.T
+    np.fill_diagonal(alike, -np.inf)
+    pairs = set()
+    for row, values in enumerate(alike):
+        for column in np.argsort(-values)[: min(nearest, len(names) - 1)]:
+            pairs.add((min(row, int(column)), max(row, int(column))))
+    return sorted((names[a], names[b]) for a, b in pairs)
 
 
-def verification() -> pycolmap.TwoViewGeometryOptions:
-    """COLMAP's options of verifying matches, the same every time."""
+def sift_descriptors(database: Path) -> dict[str, NDArray[np.float32]]:
+    """(N, 128) RootSIFT descriptors of each picture in COLMAP's database."""
     import pycolmap
 
-    options = pycolmap.TwoViewGeometryOptions()
-    options.ransac.random_seed = SEED
-    return options
+    described = {}
+    with pycolmap.Database.open(database) as opened:
+        for image in opened.read_all_images():
+            rows = np.asarray(opened.read_descriptors(image.image_id).data, np.float32)
+            rows = rows.reshape(-1, 128)
+            rows = rows[np.linspace(0, len(rows) - 1, min(FEATURES, len(rows))).astype(int)]
+            described[image.name] = root_sift(rows)
+    return described
+
+
+def _vlad(features: NDArray[np.float32], centres: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(W * D,) unit descriptor of (N, D) features by (W, D) centres."""
+    nearest = np.argmin((centres**2).sum(1) - 2 * features @ centres.T, axis=1)
+    sums = np.zeros_like(centres)
+    np.add.at(sums, nearest, features - centres[nearest])
+    sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-9)
+    flat = sums.ravel()
+    return flat / max(float(np.linalg.norm(flat)), 1e-9)
+
+
+def learned_features(
+    images: Path,
+    names: Sequence[str],
+    matcher: FeatureMatcher,
+    *,
+    masks: Path | None = None,
+    say: Say = lambda text: None,
+) -> dict[str, Features]:
+    """Features of pictures, in the pixels of the pictures as they are stored."""
+    found = {}
+    for number, name in enumerate(names, start=1):
+        features = _of_picture(read_image(images / name).rgb, matcher)
+        mask = None if masks is None else masks / f"{name}.png"
+        if mask is not None and mask.is_file():
+            usable = read_mask(mask)
+            check_size(usable.shape[::-1], (features.width, features.height), path=mask)
+            x, y = np.floor(features.xy).astype(int).T
+            features = features[usable[y, x]]
+        found[name] = features
+        if number % EVERY == 0:
+            say(f"features of {number} of {len(names)} pictures")
+    return found
+
+
+def _of_picture(rgb: np.ndarray, matcher: FeatureMatcher) -> Features:
+    height, width = rgb.shape[:2]
+    scale = min(1.0, LEARNED_SIDE / max(height, width))
+    small = (max(1, round(width * scale)), max(1, round(height * scale)))
+    if small != (width, height):
+        rgb = np.asarray(Image.fromarray(rgb).resize(small, Image.Resampling.LANCZOS))
+    features = matcher.extract(np.ascontiguousarray(rgb))
+    # Pixels' centres are at +0.5 in both pictures, so that positions scale.
+    xy = features.xy * (np.array([width, height]) / small)
+    # A learned position may lie half a pixel outside.
+    return Features(
+        np.clip(xy, 0.5, [width - 0.5, height - 0.5]), features.descriptors, width, height
+    )
+
+
+def write_keypoints(database: Path, features: Mapping[str, Features]) -> None:
+    """Write keypoints of all of the database's pictures, by their names."""
+    import pycolmap
+
+    with pycolmap.Database.open(database) as opened:
+        for image in opened.read_all_images():
+            found = features[image.name]
+            camera = opened.read_camera(image.camera_id)
+            if (camera.width, camera.height) != (found.width, found.height):
+                raise ShapeError(
+                    f"{image.name}: features of {found.width}x{found.height} pixels; expected "
+                    f"{camera.width}x{camera.height}"
+                )
+            opened.write_keypoints(image.image_id, found.xy.astype(np.float32))
+
+
+def _write_matches(
+    database: Path,
+    features: Mapping[str, Features],
+    pairs: Sequence[tuple[str, str]],
+    *,
+    matcher: FeatureMatcher,
+    say: Say,
+) -> None:
+    """Match pairs of pictures and write the matches, not verified yet."""
+    import pycolmap
+
+    with pycolmap.Database.open(database) as opened:
+        numbers = {image.name: image.image_id for image in opened.read_all_images()}
+        for number, (first, second) in enumerate(pairs, start=1):
+            rows = matcher.match(features[first], features[second])
+            opened.write_matches(numbers[first], numbers[second], rows.astype(np.uint32))
+            if number % EVERY == 0:
+                say(f"{number} of {len(pairs)} pairs matched")
 
 
 def verified(database: Path) -> dict[tuple[str, str], int]:

@@ -21,10 +21,10 @@ from scipy.spatial.transform import Rotation
 from gvtools.cameras import Cameras
 from gvtools.capture.bag import take_apart
 from gvtools.capture.project import REPORT, replaced_folder
-from gvtools.capture.rgbd_frames import RgbdFrames
-from gvtools.capture.rgbd_poses import Found, find_poses
 from gvtools.errors import ProjectError
 from gvtools.files import link_or_copy, write_json
+from gvtools.poses.odometry import RgbdFrames
+from gvtools.poses.recording import RecordingPoses, find_poses
 from gvtools.scenes.calibration import INTRINSICS
 from gvtools.scenes.images import UNREADABLE
 from gvtools.scenes.matching import named
@@ -196,7 +196,7 @@ def _write(
     recording: Recording,
     options: RgbdOptions,
     *,
-    found: Found,
+    found: RecordingPoses,
     names: Sequence[str],
 ) -> None:
     """The project's files but the report."""
@@ -234,7 +234,7 @@ def _save(path: Path, matrix: Float64) -> None:
 
 
 def _report(
-    scene: Scene, found: Found, names: Sequence[str], *, source: Path, sources: Recording
+    scene: Scene, found: RecordingPoses, names: Sequence[str], *, source: Path, sources: Recording
 ) -> RgbdCaptureReport:
     kept = sorted(found.poses)
     files = [os.path.relpath(frame.image, sources.root) for frame in sources.frames]
@@ -319,7 +319,7 @@ def _summary(rows: Float64) -> dict[str, float] | None:
     }
 
 
-def _findings(found: Found, left_out: dict[str, str], *, count: int) -> list[Finding]:
+def _findings(found: RecordingPoses, left_out: dict[str, str], *, count: int) -> list[Finding]:
     findings = []
     if left_out:
         findings.append(

@@ -32,12 +32,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from gvtools.cameras import Cameras, Float64, concatenate, invert_rigid
 from gvtools.errors import ProjectError, ShapeError
 from gvtools.evaluation.posed_picture import PosedPicture
 from gvtools.features import quiet_colmap
+from gvtools.poses.colmap import posed_model, row_of, set_intrinsics, write_pictures
 
 if TYPE_CHECKING:
     import pycolmap
@@ -82,28 +82,20 @@ def match_pictures(pictures: Sequence[PosedPicture], folder: Path, *, seed: int)
     """
     import pycolmap
 
-    masked = any(picture.mask is not None for picture in pictures)
-    _write_pictures(pictures, folder, with_masks=masked)
+    names = write_pictures(((picture.rgb, picture.mask) for picture in pictures), folder)
+    (folder / "model").mkdir()
     database = folder / "database.db"
-    reader = pycolmap.ImageReaderOptions(camera_model="PINHOLE")
-    if masked:
-        reader.mask_path = folder / "masks"
+    reader = pycolmap.ImageReaderOptions(camera_model="PINHOLE", mask_path=folder / "masks")
     pycolmap.extract_features(
         database,
         folder / "images",
-        image_names=[_file(number) for number in range(len(pictures))],
+        image_names=names,
         camera_mode=pycolmap.CameraMode.PER_IMAGE,
         reader_options=reader,
         extraction_options=pycolmap.FeatureExtractionOptions(use_gpu=False, num_threads=1),
         device=pycolmap.Device.cpu,
     )
-    with pycolmap.Database.open(database) as opened:
-        for image in opened.read_all_images():
-            K = pictures[_number(image)].camera.K[0]
-            camera = opened.read_camera(image.camera_id)
-            camera.params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
-            camera.has_prior_focal_length = True
-            opened.update_camera(camera)
+    set_intrinsics(database, np.concatenate([picture.camera.K for picture in pictures]))
     verification = pycolmap.TwoViewGeometryOptions(min_num_inliers=MIN_MATCHES)
     verification.ransac.random_seed = seed
     pycolmap.set_random_seed(seed)
@@ -126,19 +118,8 @@ def triangulate(
     """
     import pycolmap
 
-    model = pycolmap.Reconstruction()
-    with pycolmap.Database.open(folder / "database.db") as opened:
-        for image in opened.read_all_images():
-            number = _number(image)
-            model.add_camera_with_trivial_rig(opened.read_camera(image.camera_id))
-            posed = pycolmap.Image(
-                name=image.name,
-                keypoints=matched.keypoints[number],
-                camera_id=image.camera_id,
-                image_id=image.image_id,
-            )
-            pose = pictures[number].camera.cam_from_world[0, :3]
-            model.add_image_with_trivial_frame(posed, pycolmap.Rigid3d(pose))
+    poses = np.concatenate([picture.camera.cam_from_world for picture in pictures])
+    model = posed_model(folder / "database.db", poses)
     focal = min(float(picture.camera.K[0, 0, 0]) for picture in pictures)
     angle = float(np.degrees(np.arctan(limit / focal)))
     options = pycolmap.IncrementalPipelineOptions(
@@ -165,27 +146,8 @@ def observed_points(
     observed = [np.full(len(places), -1) for places in matched.keypoints]
     for image in model.images.values() if model else ():
         for row in image.get_observation_point2D_idxs():
-            observed[_number(image)][row] = image.points2D[row].point3D_id
+            observed[row_of(image)][row] = image.points2D[row].point3D_id
     return observed
-
-
-def _file(number: int) -> str:
-    return f"{number:06d}.png"
-
-
-def _number(image: pycolmap.Image) -> int:
-    return int(Path(image.name).stem)
-
-
-def _write_pictures(pictures: Sequence[PosedPicture], folder: Path, *, with_masks: bool) -> None:
-    for name in ("images", "masks", "model"):
-        (folder / name).mkdir()
-    for number, picture in enumerate(pictures):
-        Image.fromarray(picture.rgb).save(folder / "images" / _file(number), compress_level=1)
-        if with_masks:  # COLMAP then wants one for every picture
-            mask = np.ones(picture.rgb.shape[:2], bool) if picture.mask is None else picture.mask
-            bright = Image.fromarray(mask.astype(np.uint8) * 255)
-            bright.save(folder / "masks" / f"{_file(number)}.png")
 
 
 def _read_matches(database: Path, count: int) -> Matched:
@@ -194,7 +156,7 @@ def _read_matches(database: Path, count: int) -> Matched:
     keypoints = [np.zeros((0, 2)) for _ in range(count)]
     pairs = []
     with pycolmap.Database.open(database) as opened:
-        number = {image.image_id: _number(image) for image in opened.read_all_images()}
+        number = {image.image_id: row_of(image) for image in opened.read_all_images()}
         for image, row in number.items():
             keypoints[row] = opened.read_keypoints(image)[:, :2].astype(np.float64)
         for pair, geometry in zip(*opened.read_two_view_geometries(), strict=True):

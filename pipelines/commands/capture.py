@@ -201,11 +201,11 @@ def _matcher(features: str | None, weights: Sequence[Path] | None) -> LightGlueM
         return None
     import torch
 
-    from gvtools.capture.learned_matching import MAX_FEATURES
+    from gvtools.capture.matching import LEARNED_FEATURES
     from gvtools.features import LightGlueMatcher
 
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    return LightGlueMatcher(features, max_features=MAX_FEATURES, weights=weights, device=device)
+    return LightGlueMatcher(features, max_features=LEARNED_FEATURES, weights=weights, device=device)
 
 
 def _capture_rgbd(

@@ -26,7 +26,6 @@ from gvtools.appearance.blending import Blend, best_blend
 from gvtools.appearance.exposures import Exposures
 from gvtools.appearance.fit import CONTINUED, Fit
 from gvtools.appearance.fit_options import FitOptions, converged_steps
-from gvtools.appearance.fit_views import FitView
 from gvtools.appearance.fits import LEAST_SHARE, MOST_FITS, run_fits, with_chosen_backdrop
 from gvtools.appearance.gaussians import Gaussians
 from gvtools.appearance.picture import Picture, mean_picture
@@ -39,6 +38,7 @@ from gvtools.depth.source import DepthMap, MixedDepth, RecordedDepth, is_recorde
 from gvtools.errors import DegenerateError, GvError, MemoryFileError, OptionError, ShapeError
 from gvtools.memory.projection import project
 from gvtools.memory.spatial_memory import SpatialMemory
+from gvtools.poses.views import FitView
 from gvtools.prefetch import prefetch
 from gvtools.runs.poses import RunPoses
 from gvtools.scenes.images import resize_nearest

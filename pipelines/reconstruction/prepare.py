@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.appearance.fit_views import FitView
 from gvtools.cameras import Cameras
 from gvtools.completers.base import Completer, create
 from gvtools.errors import DegenerateError, OptionError, ProjectError
+from gvtools.poses.views import FitView
 from gvtools.prefetch import prefetch
 from gvtools.runs.layout import POSES, TUNED
 from gvtools.runs.poses import RunPoses, posed, with_poses
@@ -228,8 +228,8 @@ def refined_poses_of(
         targets: move like the context near them, if that errs alike.
         recorded: whether depth is recorded: it tells the scale, and poses where features do not.
     """
-    from gvtools.appearance.refined_poses import refined_poses
-    from gvtools.capture.pose_adjustment import SIDE, adjusted_poses, can_adjust, tracks_of
+    from gvtools.poses.bundle_adjustment import SIDE, adjusted_poses, can_adjust, tracks_of
+    from gvtools.poses.refinement import refined_poses
 
     scene = reduced(scene, SIDE)
     # Lengths stay small there, also in a world whose origin is far away.

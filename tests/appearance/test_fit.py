@@ -30,9 +30,9 @@ from gvtools.appearance.fit_options import (
     converged_steps,
     most_gaussians,
 )
-from gvtools.appearance.fit_views import FitView, reduced
 from gvtools.appearance.splat.project_kernels import SH
 from gvtools.appearance.splat.splat import Lens, Splat
+from gvtools.poses.views import FitView, reduced
 
 # Small numbers of steps leave no room for pictures at a quarter of their size; sizes go by share.
 STEPS = 150

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from splat_scene import photographs, picture, pose, pose_errors, rough_gaussians, walk
 
-from gvtools.appearance.camera_corrections import CameraCorrections, moved
+from gvtools.appearance.camera_corrections import CameraCorrections
 from gvtools.appearance.fit import VALIDATION_ENDS, Fit, validation_rows
 from gvtools.appearance.fit_options import FitOptions
-from gvtools.appearance.pose_check import compared, prediction_error
 from gvtools.appearance.start import from_depth
 from gvtools.memory.store.local_frame import LocalFrame
+from gvtools.poses.motions import moved
+from gvtools.poses.refinement import compared, prediction_error
 
 COUNT = 8
 FRAME = LocalFrame.at()

@@ -13,7 +13,7 @@ from command_line import refused
 from PIL import Image
 
 from gvtools.capture.mapping import find_cameras
-from gvtools.capture.pairs import sift_descriptors, similar_pairs
+from gvtools.capture.matching import sift_descriptors, similar_pairs
 from gvtools.capture.photographs import copy_upright, find_photographs
 from gvtools.capture.placement import place
 from gvtools.capture.project import capture_photographs

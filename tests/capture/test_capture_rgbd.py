@@ -15,11 +15,10 @@ from rgbd_walk import FOCAL, HEIGHT, WIDTH, pictures, walk, write_redwood, write
 from rgbd_walk import write_tum as write_tum_walk
 
 from gvtools.cameras import invert_rigid
-from gvtools.capture.odometry import compare, start_from_features
-from gvtools.capture.pose_graph import residual
-from gvtools.capture.rgbd_frames import RgbdFrames
 from gvtools.capture.rgbd_project import capture_rgbd
 from gvtools.errors import ProjectError
+from gvtools.poses.odometry import RgbdFrames, compare, start_from_features
+from gvtools.poses.pose_graph import residual
 from gvtools.scenes.project import open_project
 from gvtools.scenes.rgbd import RgbdOptions, count_unposed, read_unposed, rgbd_scene
 from pipelines.cli import main

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from gvtools.cameras import Cameras, concatenate
 from gvtools.depth.source import DepthMap
 from gvtools.depth.stereo import cleanup, silhouettes
-from gvtools.depth.stereo.alignment import PoseEquations, adjusted, pose_equations
 from gvtools.depth.stereo.back_ends import make_matcher
 from gvtools.depth.stereo.confidence import confidence_of
 from gvtools.depth.stereo.consistency import agreement
@@ -36,6 +35,7 @@ from gvtools.depth.stereo.single_view import (
 from gvtools.depth.stereo.sources import choose_sources
 from gvtools.depth.stereo.texture import textured
 from gvtools.errors import DegenerateError, OptionError
+from gvtools.poses.dense_adjustment import PoseEquations, adjusted, pose_equations
 from gvtools.scenes.scene import Frame, Scene, View
 
 # Expected errors of poses that are adjusted: radians, and a share of the typical depth.
@@ -197,7 +197,11 @@ class PlaneSweepStereo:
             return None
         cameras = concatenate([source.cameras[-1] for source in sources])
         flow = residual_flow(coarse.level, coarse.inverse_depth, noise=self.options.noise)
-        found = pose_equations(cameras, reference.cameras[-1], coarse.inverse_depth, flow=flow)
+        found = pose_equations(
+            cameras, reference.cameras[-1], coarse.inverse_depth.cpu().numpy(),
+            motion=torch.stack([flow.dx, flow.dy], -1).cpu().numpy(),
+            weight=flow.weight.cpu().numpy(),
+        )  # fmt: skip
         return None if found is None else (row, [self.views.index(n) for n in names], found)
 
     def _coarse(

@@ -12,13 +12,13 @@ from scipy.spatial.transform import Rotation
 from stereo_scenes import plane_scene
 
 from gvtools.cameras import Cameras, invert_rigid
-from gvtools.depth.stereo.alignment import adjusted, pose_equations
 from gvtools.depth.stereo.consistency import agreement
 from gvtools.depth.stereo.depth_range import estimate_range, range_of_depths, seen_points
 from gvtools.depth.stereo.pyramid import build_pyramid, level_of
 from gvtools.depth.stereo.residual_flow import residual_flow
 from gvtools.depth.stereo.sources import choose_sources, parallax
 from gvtools.errors import DegenerateError
+from gvtools.poses.dense_adjustment import adjusted, pose_equations
 from gvtools.scenes.scene import Scene, SparsePoints
 from gvtools.trajectories import look_at
 
@@ -165,7 +165,10 @@ def test_disturbed_poses_are_found_again():
         )
         inverse = torch.from_numpy(1 / made.depths[i]).float()
         flow = residual_flow(level, inverse, noise=0.006)
-        found = pose_equations(disturbed[others], disturbed[i], inverse, flow=flow)
+        found = pose_equations(
+            disturbed[others], disturbed[i], inverse.numpy(),
+            motion=torch.stack([flow.dx, flow.dy], -1).numpy(), weight=flow.weight.numpy(),
+        )  # fmt: skip
         assert found is not None
         equations.append((i, others, found))
     cameras = adjusted(disturbed, equations, rotation=0.01, translation=0.01)

@@ -16,7 +16,6 @@ from tiny_scan import write_colmap_scan, write_scan
 from gvtools.appearance.appearance import Appearance, applied
 from gvtools.appearance.blending import Blend
 from gvtools.appearance.fit import Fit
-from gvtools.appearance.fit_views import FitView
 from gvtools.appearance.gaussians import Gaussians
 from gvtools.appearance.picture import Picture
 from gvtools.appearance.splat.project_kernels import VALUES
@@ -27,6 +26,7 @@ from gvtools.errors import DegenerateError, MemoryFileError, ProjectError
 from gvtools.memory.projection import project
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.store.local_frame import LocalFrame
+from gvtools.poses.views import FitView
 from gvtools.runs.poses import RunPoses
 from gvtools.scenes.project import open_project
 from gvtools.settings import with_texts

@@ -10,8 +10,8 @@ import pytest
 from run_files import Killed, kill_after_round_0, results
 from tiny_scan import world_from_cam, write_scan
 
-from gvtools.appearance.camera_corrections import moved
 from gvtools.errors import MemoryFileError, ProjectError
+from gvtools.poses.motions import moved
 from gvtools.procedural.noisy_room import jitter_poses
 from gvtools.runs.poses import RunPoses
 from gvtools.runs.run import load_run

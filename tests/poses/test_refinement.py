@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from splat_scene import photographs, pose_errors, walk
 
-from gvtools.appearance.camera_corrections import moved
-from gvtools.appearance.fit_views import FitView
-from gvtools.appearance.pose_graph import agreeing_poses, neighbors
-from gvtools.appearance.refined_poses import refined_poses
+from gvtools.poses.motions import moved, nearest_pairs
+from gvtools.poses.refinement import agreeing_poses, refined_poses
+from gvtools.poses.views import FitView
 from gvtools.similarity import align_poses
 
 COUNT, SIZE = 8, 3
@@ -144,10 +143,10 @@ def _shift(x: float) -> np.ndarray:
 
 def test_every_camera_is_compared_with_the_nearest():
     poses = walk(6)
-    pairs = neighbors(poses, count=1)
+    pairs = nearest_pairs(poses, count=1, shift=2.0)
     assert all(second - first <= 2 for first, second in pairs)
     assert {row for pair in pairs for row in pair} == set(range(6))
-    assert neighbors(poses[:1]) == []
+    assert nearest_pairs(poses[:1], count=3, shift=2.0) == []
 
 
 def test_right_poses_are_kept_and_wrong_ones_are_not(views, truth):

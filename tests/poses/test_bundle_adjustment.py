@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 import pytest
 
-from gvtools.appearance.camera_corrections import moved
-from gvtools.capture import pose_adjustment
-from gvtools.capture.pose_adjustment import Tracks, adjusted_poses
+from gvtools.poses import bundle_adjustment
+from gvtools.poses.bundle_adjustment import Tracks, adjusted_poses
+from gvtools.poses.motions import moved
 from gvtools.procedural.room_sample import write_room
 from gvtools.scenes.project import open_project
 
@@ -81,7 +81,7 @@ def test_pictures_may_have_several_sizes(room):
     halves = np.where(np.arange(VIEWS) % 2 == 0, 2, 1)
     size = {"width": cameras.width // halves, "height": cameras.height // halves}
     found = adjusted_poses(mixed, replace(given, K=K, **size))
-    assert (np.bincount(found.tracks.view, minlength=VIEWS) >= pose_adjustment.LEAST_SEEN).all()
+    assert (np.bincount(found.tracks.view, minlength=VIEWS) >= bundle_adjustment.LEAST_SEEN).all()
     before = relative_turns(given.cam_from_world, cameras.cam_from_world)
     assert relative_turns(found.poses, cameras.cam_from_world) < 0.25 * before
 
@@ -94,7 +94,7 @@ def test_exact_poses_stay(room):
 
 def test_known_tracks_need_no_picture(room, monkeypatch):
     frames, cameras = room
-    monkeypatch.setattr(pose_adjustment, "_triangulated", None)
+    monkeypatch.setattr(bundle_adjustment, "_triangulated", None)
     tracks, given = tracks_through(cameras), off(cameras)
     assert tracks.exact(cameras)
     assert not tracks.exact(given)

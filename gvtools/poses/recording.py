@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import invert_rigid
-from gvtools.capture.odometry import Pair, chained, compare, start_from_features, within
-from gvtools.capture.pose_graph import connected, first_poses, optimised, residual
-from gvtools.capture.rgbd_frames import RgbdFrames
+from gvtools.poses.motions import chained, within
+from gvtools.poses.odometry import RgbdFrames, compare, start_from_features
+from gvtools.poses.pose_graph import Pair, connected, first_poses, optimised, residual
 
 Float64 = NDArray[np.float64]
 
@@ -34,36 +34,27 @@ Say = Callable[[str], object]
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
-    """Poses of the largest connected part of a recording.
+class RecordingPoses:
+    """Poses of the largest connected part of a recording."""
 
-    Attributes:
-        poses: (4, 4) ``world_from_cam`` by frame, metres; the first frame's is the identity.
-        parts: frames of each connected part, the largest first.
-        pairs: all that agreed.
-        loops: loop closures, pairs of the largest part that are not neighbours along the path.
-        drift: (L, 2) their errors [mm, degrees] if neighbouring pairs are simply chained; loops
-            across a break of the chain have no row.
-        residuals: (loops, 2) their errors after optimisation [mm, degrees].
-        keyframes: numbers of the keyframes.
-    """
-
+    # (4, 4) ``world_from_cam`` by frame, metres; the first frame's is the identity.
     poses: dict[int, Float64]
+    # Frames of each connected part, the largest first.
     parts: list[list[int]]
+    # All that agreed, and loop closures: those of the largest part that are no neighbours along
+    # the path.
     pairs: list[Pair]
     loops: list[Pair]
+    # (L, 2) errors of loops [mm, degrees] if neighbouring pairs are simply chained; loops across a
+    # break of the chain have no row.
     drift: Float64
+    # (loops, 2) their errors after optimisation [mm, degrees].
     residuals: Float64
     keyframes: list[int]
 
 
-def find_poses(frames: RgbdFrames, *, say: Say = lambda text: None) -> Found:
-    """Find the poses of a recording's frames.
-
-    Args:
-        frames: in order of time.
-        say: is called with a line of text at each step.
-    """
+def find_poses(frames: RgbdFrames, *, say: Say = lambda text: None) -> RecordingPoses:
+    """Find the poses of frames in order of time; ``say`` gets a line of text at each step."""
     pairs = _along(frames, say)
     chain = {pair.source: pair for pair in pairs.values() if pair.source - pair.target == 1}
     keyframes = _keyframes(len(frames), chain)
@@ -84,7 +75,7 @@ def find_poses(frames: RgbdFrames, *, say: Say = lambda text: None) -> Found:
         for pair in pairs.values()
         if id(pair) not in ends and {pair.source, pair.target} <= inside
     ]
-    return Found(
+    return RecordingPoses(
         poses,
         connected(len(frames), list(pairs.values())),
         list(pairs.values()),
@@ -104,7 +95,7 @@ def _solve(count: int, pairs: list[Pair]) -> tuple[list[int], dict[int, Float64]
         key=lambda pair: (abs(pair.source - pair.target), pair.source),
     )
     poses = first_poses(part, own)
-    return part, optimised(part, own, start=poses) if own else poses
+    return part, optimised({frame: poses[frame] for frame in part}, own) if own else poses
 
 
 def _along(frames: RgbdFrames, say: Say) -> dict[tuple[int, int], Pair]:

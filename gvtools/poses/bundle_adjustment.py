@@ -12,21 +12,28 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.appearance.camera_corrections import mean_near, motions_between, moved
-from gvtools.appearance.refined_poses import RefinedPoses
 from gvtools.cameras import Cameras
-from gvtools.capture.mapping import fix_cameras
-from gvtools.capture.matching import SEED, extract, listed, verification
 from gvtools.features import quiet_colmap
 from gvtools.memory.store.local_frame import LocalFrame
+from gvtools.poses.colmap import (
+    SEED,
+    adjust,
+    extract_sift,
+    fix_cameras,
+    list_pairs,
+    posed_model,
+    set_intrinsics,
+    verification,
+    write_pictures,
+)
+from gvtools.poses.motions import centers_of, mean_near, motions_between, moved, nearest_pairs
+from gvtools.poses.refinement import RefinedPoses
 from gvtools.scenes.colmap_writer import reconstruction
 from gvtools.scenes.scene import Frame, Scene
 from gvtools.similarity import align_poses
-from gvtools.view_selection import nearest_views
 
 if TYPE_CHECKING:
     import pycolmap
@@ -52,16 +59,10 @@ MAX_ERROR_RATIO = 0.7
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
-    """Points and where at least two pictures show each.
-
-    Attributes:
-        positions: (N, 3) in the world of the cameras.
-        point: (M,) the point of each detection.
-        view: (M,) its camera.
-        xy: (M, 2) where it is [px].
-    """
+    """Points (N, 3) in the world of the cameras, and where at least two pictures show each."""
 
     positions: Float64
+    # Of each of M detections its point, its camera and where it is [px].
     point: NDArray[np.int64]
     view: NDArray[np.int64]
     xy: Float64
@@ -87,12 +88,9 @@ class Tracks:
 
 @dataclass(frozen=True, eq=False)
 class AdjustedPoses:
-    """Poses on which features agree.
+    """Poses (V, 4, 4) camera from world on which features agree, together where the given ones are.
 
-    Attributes:
-        poses: (V, 4, 4) camera from world, together where the given ones are.
-        tracks: of the features, in that world.
-        errors: median reprojection error with the given poses and with these [px].
+    ``errors`` are the median reprojection errors with the given poses and with these [px].
     """
 
     poses: Float64
@@ -209,7 +207,7 @@ def _placed(
     """Poses and tracks in the given world; views that too few points tell move like others."""
     given = cameras.cam_from_world
     size = [
-        float(np.sqrt(_centers(each[well_observed]).var(axis=0).sum())) for each in (given, poses)
+        float(np.sqrt(centers_of(each[well_observed]).var(axis=0).sum())) for each in (given, poses)
     ]
     scale = size[0] / size[1] if min(size) > 0 else 1.0
     poses, positions = poses.copy(), tracks.positions * scale
@@ -226,50 +224,30 @@ def _placed(
     return AdjustedPoses(poses, tracks, errors)
 
 
-def _centers(poses: Float64) -> Float64:
-    return -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])
-
-
 def _triangulated(
     frames: Sequence[Frame], cameras: Cameras, work: Path
 ) -> pycolmap.Reconstruction | None:
     """Points of the pictures' features, and poses adjusted to them; None where hardly any match."""
     import pycolmap
 
-    images, masks, database = work / "images", work / "masks", work / "database.db"
-    images.mkdir()
-    masks.mkdir()
-    names = [f"{row:06d}.png" for row in range(len(frames))]
-    for name, frame in zip(names, frames, strict=True):
-        fast = [cv2.IMWRITE_PNG_COMPRESSION, 1]
-        cv2.imwrite(str(images / name), frame.rgb[..., ::-1], fast)
-        mask = np.ones(frame.rgb.shape[:2], bool) if frame.mask is None else frame.mask
-        cv2.imwrite(str(masks / f"{name}.png"), mask.astype(np.uint8) * 255, fast)
+    names = write_pictures(((frame.rgb, frame.mask) for frame in frames), work)
+    images, database = work / "images", work / "database.db"
     pycolmap.Database.open(database).close()
     # Images get the ids 1 to V in this order; extraction alone would number them as threads end.
     reader = pycolmap.ImageReaderOptions(camera_model="PINHOLE")
     mode = pycolmap.CameraMode.PER_IMAGE
     pycolmap.import_images(database, images, mode, image_names=names, options=reader)
-    extract(
-        database, images, names, masks=masks, reader=reader, side=SIDE, features=FEATURES,
+    extract_sift(
+        database, images, names, masks=work / "masks", reader=reader, side=SIDE, features=FEATURES,
         first_octave=0, one_camera=False,
     )  # fmt: skip
-    model = pycolmap.Reconstruction()
-    with pycolmap.Database.open(database) as opened:
-        for row, name in enumerate(names):
-            K, camera = cameras.K[row], opened.read_camera(row + 1)
-            camera.params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
-            camera.has_prior_focal_length = True
-            opened.update_camera(camera)
-            model.add_camera_with_trivial_rig(camera)
-            keypoints = opened.read_keypoints(row + 1)[:, :2].astype(np.float64)
-            view = pycolmap.Image(
-                name=name, keypoints=keypoints, camera_id=row + 1, image_id=row + 1
-            )
-            pose = pycolmap.Rigid3d(cameras.cam_from_world[row, :3])
-            model.add_image_with_trivial_frame(view, pose)
+    set_intrinsics(database, cameras.K)
+    model = posed_model(database, cameras.cam_from_world)
+    centers = cameras.centers
+    unit = max(float(np.median(np.linalg.norm(centers - np.median(centers, axis=0), axis=1))), 1e-9)
+    near = nearest_pairs(cameras.cam_from_world, count=NEIGHBOURS, shift=unit)
     pairing = pycolmap.ImportedPairingOptions()
-    pairing.match_list_path = listed([(names[a], names[b]) for a, b in _pairs(cameras)], work)
+    pairing.match_list_path = list_pairs([(names[a], names[b]) for a, b in near], work)
     pycolmap.match_image_pairs(
         database, pairing_options=pairing, verification_options=verification()
     )
@@ -287,18 +265,6 @@ def _triangulated(
     return model
 
 
-def _pairs(cameras: Cameras) -> list[tuple[int, int]]:
-    """Pairs of views that stand and look alike."""
-    centers = cameras.centers
-    unit = max(float(np.median(np.linalg.norm(centers - np.median(centers, axis=0), axis=1))), 1e-9)
-    pairs = set()
-    for row in range(len(cameras)):
-        others = [other for other in range(len(cameras)) if other != row]
-        for k in nearest_views(cameras[others], cameras[row], NEIGHBOURS, unit=unit):
-            pairs.add((min(row, others[k]), max(row, others[k])))
-    return sorted(pairs)
-
-
 def _model(cameras: Cameras, tracks: Tracks) -> pycolmap.Reconstruction:
     """Views at their given poses with the points that they show; image ids are rows + 1."""
     black = np.zeros(tracks.positions.shape, np.uint8)
@@ -313,7 +279,6 @@ def _solve(model: pycolmap.Reconstruction, error: float | None) -> None:
     import pycolmap
 
     options = pycolmap.BundleAdjustmentOptions()
-    options.print_summary = False
     fix_cameras(options)
     options.refine_principal_point = False
     options.refine_rig_from_world = error is not None
@@ -321,12 +286,7 @@ def _solve(model: pycolmap.Reconstruction, error: float | None) -> None:
     # In any order of threads sums differ in their last digits.
     options.ceres.solver_options.num_threads = 1
     options.ceres.solver_options.max_num_iterations = 30
-    config = pycolmap.BundleAdjustmentConfig()
-    for number in model.reg_image_ids():
-        config.add_image(number)
-    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    pycolmap.ObservationManager(model).filter_observations_with_negative_depth()
-    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+    adjust(model, options)
     if error is not None:
         pycolmap.ObservationManager(model).filter_all_points3D(error, 0.0)
 

@@ -1,11 +1,10 @@
-"""Poses adjusted to the pictures, for recordings whose poses are off by a few pixels.
+"""Bundle adjustment on dense motion, for recordings whose poses are off by a few pixels.
 
 Poses from a tracker or from a sensor's fusion leave epipolar errors of several pixels, under which
 no window finds its match. With first depth maps, the motion that is left between each reference and
 its warped sources tells what is wrong: a part that no depth explains, or on which the sources
-disagree, belongs to the poses. It is a bundle adjustment on dense motion: unknown are six numbers
-for each view and one inverse depth for each pixel; the latter are eliminated view by view, so time
-and memory grow linearly with the views.
+disagree, belongs to the poses. Unknown are six numbers for each view and one inverse depth for each
+pixel; the latter are eliminated view by view, so time and memory grow linearly with the views.
 """
 
 from __future__ import annotations
@@ -14,12 +13,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
-from kornia.geometry.liegroup import Se3, So3
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
-from gvtools.depth.stereo.residual_flow import ResidualFlow
 
 Float64 = NDArray[np.float64]
 
@@ -38,20 +34,21 @@ class PoseEquations:
 
     With the motions m (S, 6) (rotation vector and translation, in each source's frame) stacked,
     the least-squares misfit is mᵀ ``system`` m − 2 ``right`` · m, inverse depths eliminated.
-
-    Attributes:
-        system: (6 S, 6 S) float64.
-        right: (6 S,) float64.
-        off: (S,) float64, median motion that no depth explains, pixels; NaN without measurement.
     """
 
     system: Float64
     right: Float64
+    # (S,) median motion that no depth explains, pixels; NaN without measurement.
     off: Float64
 
 
 def pose_equations(
-    sources: Cameras, reference: Cameras, inverse_depth: torch.Tensor, *, flow: ResidualFlow
+    sources: Cameras,
+    reference: Cameras,
+    inverse_depth: NDArray[np.float32],
+    *,
+    motion: NDArray[np.float32],
+    weight: NDArray[np.float32],
 ) -> PoseEquations | None:
     """The equations of one reference view; None where too little motion could be measured.
 
@@ -59,28 +56,27 @@ def pose_equations(
         sources: S cameras of the level on which the motion was measured.
         reference: a batch of one, of that level.
         inverse_depth: (H, W), 1 / scene units.
-        flow: the residual motion.
+        motion: (S, H, W, 2), by which each warped source's picture is off, its pixels.
+        weight: (S, H, W), 0 where the motion is not determined.
     """
     count = len(sources)
-    weight = flow.weight.reshape(count, -1).double().cpu().numpy()
-    rows = np.flatnonzero((weight > 0).sum(0) >= 1)[::2]
+    weights = weight.reshape(count, -1).astype(np.float64)
+    rows = np.flatnonzero((weights > 0).sum(0) >= 1)[::2]
     if len(rows) < LEAST_PIXELS:
         return None
-    weight = weight[:, rows]
-    motion = np.stack(
-        [part.reshape(count, -1).cpu().numpy()[:, rows] for part in (flow.dx, flow.dy)], -1
-    ).astype(np.float64)  # (S, N, 2)
-    w = inverse_depth.reshape(-1).double().cpu().numpy()[rows]
+    weights = weights[:, rows]
+    measured = motion.reshape(count, -1, 2)[:, rows].astype(np.float64)
+    w = inverse_depth.reshape(-1)[rows].astype(np.float64)
     width = int(reference.width[0])
     xy = np.stack([rows % width, rows // width], axis=-1).astype(np.float64) + 0.5
     jacobian, along = _derivatives(sources, reference, xy, w=w)
-    across = motion[..., 0] * along[..., 1] - motion[..., 1] * along[..., 0]
+    across = measured[..., 0] * along[..., 1] - measured[..., 1] * along[..., 0]
     across /= np.linalg.norm(along, axis=-1) + 1e-12
     off = np.full(count, np.nan)
     for s in range(count):
-        if (weight[s] > 0).any():
-            off[s] = np.median(np.abs(across[s, weight[s] > 0]))
-    system, right = _eliminated(jacobian, along, motion, weight=weight)
+        if (weights[s] > 0).any():
+            off[s] = np.median(np.abs(across[s, weights[s] > 0]))
+    system, right = _eliminated(jacobian, along, measured, weight=weights)
     return PoseEquations(system, right, off)
 
 
@@ -195,6 +191,9 @@ def _eliminated(
 
 def _rigid(pose: Float64) -> Float64:
     """(S, 4, 4) rigid motions of rotation vectors and translations (S, 6)."""
+    import torch
+    from kornia.geometry.liegroup import Se3, So3
+
     turn, shift = torch.from_numpy(pose).split(3, dim=-1)
     motion: Float64 = Se3(So3.exp(turn), shift).matrix().detach().numpy()
     return motion

@@ -1,24 +1,41 @@
-"""The poses on which all measured pairs of frames agree best: Open3D's pose graph."""
+"""The poses on which all measured pairs of views agree best: Open3D's pose graph."""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import invert_rigid
-from gvtools.capture.odometry import Pair
+from gvtools.poses.motions import turn_of
 
 Float64 = NDArray[np.float64]
 
-# A loop whose weight in the optimisation falls below this is a wrong one, and taken out.
+# An uncertain pair whose weight in the optimisation falls below this is wrong, and taken out.
 PRUNED = 0.25
 
 
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """A measured relative pose of two views, by their numbers."""
+
+    source: int
+    target: int
+    target_from_source: Float64  # (4, 4) rigid
+    information: Float64  # (6, 6) of Open3D's pose graph
+    # May be wrong, and then loses its weight.
+    uncertain: bool
+    # Share of the source's pixels with depth that fall on depth of the target, and of these the
+    # share that agrees in depth.
+    overlap: float = 1.0
+    agreement: float = 1.0
+
+
 def connected(count: int, pairs: Sequence[Pair]) -> list[list[int]]:
-    """Parts of frames that pairs connect, the largest first, each in order."""
+    """Parts of the views that pairs connect, the largest first, each in order."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -30,12 +47,10 @@ def connected(count: int, pairs: Sequence[Pair]) -> list[list[int]]:
     return sorted(parts, key=lambda part: (-len(part), part[0]))
 
 
-def first_poses(frames: Sequence[int], pairs: Sequence[Pair]) -> dict[int, Float64]:
-    """``world_from_cam`` of connected frames along as few pairs as possible from the first one.
+def first_poses(views: Sequence[int], pairs: Sequence[Pair]) -> dict[int, Float64]:
+    """``world_from_cam`` of connected views along as few pairs as possible from the first one.
 
-    Args:
-        frames: that the pairs connect.
-        pairs: neighbours in time before loops.
+    Pairs of neighbours in time come before loops.
     """
     near: dict[int, list[tuple[int, Float64]]] = {}
     for pair in pairs:
@@ -44,8 +59,8 @@ def first_poses(frames: Sequence[int], pairs: Sequence[Pair]) -> dict[int, Float
         near.setdefault(pair.source, []).append(
             (pair.target, invert_rigid(pair.target_from_source))
         )
-    poses = {frames[0]: np.eye(4)}
-    waiting = deque([frames[0]])
+    poses = {views[0]: np.eye(4)}
+    waiting = deque([views[0]])
     while waiting:
         at = waiting.popleft()
         for other, step in near.get(at, ()):
@@ -55,31 +70,20 @@ def first_poses(frames: Sequence[int], pairs: Sequence[Pair]) -> dict[int, Float
     return poses
 
 
-def optimised(
-    frames: Sequence[int], pairs: Sequence[Pair], *, start: dict[int, Float64]
-) -> dict[int, Float64]:
-    """Poses that agree with all pairs best; wrong loops lose their weight.
-
-    Args:
-        frames: that the pairs connect, in order; the first one stays where it is.
-        pairs: of these frames.
-        start: ``world_from_cam`` of each.
-
-    Returns:
-        (4, 4) ``world_from_cam`` of each frame, metres.
-    """
+def optimised(start: dict[int, Float64], pairs: Sequence[Pair]) -> dict[int, Float64]:
+    """``world_from_cam`` by view that agree with all pairs best; the first view stays in place."""
     import open3d as o3d
 
     registration = o3d.pipelines.registration
     graph = registration.PoseGraph()
-    node = {frame: number for number, frame in enumerate(frames)}
-    for frame in frames:
-        graph.nodes.append(registration.PoseGraphNode(start[frame]))
+    node = {view: number for number, view in enumerate(start)}
+    for pose in start.values():
+        graph.nodes.append(registration.PoseGraphNode(pose))
     for pair in pairs:
         graph.edges.append(
             registration.PoseGraphEdge(
                 node[pair.source], node[pair.target], pair.target_from_source, pair.information,
-                abs(pair.source - pair.target) > 1,
+                pair.uncertain,
             )
         )  # fmt: skip
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
@@ -91,12 +95,11 @@ def optimised(
                 max_correspondence_distance=0.03, edge_prune_threshold=PRUNED, reference_node=0
             ),
         )
-    return {frame: np.array(graph.nodes[node[frame]].pose) for frame in frames}
+    return {view: np.array(graph.nodes[node[view]].pose) for view in start}
 
 
 def residual(pair: Pair, poses: dict[int, Float64]) -> tuple[float, float]:
-    """By how much poses depart from a measured pair: millimetres and degrees."""
+    """By how much poses in metres depart from a measured pair: millimetres and degrees."""
     predicted = invert_rigid(poses[pair.target]) @ poses[pair.source]
     off = invert_rigid(pair.target_from_source) @ predicted
-    cosine = np.clip((np.trace(off[:3, :3]) - 1) / 2, -1, 1)
-    return float(np.linalg.norm(off[:3, 3]) * 1e3), float(np.degrees(np.arccos(cosine)))
+    return float(np.linalg.norm(off[:3, 3]) * 1e3), float(np.degrees(turn_of(off)))

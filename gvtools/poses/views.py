@@ -1,8 +1,7 @@
-"""The photographs that Gaussians are fitted to, at several sizes."""
+"""Posed photographs that poses and Gaussians are fitted to, at several sizes."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,38 +14,26 @@ SMALLEST = 16
 
 @dataclass(frozen=True, eq=False)
 class FitView:
-    """One photograph.
-
-    Attributes:
-        rgb: (H, W, 3) uint8.
-        K: (3, 3) intrinsics [px].
-        cam_from_local: (4, 4) pose in the Gaussians' frame.
-        mask: (H, W) bool, True = use; None uses all.
-        depth: (H, W) float32 recorded z-depth, scene units, 0 = none; None has none.
-        estimate: (H, W) float32 likewise, estimated by a network and wrong by some percent.
-    """
+    """One photograph (H, W, 3), its intrinsics [px] and its pose in a local frame."""
 
     rgb: NDArray[np.uint8]
     K: NDArray[np.float64]
     cam_from_local: NDArray[np.float64]
+    # (H, W), True = use; None uses all.
     mask: NDArray[np.bool_] | None = None
+    # (H, W) recorded z-depth, scene units, 0 = none.
     depth: NDArray[np.float32] | None = None
+    # Likewise, estimated by a network and wrong by some percent.
     estimate: NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class ReducedView:
-    """A photograph at one size, as the loss needs it.
+    """A photograph at one size, and the intrinsics of this size."""
 
-    Attributes:
-        target: (3, H, W) float32 colours from 0 to 1.
-        weight: (H, W) float32, the share of each pixel that is used.
-        depth: (H, W) float32, 0 = none; None has none.
-        estimate: likewise.
-        K: (3, 3) intrinsics of this size.
-    """
-
+    # (3, H, W) colours from 0 to 1.
     target: NDArray[np.float32]
+    # (H, W) the share of each pixel that is used.
     weight: NDArray[np.float32]
     depth: NDArray[np.float32] | None
     estimate: NDArray[np.float32] | None
@@ -100,22 +87,3 @@ def _picked(depth: NDArray[np.float32], rows: int, columns: int) -> NDArray[np.f
     y = ((np.arange(rows) + 0.5) * height / rows).astype(int)
     x = ((np.arange(columns) + 0.5) * width / columns).astype(int)
     return np.ascontiguousarray(depth[y][:, x])
-
-
-def pixel_width(positions: NDArray[np.float32], views: Sequence[FitView]) -> NDArray[np.float32]:
-    """(N,) width of a pixel at each position in the nearest view that sees it, scene units.
-
-    What no view sees gets the median of the others.
-    """
-    width = np.full(len(positions), np.inf)
-    for view in views:
-        points = positions @ view.cam_from_local[:3, :3].T + view.cam_from_local[:3, 3]
-        z, size = points[:, 2], np.array(view.rgb.shape[1::-1])
-        ahead = z > 0
-        focal = np.array([view.K[0, 0], view.K[1, 1]])
-        xy = points[:, :2] / np.where(ahead, z, 1)[:, None] * focal + view.K[:2, 2]
-        inside = ahead & (xy > -0.3 * size).all(axis=1) & (xy < 1.3 * size).all(axis=1)
-        width[inside] = np.minimum(width[inside], z[inside] / focal[0])
-    seen = np.isfinite(width)
-    width[~seen] = np.median(width[seen]) if seen.any() else 1.0
-    return width.astype(np.float32)

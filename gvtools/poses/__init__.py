@@ -1,0 +1,1 @@
+"""Poses of views: odometry, pose graph, bundle adjustment and refinement."""

@@ -1,0 +1,254 @@
+"""Refined poses of views with depth: from odometry, checked by what views predict of each other.
+
+Poses that come from a tracker err by centimetres and tenths of degrees. Pairs of views that overlap
+tell their relative pose far better, by colour and depth together. A pose graph finds the poses that
+agree with all pairs best; as a whole they are put where the given ones are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import open3d as o3d
+import torch
+from kornia.filters import gaussian_blur2d
+from numpy.typing import NDArray
+
+from gvtools.poses.motions import mean_near, motions_between, moved, nearest, nearest_pairs
+from gvtools.poses.odometry import BEYOND, TYPICAL_DEPTH, register
+from gvtools.poses.pose_graph import Pair, optimised
+from gvtools.poses.views import FitView, ReducedView, reduced
+from gvtools.similarity import align_poses
+
+Float64 = NDArray[np.float64]
+
+# Odometry compares pictures at this length of the longer side [px], each with so many neighbours.
+SIDE, NEIGHBORS = 320, 3
+# Neighbours along the path keep their given relative pose by this share of a pair's weight, so that
+# views that overlap with none stay where they were.
+GIVEN_WEIGHT = 0.01
+# Refined poses are kept if the error of predicting neighbouring photographs falls by this share.
+LEAST_BETTER = 0.01
+# Photographs are predicted at one over this of their size, each from so many neighbours, by one of
+# so many pixels.
+SMALLER, NEIGHBOURS, PIXELS = 2, 2, 4
+# With fewer of these inside, a pair does not count.
+FEWEST = 25
+
+
+@dataclass(frozen=True, eq=False)
+class RefinedPoses:
+    """Poses (V, 4, 4) camera from world on which views agree, beside those that they were given."""
+
+    given: Float64
+    poses: Float64
+    # Typical, scene units.
+    depth: float
+    # Whether other cameras err like the views near them.
+    spread: bool
+    # By given and by refined poses: mean difference of colours between neighbouring views where
+    # they show the same, 0 to 1, or what features miss, pixels.
+    errors: tuple[float, float]
+    # Whether features told the poses, to a fraction of a pixel: a fit leaves them.
+    by_features: bool = False
+    # The unit of ``errors``.
+    in_pixels: bool = False
+
+    @property
+    def motions(self) -> NDArray[np.float64]:
+        """(V, 6) shift and turn from the given pose to the refined one, on the camera's side."""
+        return motions_between(self.given, self.poses)
+
+    def corrected(self, pose: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(4, 4) another camera's pose, moved as the views near it were if ``spread``."""
+        if not self.spread:
+            return pose
+        return moved(pose, mean_near(pose, self.given, self.motions, depth=self.depth))
+
+    def __str__(self) -> str:
+        shift = np.median(np.linalg.norm(self.motions[:, :3], axis=1))
+        turn = np.degrees(np.median(np.linalg.norm(self.motions[:, 3:], axis=1)))
+        before, after = self.errors
+        told = f"neighbouring views differ by {after:.4f} instead of {before:.4f}"
+        if self.in_pixels:
+            told = f"features miss them by {after:.2f} instead of {before:.2f} px"
+        return f"moved by {shift:.3g} scene units and {turn:.2f} degrees (medians); {told}" + (
+            "; targets moved like the context near them" if self.spread else ""
+        )
+
+
+def refined_poses(
+    views: Sequence[FitView], poses: NDArray[np.float64] | None = None
+) -> RefinedPoses | None:
+    """Poses on which neighbouring views agree; None where the given ones are as good.
+
+    Args:
+        views: all with depth, neighbours along the path beside each other.
+        poses: (V, 4, 4) told by features; None finds some by odometry.
+    """
+    if len(views) < 2:
+        return None
+    given = np.stack([view.cam_from_local for view in views])
+    by_features = poses is not None
+    if poses is None:
+        poses = agreeing_poses(views)
+    small = compared(views)
+    before, after = prediction_error(small, given), prediction_error(small, poses)
+    if not after < before * (1 - LEAST_BETTER):
+        return None
+    depth = np.concatenate([view.depth[::8, ::8].ravel() for view in views])  # type: ignore[index]
+    typical = float(np.median(depth[depth > 0]))
+    refined = RefinedPoses(given, poses, typical, False, (before, after), by_features)
+    # Each view is once treated as another camera: does it look more like its refined neighbours
+    # where it was given, or moved as they were?
+    motions = refined.motions
+    alike = [
+        moved(pose, mean_near(pose, given, motions, depth=typical, but=[row]))
+        for row, pose in enumerate(given)
+    ]
+    near = prediction_error(small, poses, at=np.stack(alike))
+    away = prediction_error(small, poses, at=given)
+    spread = near < away * (1 - LEAST_BETTER)
+    return replace(refined, spread=spread)
+
+
+def agreeing_poses(views: Iterable[FitView]) -> NDArray[np.float64]:
+    """(V, 4, 4) refined ``cam_from_local``, on average where they were given.
+
+    Args:
+        views: all with depth, neighbours along the path beside each other.
+    """
+    views = list(views)
+    height, width = views[0].rgb.shape[:2]
+    scale = min(1.0, SIDE / max(height, width))
+    size = (round(width * scale), round(height * scale))
+    smaller = [np.diag([*(np.array(size) / view.rgb.shape[1::-1]), 1]) for view in views]
+    K = np.median([a @ view.K for a, view in zip(smaller, views, strict=True)], axis=0)
+    K[0, 1] = 0  # Open3D knows no skew; views that have some are warped
+    depths = [_depth(view)[::8, ::8] for view in views]
+    known = np.concatenate([depth[depth > 0] for depth in depths])
+    if not len(known):
+        return np.stack([view.cam_from_local for view in views])
+    unit = np.diag([1.0, 1.0, 1.0, TYPICAL_DEPTH / np.median(known)])
+    given = [np.linalg.inv(unit) @ view.cam_from_local @ unit for view in views]
+    images = [_image(view, K, size, scale=TYPICAL_DEPTH / np.median(known)) for view in views]
+    refined = _optimised(np.stack(given), images, K, size=size)
+    moved = refined @ align_poses(refined, np.stack(given))
+    return np.asarray(unit @ moved @ np.linalg.inv(unit))
+
+
+def _optimised(
+    given: Float64, images: list[o3d.geometry.RGBDImage], K: Float64, *, size: tuple[int, int]
+) -> Float64:
+    """(V, 4, 4) poses that agree with the pairs of images; pairs that contradict are left out."""
+    pairs = []
+    for i, j in nearest_pairs(given, count=NEIGHBORS, shift=TYPICAL_DEPTH, by_angle=True):
+        start = given[j] @ np.linalg.inv(given[i])
+        measured = register(images[i], images[j], K, size=size, start=start)
+        if measured is not None:
+            pairs.append(Pair(i, j, *measured, uncertain=True))
+    if not pairs:
+        return given
+    weight = GIVEN_WEIGHT * float(np.median([pair.information[5, 5] for pair in pairs]))
+    for row in range(len(given) - 1):
+        motion = given[row + 1] @ np.linalg.inv(given[row])
+        pairs.append(Pair(row, row + 1, motion, weight * np.eye(6), uncertain=False))
+    poses = optimised({row: np.linalg.inv(pose) for row, pose in enumerate(given)}, pairs)
+    return np.stack([np.linalg.inv(pose) for pose in poses.values()])
+
+
+def _depth(view: FitView) -> NDArray[np.float32]:
+    assert view.depth is not None
+    return view.depth if view.mask is None else view.depth * view.mask
+
+
+def _image(
+    view: FitView, K: Float64, size: tuple[int, int], *, scale: float
+) -> o3d.geometry.RGBDImage:
+    """A view as a camera that all views share sees it, with scaled depth."""
+    # Pixels count from the first one's corner in ``K``, from its centre in OpenCV.
+    shift = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
+    smaller = (np.linalg.inv(shift) @ K @ np.linalg.inv(view.K) @ shift)[:2]
+    blur = 0.4 / smaller[0, 0]
+    rgb = cv2.GaussianBlur(view.rgb, (0, 0), blur) if blur > 0.5 else view.rgb
+    rgb = cv2.warpAffine(
+        rgb, smaller, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
+    depth = cv2.warpAffine(
+        (_depth(view) * scale).astype(np.float32), smaller, size, flags=cv2.INTER_NEAREST
+    )
+    return o3d.geometry.RGBDImage.create_from_color_and_depth(
+        o3d.geometry.Image(np.ascontiguousarray(rgb)),
+        o3d.geometry.Image(np.ascontiguousarray(depth)),
+        depth_scale=1.0,
+        depth_trunc=BEYOND,
+        convert_rgb_to_intensity=True,
+    )
+
+
+def compared(views: Sequence[FitView]) -> list[ReducedView]:
+    """Views as ``prediction_error`` compares them: smaller, without their noise."""
+    return [_blurred(reduced(view, SMALLER)) for view in views]
+
+
+def prediction_error(
+    small: Sequence[ReducedView],
+    poses: NDArray[np.float64],
+    *,
+    at: NDArray[np.float64] | None = None,
+) -> float:
+    """Mean over pairs of neighbouring photographs of the median colour difference, 0 to 1.
+
+    Each pixel with depth is looked up in the neighbour; what is hidden there is a minority that the
+    median passes over. NaN where no pair overlaps.
+
+    Args:
+        small: at least two, with depth; see ``compared``.
+        poses: (V, 4, 4) of the cameras, in the frame of the views.
+        at: (V, 4, 4) where each camera is when it is compared with the others; None: at its pose.
+    """
+    at = poses if at is None else at
+    depths = np.concatenate([view.depth.ravel() for view in small if view.depth is not None])
+    known = depths[depths > 0]
+    typical = float(np.median(known)) if len(known) else 1.0
+    errors = []
+    for row, view in enumerate(small):
+        assert view.depth is not None
+        for other in nearest(poses, row, count=NEIGHBOURS, shift=typical):
+            y, x = (each[::PIXELS] for each in np.nonzero((view.depth > 0) & (view.weight > 0.5)))
+            rays = np.stack([x + 0.5, y + 0.5, np.ones(len(x))]).T @ np.linalg.inv(view.K).T
+            points = rays * view.depth[y, x, None]
+            motion = poses[other] @ np.linalg.inv(at[row])
+            points = points @ motion[:3, :3].T + motion[:3, 3]
+            found, inside = _looked_up(small[other].target, points, small[other].K)
+            if inside.sum() > FEWEST:
+                errors.append(float(np.median(np.abs(found - view.target[:, y, x])[:, inside])))
+    return float(np.mean(errors)) if errors else float("nan")
+
+
+def _blurred(view: ReducedView) -> ReducedView:
+    """Without its noise, which looking up between pixels would average away.
+
+    Else poses seemed better that make pictures meet between pixels.
+    """
+    smooth = gaussian_blur2d(torch.from_numpy(view.target)[None], (5, 5), (1.0, 1.0))
+    return replace(view, target=smooth[0].numpy())
+
+
+def _looked_up(
+    picture: NDArray[np.float32], points: NDArray[np.float64], K: NDArray[np.float64]
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Colours (3, N) of a picture at points of its camera's frame, and which lie inside."""
+    height, width = picture.shape[1:]
+    ahead = points[:, 2] > 0
+    xy = points @ K.T
+    xy = xy[:, :2] / np.where(ahead, xy[:, 2], 1)[:, None]
+    inside = ahead & (xy > 0).all(axis=1) & (xy < [width, height]).all(axis=1)
+    grid = torch.from_numpy((xy / [width, height] * 2 - 1).astype(np.float32))[None, None]
+    colors = torch.nn.functional.grid_sample(
+        torch.from_numpy(picture)[None], grid, padding_mode="border", align_corners=False
+    )
+    return colors[0, :, 0].numpy(), inside
