@@ -239,6 +239,28 @@ def test_association_is_the_greedy_one_over_all_pairs():
     assert len(expected) > 20
 
 
+@pytest.mark.parametrize("name", ["rgb.txt", "depth.txt", "groundtruth.txt"])
+def test_tum_lists_of_windows_programs(tmp_path, name):
+    root = tum(tmp_path / "sequence")
+    text = (root / name).read_text().replace("/", "\\").replace("\n", "\r\n")
+    (root / name).write_bytes(b"\xef\xbb\xbf" + text.encode())
+    scene = TUM.read(root)
+    assert len(scene) == 3
+    assert all(view.has_depth for view in scene)
+
+
+@pytest.mark.parametrize(("layout", "write"), [(TUM, tum), (REDWOOD, redwood)])
+def test_a_default_camera_is_a_warning_at_every_door(tmp_path, layout, write):
+    root = write(tmp_path / "recording")
+    (root / "camera.json").unlink(missing_ok=True)
+    levels = [f.level for f in layout.read(root).findings if "driver's default" in f.message]
+    assert levels == ["warning"]
+    np.savetxt(root / "camera-intrinsics.txt", [[90, 0, 47.5], [0, 91, 35.5], [0, 0, 1]])
+    scene = layout.read(root)
+    assert scene.cameras.K[0, 1, 1] == 91
+    assert "intrinsics: camera-intrinsics.txt" in messages(scene)
+
+
 # --- Redwood ----------------------------------------------------------------------------------
 
 
@@ -278,9 +300,8 @@ def test_redwood_trajectory_that_does_not_fit(tmp_path):
 def test_redwood_without_intrinsics_takes_the_sensors(tmp_path):
     root = redwood(tmp_path)
     (root / "camera.json").unlink()
-    scene = REDWOOD.read(root)
-    np.testing.assert_allclose(scene.cameras.K[0], [[525, 0, 320], [0, 525, 240], [0, 0, 1]])
-    assert "driver's default" in messages(scene)
+    K = REDWOOD.read(root).cameras.K[0]
+    np.testing.assert_allclose(K, [[525, 0, 320], [0, 525, 240], [0, 0, 1]])
 
 
 # --- ScanNet ----------------------------------------------------------------------------------

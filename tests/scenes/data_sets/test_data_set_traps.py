@@ -1,21 +1,36 @@
-"""What readers of public data sets get wrong, one by one: pictures of benchmarks and of videos."""
+"""Traps of public data sets, one by one: benchmarks, videos, captures with depth, and rigs."""
 
 from __future__ import annotations
 
+import re
 import shutil
+import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
-from data_sets import mini_captures, mini_mvs, mini_reconstructed
+from data_sets import (
+    mini_aria,
+    mini_captures,
+    mini_hypersim,
+    mini_mvs,
+    mini_reconstructed,
+    mini_waymo,
+)
+from data_sets.aria_stand_in import projectaria_tools
 from data_sets.miniature import compare, layout_named
 from data_sets.miniature import read_miniature as read
 from data_sets.room_frames import room_frames
 from PIL import Image
 
-from gvtools.errors import ProjectError
+from gvtools.errors import OptionError, ProjectError
+from gvtools.scenes.data_sets.aria import FISHEYE, AriaCamera
+from gvtools.scenes.data_sets.hypersim import read_color, turned_pinhole
 from gvtools.scenes.data_sets.mvs import decomposed
+from gvtools.scenes.matching import pose_at
 from gvtools.scenes.scene import Scene
+from gvtools.scenes.transforms_frame import LensParameters
 from gvtools.scenes.video import read_frame
 
 
@@ -209,3 +224,349 @@ def test_eth3d_depth_is_not_that_of_the_same_pixel(tmp_path: Path) -> None:
     )
     assert expected.depth is not None
     assert (np.abs(naive - expected.depth[0]) < 0.1).mean() < 0.6
+
+
+# --- poses that are absent or damaged ---------------------------------------------------------
+
+
+def test_mapfree_poses_that_are_withheld_are_left_out(tmp_path: Path) -> None:
+    expected = mini_captures.write_mapfree(tmp_path)
+    path = tmp_path / expected.scene / "poses.txt"
+    lines = path.read_text().splitlines()
+    lines[3] = f"{lines[3].split()[0]} 0 0 0 0 0 0 0"
+    path.write_text("\n".join(lines))
+    next(tmp_path.glob("train/*/seq0/*.npy")).unlink()
+    scene = read("mapfree", tmp_path, expected.scene)
+    assert len(scene) == 3
+    assert "1 of 4 frames have no pose: dropped (seq1/frame_00000.jpg)" in messages(scene)
+    assert "1 of 3 frames have no depth map (seq0/frame_00000.jpg)" in messages(scene)
+    assert [view.has_depth for view in scene] == [False, True, True]
+
+
+def test_a_pose_without_numbers_leaves_its_frame_out(tmp_path: Path) -> None:
+    expected = mini_captures.write_mapfree(tmp_path)
+    path = tmp_path / expected.scene / "poses.txt"
+    lines = path.read_text().splitlines()
+    lines[3] = f"{lines[3].split()[0]} nan nan nan nan 0 0 0"
+    path.write_text("\n".join(lines))
+    scene = read("mapfree", tmp_path, expected.scene)
+    assert len(scene) == 3
+    assert "1 of 4 frames have no pose: dropped" in messages(scene)
+
+
+@pytest.mark.parametrize("text", ["meters_per_asset_unit", "meters_per_asset_unit,", ""])
+def test_hypersim_tables_that_were_cut_off_are_named(tmp_path: Path, text: str) -> None:
+    expected = mini_hypersim.MINIATURES[0].write(tmp_path)
+    scale = next(tmp_path.glob("*/_detail/metadata_scene.csv"))
+    scale.write_text(text)
+    table = tmp_path / "metadata_camera_parameters.csv"
+    whole = table.read_text()
+    table.unlink()
+    with pytest.raises(ProjectError, match="no meters_per_asset_unit"):
+        read("hypersim", tmp_path, expected.scene)
+    head, row = next(
+        (whole.splitlines()[0], line)
+        for line in whole.splitlines()
+        if line.startswith(expected.scene.partition("/")[0])
+    )
+    table.write_text("\n".join((head, ",".join(row.split(",")[:4]))))
+    scale.write_text("meters_per_asset_unit,0.5")
+    with pytest.raises(ProjectError, match="copy the file again"):
+        read("hypersim", tmp_path, expected.scene)
+
+
+@pytest.mark.parametrize("value", ["-inf", "nan", "2"])
+def test_scannet_frames_that_the_tracker_lost_are_left_out(tmp_path: Path, value: str) -> None:
+    expected = mini_captures.write_exported(tmp_path)
+    pose = tmp_path / expected.scene / "pose" / "1.txt"
+    pose.write_text("\n".join([" ".join([value] * 4)] * 4))
+    scene = read("scannet", tmp_path, expected.scene)
+    assert scene.names == ("0.jpg", "2.jpg", "3.jpg")
+    assert re.search("1 of 4 frames (have an? |have no pose|were lost)", messages(scene))
+
+
+def test_scannet_stream_that_ends_early_gives_its_whole_frames(tmp_path: Path) -> None:
+    expected = mini_captures.write_sens(tmp_path, keep=0.6)
+    scene = read("scannet", tmp_path, expected.scene)
+    assert scene.names == ("0", "1")
+    assert "2 of 4 frames are past the end of scene0000_00.sens: dropped" in messages(scene)
+    np.testing.assert_array_equal(scene.views[1].load().rgb, expected.rgb[1])  # type: ignore[index]
+
+
+def test_scannet_depth_camera_is_registered_into_the_colour_camera(tmp_path: Path) -> None:
+    expected = mini_captures.write_exported(tmp_path)
+    folder = tmp_path / expected.scene
+    K = np.loadtxt(folder / "intrinsic" / "intrinsic_depth.txt")
+    K[0, 2] += 8  # the depth camera sees 8 pixels more on the left
+    np.savetxt(folder / "intrinsic" / "intrinsic_depth.txt", K, fmt="%.17g")
+    depth = read("scannet", tmp_path, expected.scene).views[0].load().depth
+    assert depth is not None
+    moved = np.roll(np.rint(room_frames().depth[0] * 1000) / 1000, -8, axis=1)
+    agree = np.abs(depth - moved)[:, :55] < 0.06
+    assert agree.mean() > 0.95
+    assert not depth[:, 57:].any()
+
+
+# --- ARKitScenes ------------------------------------------------------------------------------
+
+
+def test_arkitscenes_high_resolution_pair_has_its_own_intrinsics(tmp_path: Path) -> None:
+    expected = mini_captures.write_arkitscenes(tmp_path)
+    layout = layout_named("arkitscenes")
+    assert layout.variants(tmp_path) == (f"{expected.scene}/wide",)
+    scene = read("arkitscenes", tmp_path, f"{expected.scene}/wide")
+    large = room_frames(4, 128, 96)
+    np.testing.assert_allclose(scene.cameras.K, large.cameras.K, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        scene.cameras.cam_from_world, expected.cameras.cam_from_world, rtol=0, atol=1e-9
+    )
+    frame = scene.views[2].load()
+    assert frame.depth is not None
+    np.testing.assert_array_equal(frame.rgb, large.rgb[2])
+    np.testing.assert_allclose(frame.depth, large.depth[2], rtol=1e-6, atol=0.0005)
+
+
+def test_arkitscenes_frames_between_poses_are_interpolated_and_others_left_out(
+    tmp_path: Path,
+) -> None:
+    expected = mini_captures.write_arkitscenes(tmp_path)
+    folder = tmp_path / expected.scene
+    for kind, suffix in (("lowres_wide", "png"), ("lowres_wide_intrinsics", "pincam")):
+        for time in (6845.857, 6846.5):
+            first = next(iter(sorted((folder / kind).iterdir())))
+            shutil.copy(
+                first, folder / kind / f"{mini_captures.ARKITSCENES_VIDEO}_{time:.3f}.{suffix}"
+            )
+    scene = read("arkitscenes", tmp_path, expected.scene)
+    assert len(scene) == 5
+    assert "1 of 6 frames have no pose: dropped" in messages(scene)
+    assert "1 frames have an interpolated pose" in messages(scene)
+    between = scene[f"{mini_captures.ARKITSCENES_VIDEO}_6845.857.png"].camera
+    middle = expected.cameras.centers[:2].mean(axis=0)
+    # Stamps in the trajectory are 0.4 ms late: a hundredth of the way to the middle.
+    assert np.linalg.norm(between.centers[0] - middle) < 0.01 * np.linalg.norm(
+        np.diff(expected.cameras.centers[:2], axis=0)
+    )
+
+
+def test_poses_far_apart_are_not_interpolated() -> None:
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[1, 0, 3] = -1.0
+    at = partial(pose_at, poses=poses, same=1e-3, longest_gap=0.2)
+    near = at(0.05, np.array([0.0, 0.1]))
+    assert near is not None
+    np.testing.assert_allclose(near[:3, 3], [-0.5, 0, 0], atol=1e-12)
+    assert at(0.5, np.array([0.0, 1.0])) is None
+    assert at(0.2, np.array([0.0, 0.1])) is None
+    assert at(-0.1, np.array([0.0, 0.1])) is None
+    for time, expected in ((0.0009, 0), (-0.0009, 0), (0.1009, -1)):
+        found = at(time, np.array([0.0, 0.1]))
+        assert found is not None
+        assert found[0, 3] == expected
+
+
+def test_arkitscenes_tells_where_the_sky_is(tmp_path: Path) -> None:
+    expected = mini_captures.write_arkitscenes(tmp_path)
+    assert "sky" not in messages(read("arkitscenes", tmp_path, expected.scene))
+    from scipy.spatial.transform import Rotation
+
+    path = tmp_path / expected.scene / "lowres_wide.traj"
+    rows = np.loadtxt(path)
+    quarter = Rotation.from_euler("z", -90, degrees=True)  # the device held on its side
+    rows[:, 1:4] = (quarter * Rotation.from_rotvec(rows[:, 1:4])).as_rotvec()
+    np.savetxt(path, rows, fmt="%.17g")
+    found = messages(read("arkitscenes", tmp_path, expected.scene))
+    assert "the sky is to the left of pictures" in found
+
+
+# --- Hypersim ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scene", sorted(mini_hypersim.PUBLISHED))
+def test_hypersim_stored_pixels_are_found_along_published_rays(scene: str) -> None:
+    """Pixels of the pinhole show what the published matrix says that their rays hit."""
+    width, height = 1024, 768
+    M = np.array(mini_hypersim.PUBLISHED[scene][0]).reshape(3, 3)
+    camera = turned_pinhole(M, (width, height))
+    y, x = np.mgrid[:height, :width].astype(np.float32) + 0.5
+    stored = camera.straight(np.stack([x, y], axis=-1), nearest=False)
+    fx, fy, cx, cy = camera.lens.values
+    rays = np.stack([(x - cx) / fx, (y - cy) / fy, np.ones_like(x)], axis=-1)
+    opengl = np.diag([1.0, -1, -1]) @ camera.stored_from_turned
+    uv = rays.reshape(-1, 3) @ (np.linalg.inv(M) @ opengl).T
+    uv = uv[:, :2] / uv[:, 2:]
+    expected = np.stack([(uv[:, 0] + 1) * width / 2, (1 - uv[:, 1]) * height / 2], axis=-1)
+    inside = (expected > 1).all(axis=1) & (expected < [width - 1, height - 1]).all(axis=1)
+    assert inside.mean() > 0.98
+    off = np.abs(stored.reshape(-1, 2) - expected)[inside]
+    assert off.max() < 0.05
+    if scene == "ai_041_003":  # without the warp, rows would be off by pixels
+        assert np.abs(np.stack([x, y], -1).reshape(-1, 2) - expected)[inside].max() > 3
+
+
+def test_hypersim_depth_is_of_the_axis_and_not_of_the_ray(tmp_path: Path) -> None:
+    expected = mini_hypersim.write(tmp_path, scene="ai_001_001", linear=False)
+    depth = read("hypersim", tmp_path, expected.scene).views[0].load().depth
+    assert depth is not None
+    distance = room_frames().distance[0]
+    assert (np.abs(distance - depth) > 0.05).mean() > 0.5
+
+
+def test_hypersim_without_the_file_of_parameters_says_so(tmp_path: Path) -> None:
+    expected = mini_hypersim.write(tmp_path, scene="ai_038_009", linear=False)
+    for path in tmp_path.glob("ai_038_009/images/*_final_preview/*.jpg"):
+        Image.open(path).resize((1024, 768)).save(path, format="PNG")
+    (tmp_path / "metadata_camera_parameters.csv").unlink()
+    scene = read("hypersim", tmp_path, expected.scene)
+    assert "60 degrees across are taken" in messages(scene)
+    np.testing.assert_allclose(scene.cameras.K[0, 0, 0], 512 / np.tan(np.radians(30)))
+    (tmp_path / "ai_038_009" / "_detail" / "metadata_scene.csv").unlink()
+    with pytest.raises(ProjectError, match="no meters_per_asset_unit"):
+        read("hypersim", tmp_path, expected.scene)
+
+
+def test_hypersim_tone_curve_is_that_of_the_data_sets_tools(tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    light = rng.gamma(2.0, 3.0, (48, 64, 3)).astype(np.float32)
+    ids = np.ones((48, 64), np.int32)
+    ids[:8] = -1
+    light[:8] *= 50  # windows, which show nothing
+    home = tmp_path / "images"
+    name = "scene_cam_00_final_hdf5/frame.0000.color.hdf5"
+    mini_hypersim.save_hdf5(home / name, light)
+    entities = "scene_cam_00_geometry_hdf5/frame.0000.render_entity_id.hdf5"
+    mini_hypersim.save_hdf5(home / entities, ids)
+    shown = read_color(home / name).rgb.astype(np.float64) / 255
+    brightness = 0.3 * light[..., 0] + 0.59 * light[..., 1] + 0.11 * light[..., 2]
+    current = np.percentile(brightness[8:], 90)
+    scale = 0.8 ** (1 / (1 / 2.2)) / current
+    expected = np.clip((scale * light) ** (1 / 2.2), 0, 1)
+    np.testing.assert_allclose(shown, expected, rtol=0, atol=0.5 / 255 + 1e-6)
+
+
+# --- ScanNet++, Waymo -------------------------------------------------------------------------
+
+
+def test_scannetpp_masks_follow_the_undistortion(tmp_path: Path) -> None:
+    expected = mini_reconstructed.write_fisheye(tmp_path)
+    mask = read("scannetpp", tmp_path, expected.scene).views[0].load().mask
+    assert mask is not None
+    lens = mini_reconstructed.fisheye_scannetpp()
+    # The middle of the masked part of the fisheye picture, in the pinhole's pixels.
+    ray = np.append(np.asarray(lens.cam_from_img(np.array([[34.5, 25.0]])))[0], 1)
+    x, y, _ = expected.cameras.K[0] @ ray
+    assert not mask[int(y), int(x)]
+    assert mask.mean() > 0.9
+
+
+def test_scannetpp_poses_are_those_of_the_scan_and_not_of_nerfstudio(tmp_path: Path) -> None:
+    expected = mini_reconstructed.write_undistorted(tmp_path)
+    shutil.rmtree(tmp_path / expected.scene / "colmap")
+    with pytest.raises(ProjectError, match="no COLMAP model"):
+        read("scannetpp", tmp_path, expected.scene)
+
+
+def test_scannetpp_says_how_to_extract_the_iphones_frames(tmp_path: Path) -> None:
+    expected = mini_reconstructed.write_iphone(tmp_path)
+    shutil.rmtree(tmp_path / expected.scene / "rgb")
+    with pytest.raises(ProjectError, match="extract it from"):
+        read("scannetpp", tmp_path, expected.scene)
+
+
+def test_waymo_recorded_pixels_are_those_of_the_documentation(tmp_path: Path) -> None:
+    mini_waymo.write(tmp_path)
+    scene = read("waymo", tmp_path, f"training/{mini_waymo.SEGMENT}")
+    points = room_frames().points
+    for view in scene:
+        camera = 1 if view.name.startswith("front/") else 2
+        lens = view.load.__self__.lens  # type: ignore[attr-defined]
+        pose = view.camera.cam_from_world[0]
+        local = points @ pose[:3, :3].T + pose[:3, 3]
+        frame = mini_waymo.TIMES.index(int(view.name.partition("/")[2]))
+        front = scene[f"front/{mini_waymo.TIMES[frame]}"].camera.world_from_cam[0]
+        vehicle = (
+            front
+            @ np.linalg.inv(mini_waymo.FORWARD)
+            @ np.linalg.inv(mini_waymo.vehicle_from_cam(1))
+        )
+        ahead = local[:, 2] > 1
+        expected = mini_waymo.brown(points[ahead], camera, vehicle)
+        np.testing.assert_allclose(lens.source.img_from_cam(local[ahead]), expected, atol=1e-6)
+
+
+def test_waymo_takes_the_frames_pose_where_pictures_have_none(tmp_path: Path) -> None:
+    expected = mini_waymo.write(tmp_path, own_poses=False)
+    scene = read("waymo", tmp_path, expected.scene)
+    compare(scene, expected)
+    assert "4 pictures have their frame's pose" in messages(scene)
+    shutil.rmtree(tmp_path / "training" / "vehicle_pose")
+    with pytest.raises(ProjectError, match="4 of 4 frames have no pose"):
+        read("waymo", tmp_path, expected.scene)
+
+
+# --- Aria Digital Twin ------------------------------------------------------------------------
+
+
+def test_aria_lens_projects_as_the_official_tools() -> None:
+    """Values that projectaria_tools 2.3.0 gives for a FISHEYE624 camera of these parameters."""
+    focal, cx, cy = 610.9, 711.2, 709.4
+    lens = LensParameters(
+        FISHEYE, (focal, focal, cx + 0.5, cy + 0.5, *mini_aria.PARAMS[3:]), (1408, 1408)
+    )
+    points = np.array([[0, 0, 1], [0.3, 0.2, 1], [-0.5, 0.4, 1], [0.9, -0.7, 1], [-1, 1, 1]])
+    official = [
+        [711.2, 709.4],
+        [894.42369727, 831.59135017],
+        [414.56037259, 946.80005992],
+        [1197.46209743, 331.38097377],
+        [205.24181961, 1215.57873122],
+    ]
+    found = AriaCamera(lens, 700.0, np.eye(4))._fisheye.img_from_cam(points)
+    np.testing.assert_allclose(found, np.array(official) + 0.5, rtol=0, atol=1e-7)
+
+
+def test_aria_first_version_has_the_scalar_of_quaternions_first(tmp_path: Path) -> None:
+    expected = mini_aria.write(tmp_path, version="1.0")
+    with projectaria_tools():
+        scene = read("aria_digital_twin", tmp_path, expected.scene)
+        compare(scene, expected)
+    assert "quaternions of version 1.0" in messages(scene)
+
+
+def test_aria_recordings_need_the_official_package(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    expected = mini_aria.write(tmp_path)
+    monkeypatch.setitem(sys.modules, "projectaria_tools", None)
+    with pytest.raises(OptionError, match=r"pip install 'gvtools\[aria\]'"):
+        read("aria_digital_twin", tmp_path, expected.scene)
+    (tmp_path / expected.scene / "video.vrs").write_bytes(b"none")
+    monkeypatch.undo()
+    with projectaria_tools(), pytest.raises(ProjectError, match="no readable VRS file"):
+        read("aria_digital_twin", tmp_path, expected.scene)
+
+
+def test_aria_recordings_that_end_early_give_their_first_frames(tmp_path: Path) -> None:
+    expected = mini_aria.write(tmp_path)
+    path = tmp_path / expected.scene / "video.vrs"
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) * 6 // 10])
+    with projectaria_tools():
+        scene = read("aria_digital_twin", tmp_path, expected.scene)
+        assert scene.names == expected.cameras.names[:2]
+        frame = scene.views[1].load()
+    assert expected.rgb is not None
+    assert np.abs(frame.rgb[frame.mask].astype(int) - expected.rgb[1][frame.mask]).mean() < 8
+
+
+def test_aria_frames_beyond_the_trajectory_are_left_out(tmp_path: Path) -> None:
+    expected = mini_aria.write(tmp_path)
+    path = tmp_path / expected.scene / "aria_trajectory.csv"
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([*lines[:2], *lines[3:4]]))  # without the second and the last pose
+    with projectaria_tools():
+        scene = read("aria_digital_twin", tmp_path, expected.scene)
+    assert scene.names == expected.cameras.names[:3]
+    assert "1 of 4 frames have no pose: dropped" in messages(scene)
+    middle = expected.cameras.centers[[0, 2]].mean(axis=0)
+    np.testing.assert_allclose(scene.cameras.centers[1], middle, atol=1e-3)

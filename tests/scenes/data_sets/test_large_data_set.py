@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from data_sets.room_frames import drawn_frames
+from data_sets.room_frames import rendered_frames
 from PIL import Image
 
 FRAMES = 10_000
@@ -42,7 +42,7 @@ print(json.dumps(dict(count=len(opened), total=total, before=before, opened=afte
 
 def write_trajectory(folder: Path, frames: int) -> int:
     """One picture and one depth map under ``frames`` names each; the picture's first value."""
-    drawn = drawn_frames((32.0, 32.0, 32.0, 24.0), 64, 48)
+    drawn = rendered_frames((32.0, 32.0, 32.0, 24.0), 64, 48)
     for name in ("image_left", "depth_left"):
         (folder / name).mkdir(parents=True)
     image, depth = folder / "picture.png", folder / "depth.npy"

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import doctest
 from pathlib import Path
 
 import pytest
 import yaml
 
 from gvtools.errors import OptionError
-from gvtools.scenes.data_sets import catalogue as spec_module
 from gvtools.scenes.data_sets.catalogue import (
     LAYOUTS,
     DataSetSpec,
@@ -120,7 +118,3 @@ def test_a_wrong_spec_is_named() -> None:
 def test_an_unknown_name_has_a_hint() -> None:
     with pytest.raises(OptionError, match="did you mean 'scannetppv2'"):
         load_spec("ScanNet++")
-
-
-def test_examples_of_the_docstrings() -> None:
-    assert doctest.testmod(spec_module).failed == 0

@@ -1,4 +1,4 @@
-"""What readers of drawn data sets get wrong: axes, codes for the sky, half pixels, resolutions."""
+"""Traps of rendered data sets: axes, codes for the sky, half pixels, resolutions."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from data_sets import mini_synthetic
 from data_sets.miniature import Expected, layout_named, read_miniature
-from data_sets.room_frames import drawn_frames
+from data_sets.room_frames import rendered_frames
 from PIL import Image
 
 from gvtools.errors import OptionError, ProjectError
@@ -267,7 +267,7 @@ def test_omniworlds_depth_buffer_is_not_linear(tmp_path: Path) -> None:
 def test_springs_depth_is_that_of_the_frames_pixel_centres(written: Written) -> None:
     """Disparity is in pixels of the frame at twice its resolution; every second value is off."""
     scene = written.read()
-    fine = drawn_frames((92.0, 92.0, 64.0, 48.0), 128, 96).depth
+    fine = rendered_frames((92.0, 92.0, 64.0, 48.0), 128, 96).depth
     errors = []
     for i, view in enumerate(scene):
         depth, true = view.load().depth, np.asarray(written.expected.depth)[i]
