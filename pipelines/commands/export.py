@@ -79,7 +79,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace, console: Console) -> None:
     """Write the export."""
     from gvtools.runs.memory_file import load_memory
-    from pipelines.export.source import Source
+    from pipelines.export.source import ExportSource
 
     form = FORMATS[args.format]
     options = _options(args, form)
@@ -89,7 +89,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
             "run's folder or its memory.npz"
         )
     form.check_path(args.out, args.memory)
-    writer = form.load()
+    write = form.load()
     memory = load_memory(args.memory, up_to=args.round)
     if not len(memory):
         raise OptionError(f"{args.memory}: an empty memory; expected one that views were fused in")
@@ -101,7 +101,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
                 "for them"
             )
         memory = shown
-    console.line(writer.write(Source(args.memory, memory, args.round), args.out, options))
+    console.line(write(ExportSource(args.memory, memory, args.round), args.out, options))
     made = memory.generated_count / len(memory)
     if made and "observed" in form.options and not options.observed:
         console.line(

@@ -1,17 +1,16 @@
 """The table of formats that ``gvtools export`` writes.
 
-A format is one line here and one module with
+A format is one line here and one function
 
     write(source, path, options) -> str
 
 which writes ``source`` (see ``pipelines.export.source``) to ``path`` and returns the line that the
-user is told. A format that fills a folder, or that shares its suffix, has a function
-``foreign(path)`` beside it: what is there already and was not written by an export, or None.
+user is told.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
@@ -27,44 +26,35 @@ MESH = ("observed", "method", "voxel", "max_triangles", "texture")
 
 @dataclass(frozen=True)
 class ExportFormat:
-    """One line of the table.
+    """One line of the table; functions are named ``module.function`` of ``pipelines.export``."""
 
-    Attributes:
-        name: as ``--format`` takes it.
-        module: that writes it.
-        holds: what the files are, for ``--help``.
-        suffixes: that a file may have, and how such a file begins; empty: a folder is written, or
-            the module knows.
-        options: of ``ExportOptions`` that it heeds.
-        needs: packages, as they are imported.
-    """
-
-    name: str
-    module: str
-    holds: str
+    name: str  # as ``--format`` takes it
+    writer: str
+    holds: str  # what the files are, for ``--help``
+    # That a file may have, and how such a file begins; none of what fills a folder.
     suffixes: Mapping[str, bytes] = field(default_factory=dict)
-    options: tuple[str, ...] = ()
-    needs: tuple[str, ...] = ()
+    options: tuple[str, ...] = ()  # of ``ExportOptions`` that it heeds
+    needs: tuple[str, ...] = ()  # packages, as they are imported
+    # Of a format without suffixes: what is at a path already and was not written by an export.
+    foreign: str = ""
 
-    def load(self) -> Any:
-        """The module that writes it."""
+    def load(self) -> Callable[..., str]:
+        """The function that writes it."""
         for package in self.needs:
             require(package, extra="export", purpose=f"--format {self.name}")
-        return import_module(self.module)
+        writer: Callable[..., str] = _function(self.writer)
+        return writer
 
     def check_path(self, path: Path, source: Path) -> None:
-        """Whether the export may write there."""
-        if self.suffixes:
-            self._check_file(path, source)
+        """Refuse a place where the export may not write."""
+        if not self.suffixes:
+            there = _function(self.foreign)(path)
+            if there is not None:
+                raise OptionError(
+                    f"{there}: is there already and was not written by gvtools export; expected a "
+                    "free place or an earlier export; give another --out"
+                )
             return
-        found = import_module(self.module).foreign(path)
-        if found is not None:
-            raise OptionError(
-                f"{found}: is there already and was not written by gvtools export; expected a free "
-                "place or an earlier export; give another --out"
-            )
-
-    def _check_file(self, path: Path, source: Path) -> None:
         start = self.suffixes.get(path.suffix.lower())
         if start is None:
             expected = " or ".join(self.suffixes)
@@ -78,25 +68,31 @@ class ExportFormat:
             raise OptionError(f"{path}: is there already and is {what}; give another --out")
 
 
+def _function(name: str) -> Any:
+    module, _, function = name.partition(".")
+    return getattr(import_module(f"pipelines.export.{module}"), function)
+
+
 _ALL = (
-    ExportFormat("ply", "pipelines.export.ply", "point cloud with all attributes",
+    ExportFormat("ply", "points.write_ply", "point cloud with all attributes",
                  {".ply": b"ply"}, POINTS),
-    ExportFormat("splat", "pipelines.export.splat", "3D Gaussians, INRIA's PLY",
+    ExportFormat("splat", "splats.write_splat_ply", "3D Gaussians, INRIA's PLY",
                  {".ply": b"ply"}, POINTS),
-    ExportFormat("spz", "pipelines.export.spz", "3D Gaussians, compressed",
+    ExportFormat("spz", "splats.write_spz", "3D Gaussians, compressed",
                  {".spz": b"\x1f\x8b"}, POINTS),
-    ExportFormat("mesh", "pipelines.export.mesh", "triangles with vertex colours or a texture",
+    ExportFormat("mesh", "mesh.write_mesh", "triangles with vertex colours or a texture",
                  {".ply": b"ply", ".glb": b"glTF", ".obj": b"# gvtools"}, MESH, ("trimesh",)),
-    ExportFormat("las", "pipelines.export.las", "point cloud for GIS",
+    ExportFormat("las", "points.write_las", "point cloud for GIS",
                  {".las": b"LASF", ".laz": b"LASF"}, POINTS, ("laspy", "lazrs")),
-    ExportFormat("usd", "pipelines.export.usd", "point cloud for Omniverse, Blender, Houdini",
+    ExportFormat("usd", "points.write_usd", "point cloud for Omniverse, Blender, Houdini",
                  {".usdc": b"PXR-USDC", ".usda": b"#usda"}, POINTS, ("pxr",)),
-    ExportFormat("rrd", "pipelines.export.rrd", "recording of the whole run for rerun",
+    ExportFormat("rrd", "rrd.write_rrd", "recording of the whole run for rerun",
                  {".rrd": b"RRF2"}, ("max_points",), ("rerun",)),
-    ExportFormat("glb", "pipelines.export.glb", "point cloud for web viewers",
+    ExportFormat("glb", "points.write_glb", "point cloud for web viewers",
                  {".glb": b"glTF"}, POINTS, ("trimesh",)),
-    ExportFormat("colmap", "pipelines.export.colmap", "COLMAP model", options=("max_points",)),
-    ExportFormat("transforms", "pipelines.export.transforms", "cameras as transforms.json",
-                 options=("images",)),
+    ExportFormat("colmap", "cameras.write_colmap", "COLMAP model",
+                 options=("max_points",), foreign="cameras.foreign_model"),
+    ExportFormat("transforms", "cameras.write_transforms", "cameras as transforms.json",
+                 options=("images",), foreign="cameras.foreign_transforms"),
 )  # fmt: skip
 FORMATS: Mapping[str, ExportFormat] = {each.name: each for each in _ALL}

@@ -1,4 +1,10 @@
-"""A mesh with vertex colours or a texture, as PLY, glTF binary or OBJ, in the world frame."""
+"""A mesh with vertex colours or a texture, as PLY, glTF binary or OBJ, in the world frame.
+
+It has fewer triangles by Open3D's quadric decimation, which goes through all edges in order of
+their cost, one at a time: triangles without area confuse that order, and a mesh of millions takes
+minutes. So the mesh is cleaned first, and where far fewer triangles are wanted, vertices are merged
+in cells before.
+"""
 
 from __future__ import annotations
 
@@ -11,39 +17,35 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
-from gvtools.errors import OptionError
+from gvtools.errors import DegenerateError, OptionError
 from gvtools.files import replaced_when_written, write_text
 from gvtools.memory.store.local_frame import LocalFrame
 from gvtools.runs.layout import RECORD
 from gvtools.runs.run import load_run
-from pipelines.export.glb import write_scene
-from pipelines.export.simplify import simplified
-from pipelines.export.source import ExportOptions, Source
+from pipelines.export.points import write_glb_scene
+from pipelines.export.source import ExportOptions, ExportSource
 from pipelines.export.surfaces import mesh_voxel, poisson_mesh, tsdf_mesh
-from pipelines.export.texture import TEXELS, Texture, textured
+from pipelines.export.texture import TEXELS, Texture, texture_of
 
 if TYPE_CHECKING:
     import open3d as o3d
 
 METHODS = {"tsdf": tsdf_mesh, "poisson": poisson_mesh}
 NODE = "gvtools_mesh"
+# Decimation starts from at most so many times the triangles that are wanted.
+RATIO = 8
+# Cells grow by so much until they leave few enough.
+GROWTH = 1.25
 
 
 @dataclass(frozen=True, eq=False)
 class Triangles:
-    """A mesh as files hold it.
+    """A mesh as files hold it."""
 
-    Attributes:
-        vertices: (V, 3) float64, world frame, scene units.
-        faces: (F, 3) int32, rows of ``vertices``, against the clock as seen from outside.
-        colors: (V, 3) uint8.
-        texture: where triangles have their colours in a picture; their vertices are their own,
-            in order.
-    """
-
-    vertices: NDArray[np.float64]
-    faces: NDArray[np.int32]
-    colors: NDArray[np.uint8]
+    vertices: NDArray[np.float64]  # (V, 3) world frame, scene units
+    faces: NDArray[np.int32]  # (F, 3) rows of ``vertices``, against the clock seen from outside
+    colors: NDArray[np.uint8]  # (V, 3)
+    # Where triangles have their colours in a picture; their vertices are their own, in order.
     texture: Texture | None = None
 
     @classmethod
@@ -60,7 +62,7 @@ class Triangles:
         return cls(positions[faces.ravel()], own, colors[faces.ravel()], texture)
 
 
-def write(source: Source, path: Path, options: ExportOptions) -> str:
+def write_mesh(source: ExportSource, path: Path, options: ExportOptions) -> str:
     """Write a mesh."""
     memory, size = source.memory, options.texture
     if size is not None:
@@ -73,8 +75,8 @@ def write(source: Source, path: Path, options: ExportOptions) -> str:
     if size is not None and most is None:
         most = size**2 // TEXELS
     if most is not None:
-        mesh = simplified(mesh, most)
-    texture = None if size is None else textured(mesh, _photographs(source), size)
+        mesh = simplify(mesh, most)
+    texture = None if size is None else texture_of(mesh, _photographs(source), size)
     triangles = Triangles.of(mesh, memory.frame, texture)
     SAVERS[path.suffix.lower()](triangles, path)
     count = len(triangles.faces)
@@ -86,7 +88,7 @@ def write(source: Source, path: Path, options: ExportOptions) -> str:
     )
 
 
-def _check_texture(source: Source, path: Path) -> None:
+def _check_texture(source: ExportSource, path: Path) -> None:
     if path.suffix.lower() == ".ply":
         raise OptionError(
             f"--texture: {path} is to be a PLY; .glb and .obj take a texture, a .ply has vertex "
@@ -105,7 +107,7 @@ def _check_texture(source: Source, path: Path) -> None:
             )
 
 
-def _photographs(source: Source) -> Iterator[tuple[Cameras, NDArray[np.uint8]]]:
+def _photographs(source: ExportSource) -> Iterator[tuple[Cameras, NDArray[np.uint8]]]:
     """Cameras of the observed views in the memory's frame, and their photographs."""
     scene = load_run(source.path).scenes[0]
     for view in source.memory.views.photographed:
@@ -127,7 +129,9 @@ def _save_ply(triangles: Triangles, path: Path) -> None:
 
 
 def _save_glb(triangles: Triangles, path: Path) -> None:
-    write_scene(lambda vertices: _trimesh(triangles, vertices), triangles.vertices, path, node=NODE)
+    write_glb_scene(
+        lambda vertices: _trimesh(triangles, vertices), triangles.vertices, path, node=NODE
+    )
 
 
 def _save_obj(triangles: Triangles, path: Path) -> None:
@@ -172,6 +176,51 @@ def _trimesh(
         ),
     )
     return trimesh.Trimesh(vertices, triangles.faces, visual=visuals, process=False)
+
+
+def simplify(mesh: o3d.t.geometry.TriangleMesh, max_triangles: int) -> o3d.t.geometry.TriangleMesh:
+    """The mesh with at most so many triangles; as it is where it has no more."""
+    import open3d as o3d
+
+    if len(mesh.triangle.indices) <= max_triangles:
+        return mesh
+    legacy = _clean(mesh.to_legacy())
+    legacy = _merge_vertices(legacy, RATIO * max_triangles)
+    legacy = _clean(legacy.simplify_quadric_decimation(max_triangles))
+    # Where borders keep decimation from its number, cells give it.
+    legacy = _merge_vertices(legacy, max_triangles)
+    if not len(legacy.triangles):
+        raise DegenerateError(
+            f"--max-triangles {max_triangles}: no triangle is left of "
+            f"{len(mesh.triangle.indices)}; expected more"
+        )
+    return o3d.t.geometry.TriangleMesh.from_legacy(legacy)
+
+
+def _merge_vertices(mesh: o3d.geometry.TriangleMesh, most: int) -> o3d.geometry.TriangleMesh:
+    """Vertices merged in cells that grow until at most ``most`` triangles are left."""
+    if len(mesh.triangles) <= most:
+        return mesh
+    corners = np.asarray(mesh.vertices)[np.asarray(mesh.triangles)]
+    edge = float(np.median(np.linalg.norm(corners[:, 0] - corners[:, 1], axis=1)))
+    fewer = mesh
+    while len(fewer.triangles) > most:
+        fewer = _clean(mesh.simplify_vertex_clustering(edge))
+        edge *= GROWTH
+    return fewer
+
+
+def _clean(mesh: o3d.geometry.TriangleMesh) -> o3d.geometry.TriangleMesh:
+    mesh.remove_duplicated_vertices()
+    mesh.remove_degenerate_triangles()
+    mesh.remove_duplicated_triangles()
+    corners = np.asarray(mesh.vertices)[np.asarray(mesh.triangles)]
+    area = np.linalg.norm(
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+    )
+    mesh.remove_triangles_by_mask(~(area > 0))
+    mesh.remove_unreferenced_vertices()
+    return mesh
 
 
 SAVERS = {".ply": _save_ply, ".glb": _save_glb, ".obj": _save_obj}

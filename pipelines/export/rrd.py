@@ -7,9 +7,10 @@ where float32 would be too coarse in the world frame; the recording's name says 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +19,8 @@ from gvtools.cameras import Cameras
 from gvtools.errors import GvError
 from gvtools.files import replaced_when_written
 from gvtools.runs.layout import RECORD
-from gvtools.runs.run import Run, load_run
-from pipelines.export.source import ExportOptions, Source, points_summary
+from gvtools.runs.run import load_run
+from pipelines.export.source import ExportOptions, ExportSource
 
 if TYPE_CHECKING:
     import rerun
@@ -36,23 +37,16 @@ ROUNDING = 0.1
 
 
 @dataclass(frozen=True, eq=False)
-class Shot:
-    """A camera with its picture.
+class RecordedCamera:
+    """A camera with its picture."""
 
-    Attributes:
-        round: that it came with.
-        kind: ``context`` or ``generated``.
-        camera: a batch of one, world frame.
-        picture: (H, W, 3) uint8; None where there is none.
-    """
-
-    round: int
-    kind: str
-    camera: Cameras
-    picture: NDArray[np.uint8] | None
+    round: int  # that it came with
+    kind: str  # ``context`` or ``generated``
+    camera: Cameras  # a batch of one, world frame
+    picture: NDArray[np.uint8] | None  # (H, W, 3); None where there is none
 
 
-def write(source: Source, path: Path, options: ExportOptions) -> str:
+def write_rrd(source: ExportSource, path: Path, options: ExportOptions) -> str:
     """Write the recording."""
     import rerun
 
@@ -92,17 +86,24 @@ def write(source: Source, path: Path, options: ExportOptions) -> str:
             shots += 1
         recording.flush()
         recording.disconnect()
-    return f"{points_summary(points, memory)} and {shots} cameras in {path}"
+    return f"{source.points_summary(points)} and {shots} cameras in {path}"
 
 
 def _log(
-    recording: rerun.RecordingStream, shot: Shot, *, origin: NDArray[np.float64], distance: float
+    recording: rerun.RecordingStream,
+    shot: RecordedCamera,
+    *,
+    origin: NDArray[np.float64],
+    distance: float,
 ) -> None:
     import rerun
+    from PIL import Image
 
     camera, picture = shot.camera, shot.picture
     if picture is not None:
-        picture = _reduced(picture)
+        image = Image.fromarray(picture)
+        image.thumbnail((SIDE, SIDE))
+        picture = np.asarray(image)
         camera = camera.resized(picture.shape[1], picture.shape[0])
     pose = camera.world_from_cam[0]
     entity = rerun.new_entity_path(
@@ -123,37 +124,23 @@ def _log(
         recording.log(entity, rerun.Image(picture).compress(jpeg_quality=QUALITY))
 
 
-def _shots(source: Source) -> Iterator[Shot]:
+def _shots(source: ExportSource) -> Iterator[RecordedCamera]:
     """Cameras of the memory's views and the run's targets, with pictures where they are there."""
     run = load_run(source.path) if (source.path / RECORD).is_file() else None
-    scene = _scene(run)
+    scene = None
+    if run is not None:
+        with suppress(GvError):  # A project that cannot be read any more has no pictures.
+            scene = run.scenes[0]
     for view in source.memory.views:
         name = view.camera.names[0]
         if view.scanned:
             continue
         if view.generated:
             if run is None:
-                yield Shot(view.round, "generated", view.camera, None)
+                yield RecordedCamera(view.round, "generated", view.camera, None)
             continue
         picture = scene[name].load().rgb if scene is not None and name in scene.names else None
-        yield Shot(view.round, "context", view.camera, picture)
+        yield RecordedCamera(view.round, "context", view.camera, picture)
     for target in run.views if run else ():
         if source.up_to is None or target.round <= source.up_to:
-            yield Shot(target.round, "generated", target.camera, target.read().picture)
-
-
-def _scene(run: Run | None) -> Any:
-    """The run's project; None where it cannot be read any more."""
-    try:
-        return None if run is None else run.scenes[0]
-    except GvError:
-        return None
-
-
-def _reduced(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The picture with sides of at most ``SIDE``."""
-    from PIL import Image
-
-    image = Image.fromarray(picture)
-    image.thumbnail((SIDE, SIDE))
-    return np.asarray(image)
+            yield RecordedCamera(target.round, "generated", target.camera, target.read().picture)

@@ -1,77 +1,149 @@
-"""What an export is made from, and the options that choose from it."""
+"""Contents of an export: points, Gaussians and cameras of a run or a memory, and user's options.
+
+Gaussians are those that the run fitted, which show what photographs saw. Of the memory's points,
+generated ones are added, and scanned ones that have no photograph's observation near them. Without
+a fit all points are exported. Each point becomes a spherical Gaussian.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.errors import OptionError
+from gvtools.appearance.gaussians import Gaussians
+from gvtools.appearance.splat.project_kernels import LOG_SCALE, LOGIT, QUATERNION, SH
+from gvtools.appearance.turning import turned
+from gvtools.cameras import Cameras, concatenate
+from gvtools.errors import OptionError, ProjectError
+from gvtools.memory.store.local_frame import LocalFrame
+from gvtools.memory.store.voxel_levels import levels_above
 from gvtools.memory.thinning import thinned
 from gvtools.runs.memory_file import load_appearance
+from gvtools.runs.target_files import completed_picture
 
 if TYPE_CHECKING:
     from gvtools.appearance.appearance import Appearance
     from gvtools.memory.spatial_memory import SpatialMemory
 
+# Standard deviation of a point's Gaussian, as a share of the distance to the next point.
+SPREAD = 0.6
+# Opacity of a point at confidence 0, and towards which it grows with confidence.
+LEAST_OPACITY, MOST_OPACITY = 0.7, 0.99
+# Confidence at which the opacity is half-way between them.
+HALFWAY = 0.5
+# Files hold float32. Where its rounding is more than the share ROUNDING of the size of small
+# Gaussians (the quantile SMALLEST), positions are relative to the middle of the scene.
+ROUNDING, SMALLEST = 0.1, 0.01
+
 
 @dataclass(frozen=True)
 class ExportOptions:
-    """What a user asked for; None: was not given, the format has its own default.
+    """What a user asked for; None: was not given, the format has its own default."""
 
-    Attributes:
-        max_points: thin to at most so many points.
-        observed: leave out what a completer made.
-        images: folder of the observed views' pictures, for ``transforms``.
-        method: that makes a mesh, ``tsdf`` or ``poisson``.
-        voxel: edge of the voxels that a mesh is made in, scene units.
-        max_triangles: simplify a mesh to at most so many.
-        texture: side of the picture that a mesh's colours are in, texels.
-    """
-
-    max_points: int | None = None
-    observed: bool | None = None
-    images: str | None = None
-    method: str | None = None
-    voxel: float | None = None
-    max_triangles: int | None = None
-    texture: int | None = None
+    max_points: int | None = None  # thin to at most so many
+    observed: bool | None = None  # leave out what a completer made
+    images: str | None = None  # folder of the observed views' pictures, for ``transforms``
+    method: str | None = None  # that makes a mesh, ``tsdf`` or ``poisson``
+    voxel: float | None = None  # edge of the voxels that a mesh is made in, scene units
+    max_triangles: int | None = None  # simplify a mesh to at most so many
+    texture: int | None = None  # side of the picture that a mesh's colours are in, texels
 
 
 @dataclass(frozen=True, eq=False)
-class Points:
-    """Points of a memory, one a voxel.
+class ExportPoints:
+    """P points of a memory, one a voxel."""
 
-    Attributes:
-        rows: (P,) their observations in the memory.
-        positions: (P, 3) float64, world frame, scene units.
-        colors: (P, 3) uint8.
-        edge: of the voxels that they were thinned to, scene units.
-    """
+    rows: NDArray[np.int64]  # (P,) their observations in the memory
+    positions: NDArray[np.float64]  # (P, 3) world frame, scene units
+    colors: NDArray[np.uint8]  # (P, 3)
+    edge: float  # of the voxels that they were thinned to, scene units
 
-    rows: NDArray[np.int64]
-    positions: NDArray[np.float64]
-    colors: NDArray[np.uint8]
-    edge: float
+    @property
+    def middle(self) -> NDArray[np.float64]:
+        """(3,) the middle of the box around them."""
+        return box_middle(self.positions)
 
 
 @dataclass(frozen=True, eq=False)
-class Source:
-    """A run, or a memory alone.
+class Splats:
+    """N Gaussians with the axes of the world frame."""
 
-    Attributes:
-        path: a run's folder, or a memory file.
-        memory: with at least one observation.
-        up_to: round that the memory ends with; None for the last one.
-    """
+    # (N, VALUES), see appearance.splat.project_kernels; positions are relative to ``origin``.
+    values: NDArray[np.float32]
+    origin: NDArray[np.float64]  # (3,) world frame; zero if float32 is precise enough
+    fitted: int  # number of fitted ones, which come first; the others are points of the memory
+    further: int  # number of the run's other fits, which are left out
+    rounds: NDArray[np.int32]  # (N,) in which each was added
 
-    path: Path
-    memory: SpatialMemory
-    up_to: int | None = None
+    def __len__(self) -> int:
+        return len(self.values)
+
+    @property
+    def positions(self) -> NDArray[np.float32]:
+        """(N, 3) relative to ``origin``, scene units."""
+        return self.values[:, :LOG_SCALE]
+
+    @property
+    def log_scales(self) -> NDArray[np.float32]:
+        """(N, 3) natural logarithms of the standard deviations, scene units."""
+        return self.values[:, LOG_SCALE:QUATERNION]
+
+    @property
+    def quaternions(self) -> NDArray[np.float32]:
+        """(N, 4) w, x, y, z of length 1."""
+        q = self.values[:, QUATERNION:LOGIT]
+        return q / np.linalg.norm(q, axis=1, keepdims=True)
+
+    @property
+    def logits(self) -> NDArray[np.float32]:
+        """(N,) opacities before the sigmoid."""
+        return self.values[:, LOGIT]
+
+    @property
+    def harmonics(self) -> NDArray[np.float32]:
+        """(N, H, 3) coefficients; H = 9 (degree 2) with a fit, else 1 (one colour each)."""
+        sh = self.values[:, SH:].reshape(len(self), -1, 3)
+        return sh if self.fitted else sh[:, :1]
+
+    def summary(self) -> str:
+        """A line of text for the user."""
+        points = len(self) - self.fitted
+        parts = [f"{self.fitted} fitted"] if self.fitted else []
+        if points or not parts:
+            parts.append(f"{points} from {'further ' if self.fitted else ''}points")
+        text = f"{len(self)} Gaussians ({', '.join(parts)})"
+        if self.further:
+            text += f", the first of {self.further + 1} fits"
+        if self.origin.any():
+            text += f", counted from {' '.join(f'{x:.10g}' for x in self.origin)}"
+        return text
+
+
+@dataclass(frozen=True, eq=False)
+class DistinctCameras:
+    """Each camera of a memory once, under a name of its own."""
+
+    cameras: Cameras
+    # (views of the memory,) which of the cameras each view has; -1 for a scan's station.
+    row_of_view: NDArray[np.int64]
+    # Those that a completer alone saw through, in order, with the pictures that the run kept.
+    generated: dict[str, Path | None]
+
+
+@dataclass(frozen=True, eq=False)
+class ExportSource:
+    """A run, or a memory alone."""
+
+    path: Path  # a run's folder, or a memory file
+    memory: SpatialMemory  # with at least one observation
+    up_to: int | None = None  # round that the memory ends with; None for the last one
 
     @cached_property
     def appearance(self) -> Appearance | None:
@@ -84,7 +156,7 @@ class Source:
         *,
         most: int | None = None,
         among: NDArray[np.bool_] | None = None,
-    ) -> Points:
+    ) -> ExportPoints:
         """The most confident observation of each voxel.
 
         Args:
@@ -102,14 +174,174 @@ class Source:
         kept = thinned(memory, limit, among=chosen)
         columns = memory.columns
         positions = memory.frame.to_world(columns.positions[kept.rows])
-        return Points(kept.rows, positions, columns.colors[kept.rows], kept.edge)
+        return ExportPoints(kept.rows, positions, columns.colors[kept.rows], kept.edge)
+
+    def points_summary(self, points: ExportPoints) -> str:
+        """How many points there are, for the user."""
+        return (
+            f"{len(points.rows)} points of {len(self.memory)} observations (voxels of "
+            f"{points.edge:.4g})"
+        )
+
+    def splats(self, options: ExportOptions) -> Splats:
+        """The Gaussians that show the run or the memory."""
+        appearance, memory = self.appearance, self.memory
+        if appearance is None:
+            values, rounds = self._point_gaussians(options)
+            values, origin = _relative_to_middle(values, memory.frame.origin)
+            return Splats(values, origin, 0, 0, rounds)
+        first = appearance.gaussians
+        if appearance.exposures is not None:
+            from gvtools.appearance.exposed import exposed
+
+            photographs = concatenate([view.camera for view in memory.views.photographed])
+            first = exposed(first, appearance.exposures, photographs)
+        fitted = turned(first.values, first.frame.axes)
+        parts, rest = [fitted], None
+        rounds_of_parts = [np.zeros(len(fitted), np.int32)]
+        if options.max_points is not None:
+            rest = options.max_points - len(fitted)
+            if rest < 0:
+                raise OptionError(
+                    f"--max-points {options.max_points}: the run's fit has {len(fitted)} "
+                    "Gaussians, which are kept whole; expected no less"
+                )
+        further = unphotographed(memory)
+        if not options.observed:
+            further |= memory.generated
+        if further.any() and rest != 0:
+            points, rounds = self._point_gaussians(ExportOptions(max_points=rest), among=further)
+            points[:, :LOG_SCALE] += (memory.frame.origin - first.frame.origin).astype(np.float32)
+            parts.append(points)
+            rounds_of_parts.append(rounds)
+        values, origin = _relative_to_middle(np.concatenate(parts), first.frame.origin)
+        rounds = np.concatenate(rounds_of_parts)
+        return Splats(values, origin, len(fitted), len(appearance.others), rounds)
+
+    def _point_gaussians(
+        self, options: ExportOptions, *, among: NDArray[np.bool_] | None = None
+    ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+        """Spherical Gaussians of the memory's points, one a voxel, and the round of each.
+
+        Their size follows from the distance between points, their opacity from confidence. Axes
+        are the world's, positions relative to the memory's origin.
+        """
+        memory = self.memory
+        points = self.points(options, among=among)
+        columns = memory.columns
+        # The next point is at least about a voxel's edge away: each voxel has one.
+        above = levels_above(columns.level[points.rows], points.edge / memory.voxel)
+        edges = np.ldexp(points.edge, above)
+        apart = np.maximum(columns.spacing[points.rows], edges)
+        local = points.positions - memory.frame.origin
+        gaussians = Gaussians.at(
+            local, points.colors, sizes=SPREAD * apart, frame=LocalFrame.at(memory.frame.origin)
+        )
+        confidence = memory.confidence[points.rows]
+        share = confidence / (confidence + HALFWAY)
+        opacity = LEAST_OPACITY + (MOST_OPACITY - LEAST_OPACITY) * share
+        gaussians.values[:, LOGIT] = np.log(opacity / (1 - opacity))
+        return gaussians.values, columns.round[points.rows].astype(np.int32)
+
+    def cameras(self) -> DistinctCameras:
+        """Each camera once, as formats of other tools need it, each with a unique name.
+
+        A view may be fused twice. Observed cameras keep their names; generated ones are named
+        ``generated/NAME``, or ``generated_2/NAME`` and so on where another has that in any case.
+        """
+        memory = self.memory
+        cameras, made = memory.views.cameras, memory.views.generated
+        taken = np.flatnonzero(~memory.views.scanned)
+        if cameras is None or not len(taken):
+            raise ProjectError("the memory has no views; nothing to export")
+        first: list[int] = []  # for each camera kept the first view that has it
+        names: list[str] = []
+        rows_of_name: dict[str, list[int]] = {}
+        row_of_view = np.full(len(cameras), -1, np.int64)
+        used: set[str] = set()
+        # Observed views come first and keep their names.
+        for i in taken[np.argsort(made[taken], kind="stable")].tolist():
+            name = cameras.names[i]
+            alike = rows_of_name.setdefault(name, [])
+            row = next((row for row in alike if _same_camera(memory, first[row], i)), len(first))
+            row_of_view[i] = row
+            if row < len(first):
+                continue
+            if alike and not made[i]:
+                raise ProjectError(
+                    f"two different observed cameras of the memory are named {name!r}; formats of "
+                    "other tools need unique names; rename one in the project and run again"
+                )
+            if made[i]:
+                name = next(new for new in _generated_names(name) if new.lower() not in used)
+            alike.append(row)
+            first.append(i)
+            names.append(name)
+            used.add(name.lower())
+        kept = cameras[first]
+        kept = Cameras(kept.K, kept.cam_from_world, kept.width, kept.height, tuple(names))
+        pictures: dict[str, Path | None] = {}
+        for i, row in enumerate(row_of_view.tolist()):
+            if row >= 0 and made[first[row]]:
+                # Of several rounds' pictures the last.
+                view = memory.views[i]
+                picture = completed_picture(self.path, view.round, view.camera.names[0])
+                pictures[names[row]] = picture or pictures.get(names[row])
+        return DistinctCameras(kept, row_of_view, pictures)
 
 
-def middle(positions: NDArray[np.float64]) -> NDArray[np.float64]:
+def box_middle(positions: NDArray[np.float64]) -> NDArray[np.float64]:
     """(3,) the middle of the box around positions (N, 3)."""
     return (positions.min(axis=0) + positions.max(axis=0)) / 2
 
 
-def points_summary(points: Points, memory: SpatialMemory) -> str:
-    """How many points there are, for the user."""
-    return f"{len(points.rows)} points of {len(memory)} observations (voxels of {points.edge:.4g})"
+def _relative_to_middle(
+    values: NDArray[np.float32], origin: NDArray[np.float64]
+) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    """Gaussians with positions relative to the world's origin, or to their middle, see ROUNDING.
+
+    ``values`` count from ``origin`` and are changed; the origin that they count from now is
+    returned beside them.
+    """
+    positions = values[:, :LOG_SCALE].astype(np.float64) + origin
+    sizes = np.exp(values[:, LOG_SCALE:QUATERNION].max(axis=1))
+    reach = float(np.abs(positions).max())
+    if reach * 2.0**-24 > ROUNDING * float(np.quantile(sizes, SMALLEST)):
+        origin = np.round(box_middle(positions))
+    else:
+        origin = np.zeros(3)
+    values[:, :LOG_SCALE] = positions - origin
+    return values, origin
+
+
+def unphotographed(memory: SpatialMemory) -> NDArray[np.bool_]:
+    """(N,) scanned observations without a photograph's observation within their spacing."""
+    scanned = memory.scanned
+    seen = ~(scanned | memory.generated)
+    if not scanned.any() or not seen.any():
+        return scanned.copy()
+    from scipy.spatial import KDTree
+
+    positions, rows = memory.columns.positions, np.flatnonzero(scanned)
+    away, _ = KDTree(positions[seen]).query(positions[rows], workers=-1)
+    alone = np.zeros(len(memory), np.bool_)
+    alone[rows[away > memory.columns.spacing[rows]]] = True
+    return alone
+
+
+def _generated_names(name: str) -> Iterator[str]:
+    yield f"generated/{name}"
+    yield from (f"generated_{number}/{name}" for number in count(2))
+
+
+def _same_camera(memory: SpatialMemory, i: int, j: int) -> bool:
+    """Whether two views of the memory have one camera, up to rounding."""
+    first, second = memory.views[i].camera, memory.views[j].camera
+    # Relative to the memory's origin: in a far world frame a tolerance would swallow a step aside.
+    pose = memory.views.cam_from_local
+    return bool(
+        (first.width == second.width).all()
+        and (first.height == second.height).all()
+        and np.allclose(pose[i], pose[j])
+        and np.allclose(first.K, second.K)
+    )

@@ -1,202 +1,263 @@
-"""The Gaussians of an export: those that the run fitted, and the memory's points beside them.
+"""3D Gaussians as INRIA's PLY and as SPZ, version 3, written and read.
 
-Fitted Gaussians show what photographs saw. Of the memory's points, generated ones are added, and
-scanned ones that have no photograph's observation near them. Without a fit all points are exported.
-Each point becomes a spherical Gaussian.
+The PLY is as "3D Gaussian Splatting" writes it: natural logarithms of standard deviations, opacity
+before the sigmoid, quaternions w, x, y, z, and coefficients of spherical harmonics channel by
+channel.
+
+SPZ is Niantic's format, a tenth of the PLY's size: a gzip stream of a header and one array after
+the other: positions (24-bit fixed point), opacities, colours and logarithms of sizes (8 bits each),
+rotations (32 bits: the three smallest components and which one is missing), and harmonics (8 bits,
+of which 5 count at degree 1 and 4 above). https://github.com/nianticlabs/spz describes it. Its axes
+are right, up, back: Gaussians are turned half around x, and its readers turn them back where theirs
+are right, down, forward, as a PLY's.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import gzip
+import struct
+from collections.abc import Collection, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.appearance.gaussians import Gaussians
-from gvtools.appearance.splat.project_kernels import LOG_SCALE, LOGIT, QUATERNION, SH
+from gvtools.appearance.splat.project_kernels import (
+    LOG_SCALE,
+    LOGIT,
+    QUATERNION,
+    SH,
+    VALUES,
+)
 from gvtools.appearance.turning import turned
-from gvtools.cameras import Cameras, concatenate
-from gvtools.errors import OptionError
-from gvtools.memory.spatial_memory import SpatialMemory
-from gvtools.memory.store.local_frame import LocalFrame
-from gvtools.memory.store.voxel_levels import levels_above
-from pipelines.export.source import ExportOptions, Source, middle
+from gvtools.errors import MemoryFileError
+from gvtools.files import replaced_when_written
+from gvtools.ply import read_ply, write_ply
+from gvtools.untrusted import read_bytes, unpack_gzip
+from pipelines.export.source import ExportOptions, ExportSource, Splats
 
-# Standard deviation of a point's Gaussian, as a share of the distance to the next point.
-SPREAD = 0.6
-# Opacity of a point at confidence 0, and towards which it grows with confidence.
-LEAST_OPACITY, MOST_OPACITY = 0.7, 0.99
-# Confidence at which the opacity is half-way between them.
-HALFWAY = 0.5
-# Files hold float32. Where its rounding is more than the share ROUNDING of the size of small
-# Gaussians (the quantile SMALLEST), positions are relative to the middle of the scene.
-ROUNDING, SMALLEST = 0.1, 0.01
-
-
-@dataclass(frozen=True, eq=False)
-class Splats:
-    """N Gaussians with the axes of the world frame.
-
-    Attributes:
-        values: (N, VALUES) float32, see appearance.splat.project_kernels; positions are relative
-            to ``origin``.
-        origin: (3,) float64, world frame, scene units; zero if float32 is precise enough.
-        fitted: number of fitted ones, which come first; the others are points of the memory.
-        further: number of the run's other fits, which are left out.
-        rounds: (N,) int32, the round in which each was added.
-    """
-
-    values: NDArray[np.float32]
-    origin: NDArray[np.float64]
-    fitted: int
-    further: int
-    rounds: NDArray[np.int32]
-
-    def __len__(self) -> int:
-        return len(self.values)
-
-    @property
-    def positions(self) -> NDArray[np.float32]:
-        """(N, 3) relative to ``origin``, scene units."""
-        return self.values[:, :LOG_SCALE]
-
-    @property
-    def log_scales(self) -> NDArray[np.float32]:
-        """(N, 3) natural logarithms of the standard deviations, scene units."""
-        return self.values[:, LOG_SCALE:QUATERNION]
-
-    @property
-    def quaternions(self) -> NDArray[np.float32]:
-        """(N, 4) w, x, y, z of length 1."""
-        q = self.values[:, QUATERNION:LOGIT]
-        return q / np.linalg.norm(q, axis=1, keepdims=True)
-
-    @property
-    def logits(self) -> NDArray[np.float32]:
-        """(N,) opacities before the sigmoid."""
-        return self.values[:, LOGIT]
-
-    @property
-    def harmonics(self) -> NDArray[np.float32]:
-        """(N, H, 3) coefficients; H = 9 (degree 2) with a fit, else 1 (one colour each)."""
-        sh = self.values[:, SH:].reshape(len(self), -1, 3)
-        return sh if self.fitted else sh[:, :1]
-
-    def summary(self) -> str:
-        """A line of text for the user."""
-        points = len(self) - self.fitted
-        parts = [f"{self.fitted} fitted"] if self.fitted else []
-        if points or not parts:
-            parts.append(f"{points} from {'further ' if self.fitted else ''}points")
-        text = f"{len(self)} Gaussians ({', '.join(parts)})"
-        if self.further:
-            text += f", the first of {self.further + 1} fits"
-        if self.origin.any():
-            text += f", counted from {' '.join(f'{x:.10g}' for x in self.origin)}"
-        return text
+MAGIC, VERSION = 0x5053474E, 3
+# What may be unpacked: so many bytes for each of the file's, which harmonics of zeros need, and so
+# many more. In RAM a Gaussian takes several times what it does there.
+MOST_RATIO, MOST_BYTES = 16, 1 << 22
+# Header: magic, version, count, degree of the harmonics, fractional bits, flags, reserved.
+HEADER = struct.Struct("<IIIBBBB")
+# From right, down, forward to right, up, back.
+TO_RUB = np.diag([1.0, -1.0, -1.0])
+# Bits of a coordinate with its sign, and the most of them behind the point that readers take.
+BITS, MOST_FRACTIONAL = 24, 23
+# Steps of positions in a small Gaussian's least standard deviation; smaller ones are this share.
+STEPS_PER_SIZE, SMALLEST = 8, 0.05
+# Colours are stored as 0.15 f_dc + 0.5, logarithms of sizes as 16 (log + 10).
+COLOR, SCALE, SHIFT = 0.15, 16, 10
+# Bits of harmonics that are kept, by degree.
+HARMONIC_BITS = (5, 4)
+# A component's 9 bits of magnitude; the three smallest are at most this.
+COMPONENT, LARGEST = 511, np.sqrt(0.5)
+# From 0 and from 1, of opacities that are read: their logits are finite.
+LEAST = 1e-4
 
 
-def splats_of(source: Source, options: ExportOptions) -> Splats:
-    """The Gaussians that show a run or a memory."""
-    appearance, memory = source.appearance, source.memory
-    if appearance is None:
-        values, rounds = of_points(source, options)
-        values, origin = _rounded(values, memory.frame.origin)
-        return Splats(values, origin, 0, 0, rounds)
-    first = appearance.gaussians
-    if appearance.exposures is not None:
-        from gvtools.appearance.exposed import exposed
-
-        first = exposed(first, appearance.exposures, _photographs(memory))
-    fitted = turned(first.values, first.frame.axes)
-    parts, rest = [fitted], None
-    of_parts = [np.zeros(len(fitted), np.int32)]
-    if options.max_points is not None:
-        rest = options.max_points - len(fitted)
-        if rest < 0:
-            raise OptionError(
-                f"--max-points {options.max_points}: the run's fit has {len(fitted)} Gaussians, "
-                "which are kept whole; expected no less"
-            )
-    further = unphotographed(memory)
-    if not options.observed:
-        further |= memory.generated
-    if further.any() and rest != 0:
-        points, came = of_points(source, ExportOptions(max_points=rest), among=further)
-        points[:, :LOG_SCALE] += (memory.frame.origin - first.frame.origin).astype(np.float32)
-        parts.append(points)
-        of_parts.append(came)
-    values, origin = _rounded(np.concatenate(parts), first.frame.origin)
-    return Splats(values, origin, len(fitted), len(appearance.others), np.concatenate(of_parts))
+def write_splat_ply(source: ExportSource, path: Path, options: ExportOptions) -> str:
+    """Write the Gaussians."""
+    splats = source.splats(options)
+    comments = ["3D Gaussians by gvtools, axes of the input's world frame, scene units"]
+    if splats.origin.any():
+        comments.append("origin " + " ".join(repr(float(x)) for x in splats.origin))
+    write_ply(path, ply_rows(splats), comments=tuple(comments))
+    return f"{splats.summary()} in {path}"
 
 
-def _rounded(
-    values: NDArray[np.float32], origin: NDArray[np.float64]
-) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-    """Make positions relative to the world's origin, or to the scene's middle, see ROUNDING.
-
-    Args:
-        values: (N, VALUES), positions relative to ``origin``; is changed.
-        origin: (3,) world frame.
-
-    Returns:
-        ``values``, and the (3,) origin that positions are relative to now.
-    """
-    positions = values[:, :LOG_SCALE].astype(np.float64) + origin
-    sizes = np.exp(values[:, LOG_SCALE:QUATERNION].max(axis=1))
-    reach = float(np.abs(positions).max())
-    if reach * 2.0**-24 > ROUNDING * float(np.quantile(sizes, SMALLEST)):
-        origin = np.round(middle(positions))
-    else:
-        origin = np.zeros(3)
-    values[:, :LOG_SCALE] = positions - origin
-    return values, origin
+def ply_rows(splats: Splats) -> NDArray[np.void]:
+    """(N,) rows as the PLY has them; normals are zero, as INRIA's are."""
+    rest = splats.harmonics[:, 1:].transpose(0, 2, 1).reshape(len(splats), -1)
+    columns: dict[tuple[str, ...], NDArray[Any]] = {
+        ("x", "y", "z"): splats.positions,
+        ("nx", "ny", "nz"): np.zeros((len(splats), 3)),
+        _numbered("f_dc", 3): splats.harmonics[:, 0],
+        _numbered("f_rest", rest.shape[1]): rest,
+        ("opacity",): splats.logits[:, None],
+        _numbered("scale", 3): splats.log_scales,
+        _numbered("rot", 4): splats.quaternions,
+    }
+    rows = np.empty(len(splats), [(name, "<f4") for names in columns for name in names])
+    for names, values in columns.items():
+        for name, column in zip(names, values.T, strict=True):
+            rows[name] = column
+    return rows
 
 
-def unphotographed(memory: SpatialMemory) -> NDArray[np.bool_]:
-    """(N,) scanned observations without a photograph's observation within their spacing."""
-    scanned = memory.scanned
-    seen = ~(scanned | memory.generated)
-    if not scanned.any() or not seen.any():
-        return scanned.copy()
-    from scipy.spatial import KDTree
-
-    positions, rows = memory.columns.positions, np.flatnonzero(scanned)
-    away, _ = KDTree(positions[seen]).query(positions[rows], workers=-1)
-    alone = np.zeros(len(memory), np.bool_)
-    alone[rows[away > memory.columns.spacing[rows]]] = True
-    return alone
+def is_splat(names: Collection[str]) -> bool:
+    """Whether a PLY with properties of these names holds Gaussians."""
+    needed = {*"xyz", *_numbered("f_dc", 3), "opacity", *_numbered("scale", 3)}
+    return needed.union(_numbered("rot", 4)) <= set(names)
 
 
-def _photographs(memory: SpatialMemory) -> Cameras:
-    """The cameras of the observed views."""
-    return concatenate([view.camera for view in memory.views.photographed])
+def read_splat_ply(path: Path) -> Splats:
+    """The Gaussians of a file; harmonics above degree 2 and values that are none are left out."""
+    rows = read_ply(path)
+    names = rows.dtype.names or ()
+    if not is_splat(names):
+        raise MemoryFileError(f"{path}: a PLY without Gaussians; expected f_dc_0, scale_0, rot_0")
+
+    def columns(of: Sequence[str]) -> NDArray[np.float32]:
+        return np.stack([rows[name].astype(np.float32) for name in of], axis=1)
+
+    values = np.zeros((len(rows), VALUES), np.float32)
+    values[:, :LOG_SCALE] = columns("xyz")
+    values[:, LOG_SCALE:QUATERNION] = columns(_numbered("scale", 3))
+    values[:, QUATERNION:LOGIT] = columns(_numbered("rot", 4))
+    values[:, LOGIT] = rows["opacity"]
+    values[:, SH : SH + 3] = columns(_numbered("f_dc", 3))
+    rest = [name for name in _numbered("f_rest", len(names)) if name in names]
+    if rest and len(rest) % 3 == 0:
+        kept = columns(rest).reshape(len(rows), 3, -1).transpose(0, 2, 1)
+        kept = kept.reshape(len(rows), -1)[:, : VALUES - SH - 3]
+        values[:, SH + 3 : SH + 3 + kept.shape[1]] = kept
+    values = values[np.isfinite(values).all(axis=1) & values[:, QUATERNION:LOGIT].any(axis=1)]
+    return Splats(values, _origin(path), len(values), 0, np.zeros(len(values), np.int32))
 
 
-def of_points(
-    source: Source, options: ExportOptions, *, among: NDArray[np.bool_] | None = None
-) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """Spherical Gaussians of a memory's points, one for each voxel.
+def _origin(path: Path) -> NDArray[np.float64]:
+    """(3,) that positions count from, as a comment says it; zero without one."""
+    with path.open("rb") as file:
+        for line in file:
+            words = line.split()
+            if words[:2] == [b"comment", b"origin"] and len(words) == 5:
+                try:
+                    return np.array([float(word) for word in words[2:]])
+                except ValueError:
+                    break
+            if words[:1] == [b"end_header"]:
+                break
+    return np.zeros(3)
 
-    Their size follows from the distance between points, their opacity from confidence.
 
-    Returns:
-        (N, VALUES) float32 with the world's axes, positions relative to the memory's origin; and
-        (N,) int32, the round of each point.
-    """
-    memory = source.memory
-    points = source.points(options, among=among)
-    columns = memory.columns
-    # The next point is at least about a voxel's edge away: each voxel has one.
-    above = levels_above(columns.level[points.rows], points.edge / memory.voxel)
-    edges = np.ldexp(points.edge, above)
-    apart = np.maximum(columns.spacing[points.rows], edges)
-    local = points.positions - memory.frame.origin
-    gaussians = Gaussians.at(
-        local, points.colors, sizes=SPREAD * apart, frame=LocalFrame.at(memory.frame.origin)
-    )
-    confidence = memory.confidence[points.rows]
-    share = confidence / (confidence + HALFWAY)
-    opacity = LEAST_OPACITY + (MOST_OPACITY - LEAST_OPACITY) * share
-    gaussians.values[:, LOGIT] = np.log(opacity / (1 - opacity))
-    return gaussians.values, columns.round[points.rows].astype(np.int32)
+def _numbered(name: str, count: int) -> tuple[str, ...]:
+    return tuple(f"{name}_{number}" for number in range(count))
+
+
+def write_spz(source: ExportSource, path: Path, options: ExportOptions) -> str:
+    """Write the Gaussians."""
+    splats = source.splats(options)
+    data, fractional = spz_stream(splats)
+    with replaced_when_written(path) as temporary:
+        # Without a time, so that equal scenes give equal files.
+        temporary.write_bytes(gzip.compress(data, mtime=0))
+    return f"{splats.summary()} in {path}, positions in steps of {2.0**-fractional:.3g}"
+
+
+def spz_stream(splats: Splats) -> tuple[bytes, int]:
+    """The stream before gzip, and how many bits of a position lie behind the point."""
+    values = turned(splats.values, TO_RUB)
+    one = replace(splats, values=values)
+    reach = float(np.abs(values[:, :LOG_SCALE]).max())
+    # As fine as the smallest Gaussians ask for and the farthest position allows.
+    size = float(np.exp(np.quantile(one.log_scales.min(axis=1), SMALLEST)))
+    wanted = int(np.ceil(np.log2(STEPS_PER_SIZE / size)))
+    whole = int(np.floor(np.log2(max(reach, 1e-30)))) + 1
+    fractional = int(np.clip(min(wanted, BITS - 2 - whole), 0, MOST_FRACTIONAL))
+    degree = {1: 0, 4: 1, 9: 2}[one.harmonics.shape[1]]
+    header = HEADER.pack(MAGIC, VERSION, len(one), degree, fractional, 0, 0)
+    fixed = np.rint(one.positions.astype(np.float64) * 2**fractional).astype("<i4")
+    parts = [
+        fixed.view(np.uint8).reshape(len(one), 3, 4)[:, :, :3],
+        _byte(255 / (1 + np.exp(-one.logits.astype(np.float64)))),
+        _byte(255 * (COLOR * one.harmonics[:, 0] + 0.5)),
+        _byte(SCALE * (one.log_scales + SHIFT)),
+        _smallest_three(one.quaternions),
+        _harmonics(one.harmonics[:, 1:]),
+    ]
+    return header + b"".join(np.ascontiguousarray(part).tobytes() for part in parts), fractional
+
+
+def read_spz(path: Path) -> Splats:
+    """The Gaussians of a file, with the axes of a PLY; harmonics above degree 2 are left out."""
+    try:
+        packed = read_bytes(path)
+        data = unpack_gzip(packed, MOST_RATIO * len(packed) + MOST_BYTES)
+        magic, version, count, degree, fractional, _, _ = HEADER.unpack_from(data)
+    except (OSError, ValueError, struct.error) as error:
+        raise MemoryFileError(
+            f"{path}: no SPZ of version 2 or 3 ({error}); expected a gzip stream"
+        ) from None
+    if magic != MAGIC or version not in (2, 3) or degree > 3:
+        raise MemoryFileError(
+            f"{path}: SPZ version {version}, harmonics of degree {degree}; expected version 2 or "
+            "3, degree 3 at most"
+        )
+    if not count:
+        raise MemoryFileError(f"{path}: no Gaussians; expected some")
+    terms = (degree + 1) ** 2 - 1
+    lengths = [9, 1, 3, 3, 3 if version == 2 else 4, 3 * terms]
+    bytes_ = np.frombuffer(data, np.uint8, offset=HEADER.size)
+    if len(bytes_) != count * sum(lengths):
+        raise MemoryFileError(
+            f"{path}: {len(bytes_)} bytes of Gaussians; its header says {count} of {sum(lengths)}"
+        )
+    parts = np.split(bytes_, np.cumsum(lengths)[:-1] * count)
+    places, opacity, color, size, turns, rest = (part.reshape(count, -1) for part in parts)
+    values = np.zeros((count, VALUES), np.float32)
+    padded = np.zeros((count, 3, 4), np.uint8)
+    # Above the byte that is not there, so that the sign is kept.
+    padded[:, :, 1:] = places.reshape(count, 3, 3)
+    fixed = padded.reshape(count, -1).view("<i4") >> 8
+    values[:, :LOG_SCALE] = fixed / 2.0**fractional
+    values[:, LOG_SCALE:QUATERNION] = size / SCALE - SHIFT
+    values[:, QUATERNION:LOGIT] = _first_three(turns) if version == 2 else _from_smallest(turns)
+    share = np.clip(opacity[:, 0] / 255, LEAST, 1 - LEAST)
+    values[:, LOGIT] = np.log(share / (1 - share))
+    values[:, SH : SH + 3] = (color / 255 - 0.5) / COLOR
+    kept = (rest.astype(np.float32) - 128) / 128
+    kept = kept[:, : VALUES - SH - 3]
+    values[:, SH + 3 : SH + 3 + kept.shape[1]] = kept
+    rounds = np.zeros(count, np.int32)
+    return Splats(turned(values, TO_RUB), np.zeros(3), count, 0, rounds)
+
+
+def _first_three(turns: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """(N, 4) w, x, y, z of version 2's (N, 3) bytes: x, y and z of quaternions with w >= 0."""
+    xyz = turns / 127.5 - 1
+    w = np.sqrt(np.maximum(1 - np.square(xyz).sum(axis=1, keepdims=True), 0))
+    return np.concatenate([w, xyz], axis=1)
+
+
+def _from_smallest(turns: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """(N, 4) w, x, y, z: the inverse of ``_smallest_three``."""
+    word = np.ascontiguousarray(turns).view("<u4")[:, 0]
+    largest = word >> 30
+    q = np.zeros((len(word), 4))
+    for axis in (3, 2, 1, 0):
+        stored = largest != axis
+        size = (word & COMPONENT) * (LARGEST / COMPONENT)
+        q[:, axis] = np.where(stored, np.where(word >> 9 & 1, -size, size), 0)
+        word = np.where(stored, word >> 10, word)
+    rest = np.sqrt(np.maximum(1 - np.square(q).sum(axis=1), 0))
+    np.put_along_axis(q, largest[:, None].astype(np.int64), rest[:, None], axis=1)
+    return np.roll(q, 1, axis=1)
+
+
+def _byte(values: NDArray[np.floating]) -> NDArray[np.uint8]:
+    return np.clip(np.rint(values), 0, 255).astype(np.uint8)
+
+
+def _smallest_three(quaternions: NDArray[np.float32]) -> NDArray[np.uint32]:
+    """(N,) from w, x, y, z: two bits say which of x, y, z, w is largest, ten each the others."""
+    q = np.roll(quaternions.astype(np.float64), -1, axis=1)
+    largest = np.abs(q).argmax(axis=1)
+    q = q * np.where(np.take_along_axis(q, largest[:, None], axis=1) < 0, -1, 1)
+    size = np.clip(np.rint(COMPONENT * np.abs(q) / LARGEST), 0, COMPONENT).astype(np.uint32)
+    ten_bits = size | (q < 0).astype(np.uint32) << 9
+    word = largest.astype(np.uint32)
+    for axis in range(4):
+        word = np.where(largest == axis, word, word << 10 | ten_bits[:, axis])
+    return word.astype("<u4")
+
+
+def _harmonics(coefficients: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """(N, H, 3) bytes; low bits that do not count are zero for gzip's sake."""
+    degree_one, above = (2.0 ** (8 - bits) for bits in HARMONIC_BITS)
+    steps = np.where(np.arange(coefficients.shape[1]) < 3, degree_one, above)[None, :, None]
+    return _byte(np.rint((128 * coefficients + 128) / steps) * steps)

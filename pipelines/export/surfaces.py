@@ -58,10 +58,7 @@ def tsdf_mesh(
 ) -> o3d.t.geometry.TriangleMesh:
     """Integrate the memory's depth, rendered from its own views, into a TSDF, and mesh it.
 
-    Args:
-        memory: with at least one view.
-        voxel: edge, scene units.
-        observed: leave out generated points and views.
+    ``voxel`` is the edge, scene units; ``observed`` leaves out generated points and views.
     """
     import open3d as o3d
 
@@ -165,12 +162,8 @@ def poisson_mesh(
 ) -> o3d.t.geometry.TriangleMesh:
     """Screened Poisson reconstruction of the memory's points, cut off where there are none.
 
-    Normals are those of the nearest points, turned to the view that saw the point.
-
-    Args:
-        memory: with at least one view.
-        voxel: edge of the finest cells, scene units.
-        observed: leave out what a completer made.
+    Normals are those of the nearest points, turned to the view that saw the point. ``voxel`` is
+    the edge of the finest cells, scene units; ``observed`` leaves out what a completer made.
     """
     import open3d as o3d
 

@@ -42,15 +42,10 @@ SHARPEN = 4
 
 @dataclass(frozen=True, eq=False)
 class Texture:
-    """A texture and the triangles' places in it.
+    """A texture and the triangles' places in it."""
 
-    Attributes:
-        corners: (F, 3, 2) float64 x and y, texels from the texture's upper left corner.
-        image: (S, S, 3) uint8.
-    """
-
-    corners: NDArray[np.float64]
-    image: NDArray[np.uint8]
+    corners: NDArray[np.float64]  # (F, 3, 2) x and y, texels from the upper left corner
+    image: NDArray[np.uint8]  # (S, S, 3)
 
     @property
     def uv(self) -> NDArray[np.float64]:
@@ -58,13 +53,10 @@ class Texture:
         return np.array([0.0, 1.0]) + self.corners / len(self.image) * [1.0, -1.0]
 
 
-def textured(mesh: o3d.t.geometry.TriangleMesh, shots: Iterable[Shot], size: int) -> Texture:
-    """The texture of a mesh from photographs, and from vertex colours where none sees it.
+def texture_of(mesh: o3d.t.geometry.TriangleMesh, shots: Iterable[Shot], size: int) -> Texture:
+    """The texture of a mesh from photographs, and from its vertex colours where none sees it.
 
-    Args:
-        mesh: with vertex colours.
-        shots: cameras in the mesh's frame, and their photographs (H, W, 3) uint8.
-        size: side of the texture, texels.
+    Cameras of the ``shots`` are in the mesh's frame; ``size`` is the texture's side, texels.
     """
     vertices = mesh.vertex.positions.numpy().astype(np.float64)
     faces = mesh.triangle.indices.numpy()

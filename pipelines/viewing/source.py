@@ -22,9 +22,8 @@ from gvtools.ply import read_header
 from gvtools.runs.layout import RECORD
 from gvtools.runs.memory_file import load_memory
 from gvtools.runs.run import Run, count_rounds, load_growing_run
-from pipelines.export import splat, spz
-from pipelines.export.source import ExportOptions, Source
-from pipelines.export.splats import Splats, splats_of
+from pipelines.export.source import ExportOptions, ExportSource, Splats
+from pipelines.export.splats import is_splat, read_splat_ply, read_spz
 from pipelines.viewing.readers import GREY, load_mesh, read_usd
 from viz.viewer.run_view import (
     MESH,
@@ -92,9 +91,9 @@ class ViewSource:
 
         def gaussians_of(most: int) -> ShownGaussians:
             """Fitted Gaussians, which are always whole, and those of so many points at most."""
-            source = Source(self.path, memory)
+            source = ExportSource(self.path, memory)
             fitted = 0 if source.appearance is None else len(source.appearance.gaussians)
-            return _shown(splats_of(source, ExportOptions(max_points=fitted + most)))
+            return _shown(source.splats(ExportOptions(max_points=fitted + most)))
 
         return RunView(
             self.path, memory, reports, cameras_of(memory, reports), self._frames, planned,
@@ -170,7 +169,7 @@ def _open_ply(path: Path) -> RunView | None:
     if header.holds("face"):
         return _open_mesh(path)
     names = {name for element in header.elements for name, _ in element.columns}
-    return _splat_view(path, splat.read(path)) if splat.is_splat(names) else None
+    return _splat_view(path, read_splat_ply(path)) if is_splat(names) else None
 
 
 def _open_mesh(path: Path) -> RunView:
@@ -236,7 +235,7 @@ def _memory(path: Path, positions: NDArray[Any], colors: NDArray[Any] | None) ->
 
 OPENERS: Mapping[str, Callable[[Path], RunView | None]] = {
     ".ply": _open_ply,
-    ".spz": lambda path: _splat_view(path, spz.read(path)),
+    ".spz": lambda path: _splat_view(path, read_spz(path)),
     **dict.fromkeys((".glb", ".obj"), _open_mesh),
     **dict.fromkeys((".las", ".laz"), _open_las),
     **dict.fromkeys((".usd", ".usda", ".usdc"), lambda path: _points_view(path, *read_usd(path))),

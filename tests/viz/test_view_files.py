@@ -21,7 +21,7 @@ from reference_gaussians import rotations
 from gvtools.errors import MemoryFileError, OptionError
 from gvtools.memory.thinning import thinned
 from pipelines.cli import main
-from pipelines.export import splat, spz
+from pipelines.export.splats import read_splat_ply, read_spz
 from pipelines.viewing.source import ViewSource
 from viz.viewer.render import chosen_camera
 from viz.viewer.run_view import MESH, POINTS, RENDERED, SPLATS, TARGET
@@ -117,7 +117,7 @@ def test_spz_that_unpacks_to_more_than_it_can_hold_is_refused(tmp_path):
     file = tmp_path / "a.spz"
     file.write_bytes(gzip.compress(header + bytes(20_000_000)))
     with pytest.raises(MemoryFileError, match="unpack to more"):
-        spz.read(file)
+        read_spz(file)
 
 
 def write_glb(path: Path, tree: dict, body: bytes) -> Path:
@@ -176,7 +176,7 @@ def test_spz_is_read_as_gsply_reads_it(tmp_path, version):
     header = struct.pack("<IIIBBBB", 0x5053474E, version, count, degree, 12, 0, 0)
     file = tmp_path / "a.spz"
     file.write_bytes(gzip.compress(header + b"".join(part.tobytes() for part in data)))
-    ours, plain = spz.read(file), gsply.read_spz(file)
+    ours, plain = read_spz(file), gsply.read_spz(file)
     turn = np.array([1, -1, -1])
     np.testing.assert_allclose(ours.positions * turn, plain.means, atol=1e-4)
     np.testing.assert_allclose(ours.log_scales, plain.scales, atol=1e-5)
@@ -196,7 +196,7 @@ def test_a_splat_file_counted_from_an_origin_lies_in_the_world(tmp_path, exporte
     head, end, body = file.read_bytes().partition(b"end_header\n")
     moved = tmp_path / "moved.ply"
     moved.write_bytes(head + b"comment origin 431000.0 5650000.0 120.5\n" + end + body)
-    near, far = splat.read(file), splat.read(moved)
+    near, far = read_splat_ply(file), read_splat_ply(moved)
     assert far.origin.tolist() == [431000.0, 5650000.0, 120.5]
     np.testing.assert_array_equal(near.values, far.values)
 
@@ -256,7 +256,7 @@ def test_a_runs_gaussians_are_those_of_its_export(run, exported):
     assert shown.looks == (POINTS, SPLATS, RENDERED)
     assert shown.gaussians_of is not None
     gaussians = shown.gaussians_of(10**6)
-    file = splat.read(exported("whole.ply", "splat"))
+    file = read_splat_ply(exported("whole.ply", "splat"))
     np.testing.assert_allclose(gaussians.values, file.values, atol=1e-6)
     fitted = len(run.appearance.gaussians)
     assert not gaussians.rounds[:fitted].any()
@@ -269,7 +269,7 @@ def test_a_runs_gaussians_are_those_of_its_export(run, exported):
 
 def test_a_splat_file_without_what_it_needs_is_refused(exported, tmp_path):
     with pytest.raises(MemoryFileError, match="without Gaussians"):
-        splat.read(exported("points.ply", "ply"))
+        read_splat_ply(exported("points.ply", "ply"))
 
 
 def test_names_of_files_say_nothing_to_the_file_system(exported):

@@ -13,7 +13,7 @@ from export_runs import export_run
 from gvtools.errors import DegenerateError, OptionError
 from gvtools.memory.spatial_memory import SpatialMemory
 from pipelines.export import surfaces
-from pipelines.export.simplify import simplified
+from pipelines.export.mesh import simplify
 from pipelines.export.surfaces import tsdf_mesh
 
 trimesh = pytest.importorskip("trimesh")
@@ -123,7 +123,7 @@ def test_observed_leaves_out_generated_views_and_points(scene, bare_run):
 def test_simplified_meshes_keep_number_place_and_colours(scene, bare_run, share):
     mesh = tsdf_mesh(bare_run.memory, bare_run.memory.voxel)
     most = int(share * len(mesh.triangle.indices))
-    fewer = simplified(mesh, most)
+    fewer = simplify(mesh, most)
     assert 0.3 * most < len(fewer.triangle.indices) <= most
     view = scene.views[1]
     depths = [
@@ -142,7 +142,7 @@ def test_triangles_without_area_do_not_stop_the_simplification(bare_run):
     flat = faces[:500].copy()
     flat[:, 2] = flat[:, 1]
     mesh.triangle.indices = o3d.core.Tensor(np.concatenate([faces, flat, faces[:500]]))
-    assert 0 < len(simplified(mesh, 400).triangle.indices) <= 400
+    assert 0 < len(simplify(mesh, 400).triangle.indices) <= 400
 
 
 def test_voxels_that_would_fill_the_memory_are_refused_or_widened(bare_run, tmp_path, monkeypatch):

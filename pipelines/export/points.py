@@ -1,0 +1,180 @@
+"""Point clouds: PLY with all attributes, LAS 1.4 or LAZ, USD, glTF binary.
+
+Positions keep their precision in georeferenced scenes: LAS has whole multiples of a step from an
+offset; USD and glTF have float32 around the middle of the cloud, which the parent's translation, or
+the node's matrix, moves to the input's world frame for readers that compute in double. Axes are the
+input's: glTF calls y up, an input's up is its own affair, and a turned cloud would no longer lie on
+the other exports.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.files import replaced_when_written
+from gvtools.memory.io.ply import export_memory_ply
+from pipelines.export.source import ExportOptions, ExportSource, box_middle
+
+# LAS: point format 7 has colours of 16 bits.
+POINT_FORMAT, VERSION = 7, "1.4"
+# Steps of coordinates in a voxel, at least, and the largest number of them.
+STEPS_PER_VOXEL, MOST_STEPS = 10, 2**31 - 1
+# 8 bits to 16: 255 becomes 65535.
+TO_16_BITS = 257
+# Viewers of USD and glTF are slow beyond it.
+MAX_POINTS = 2_000_000
+ROOT, CLOUD = "/gvtools", "/gvtools/memory"
+NODE = "gvtools_memory"
+FRAME = "input world frame, scene units, axes as in the input (not turned to y up)"
+
+
+def write_ply(source: ExportSource, path: Path, options: ExportOptions) -> str:
+    """Write every observation, or one a voxel where a number of points is given."""
+    memory, observed = source.memory, bool(options.observed)
+    points, edge = export_memory_ply(memory, path, max_points=options.max_points, observed=observed)
+    thinned = f", thinned to voxels of {edge:.4g}" if edge else ""
+    return f"{points} of {len(memory)} observations{thinned} in {path}"
+
+
+def write_las(source: ExportSource, path: Path, options: ExportOptions) -> str:
+    """Write one point a voxel; LAS's own flag "synthetic" also says what a completer made."""
+    import laspy
+
+    memory = source.memory
+    points = source.points(options)
+    columns, rows = memory.columns, points.rows
+    header = laspy.LasHeader(point_format=POINT_FORMAT, version=VERSION)
+    header.generating_software = "gvtools"
+    header.offsets = np.round(points.middle)
+    reach = float(np.abs(points.positions - header.offsets).max())
+    # A power of ten, as other software writes it.
+    step = 10.0 ** np.floor(np.log10(memory.voxel / STEPS_PER_VOXEL))
+    while reach / step > MOST_STEPS:
+        step *= 10
+    header.scales = np.full(3, step)
+    header.add_extra_dims(
+        [
+            laspy.ExtraBytesParams("confidence", "f4", "sum over the views that saw it"),
+            laspy.ExtraBytesParams("spacing", "f4", "footprint of a pixel, units"),
+            laspy.ExtraBytesParams("round", "u2", "that it came with"),
+            laspy.ExtraBytesParams("generated", "u1", "1: made by a completer"),
+            laspy.ExtraBytesParams("scanned", "u1", "1: of a scan, no photograph"),
+        ]
+    )
+    cloud = laspy.LasData(header)
+    cloud.x, cloud.y, cloud.z = points.positions.T
+    cloud.red, cloud.green, cloud.blue = points.colors.astype(np.uint16).T * TO_16_BITS
+    cloud.return_number[:] = cloud.number_of_returns[:] = 1
+    cloud.synthetic[:] = columns.generated[rows]
+    for name in ("confidence", "spacing", "round", "generated"):
+        cloud[name] = getattr(columns, name)[rows]
+    cloud["scanned"] = memory.scanned[rows]
+    with replaced_when_written(path) as temporary, temporary.open("wb") as file:
+        cloud.write(file, do_compress=path.suffix.lower() == ".laz")
+    return f"{source.points_summary(points)} in {path}, coordinates in steps of {step:g}"
+
+
+def write_usd(source: ExportSource, path: Path, options: ExportOptions) -> str:
+    """Write one point a voxel as ``UsdGeom.Points``; a scene unit is a metre, as glTF has it."""
+    from pxr import Gf, Sdf, Usd, UsdGeom, Vt
+
+    memory = source.memory
+    points = source.points(options, most=MAX_POINTS)
+    columns, rows = memory.columns, points.rows
+    center = points.middle
+    stage = Usd.Stage.CreateInMemory()
+    # Where a stage does not say, its unit is a centimetre: rooms would open far too small.
+    UsdGeom.SetStageMetersPerUnit(stage, UsdGeom.LinearUnits.meters)
+    root = UsdGeom.Xform.Define(stage, ROOT)
+    root.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*center.tolist()))
+    stage.SetDefaultPrim(root.GetPrim())
+    stage.SetMetadata("comment", "gvtools memory, input world frame and axes, scene units")
+    cloud = UsdGeom.Points.Define(stage, CLOUD)
+    local = (points.positions - center).astype(np.float32)
+    widths = np.maximum(columns.spacing[rows], np.float32(points.edge))
+    cloud.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(local))
+    cloud.CreateWidthsAttr(Vt.FloatArray.FromNumpy(widths))
+    cloud.SetWidthsInterpolation(UsdGeom.Tokens.vertex)
+    corners = np.stack([local.min(axis=0), local.max(axis=0)]).astype(np.float32)
+    cloud.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(corners))
+    primvars = UsdGeom.PrimvarsAPI(cloud)
+    colors = _linear(points.colors)
+    for name, kind, values in (
+        ("displayColor", Sdf.ValueTypeNames.Color3fArray, Vt.Vec3fArray.FromNumpy(colors)),
+        ("confidence", Sdf.ValueTypeNames.FloatArray,
+         Vt.FloatArray.FromNumpy(columns.confidence[rows])),
+        ("round", Sdf.ValueTypeNames.IntArray,
+         Vt.IntArray.FromNumpy(columns.round[rows].astype(np.int32))),
+        ("generated", Sdf.ValueTypeNames.IntArray,
+         Vt.IntArray.FromNumpy(columns.generated[rows].astype(np.int32))),
+        ("scanned", Sdf.ValueTypeNames.IntArray,
+         Vt.IntArray.FromNumpy(memory.scanned[rows].astype(np.int32))),
+    ):  # fmt: skip
+        primvars.CreatePrimvar(name, kind, UsdGeom.Tokens.vertex).Set(values)
+    with replaced_when_written(path, suffix=path.suffix.lower()) as temporary:
+        if not stage.GetRootLayer().Export(str(temporary)):
+            raise OSError("USD wrote no file")
+    return f"{source.points_summary(points)} in {path}, in the input's axes"
+
+
+def _linear(colors: np.ndarray) -> np.ndarray:
+    """Bytes of sRGB as the linear light that USD's colours are, (N, 3) float32."""
+    share = np.arange(256) / 255
+    table = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+    return table.astype(np.float32)[colors]
+
+
+def write_glb(source: ExportSource, path: Path, options: ExportOptions) -> str:
+    """Write one point a voxel with its colour; the node's extras tell origin and frame."""
+    import trimesh
+
+    points = source.points(options, most=MAX_POINTS)
+    write_glb_scene(
+        lambda positions: trimesh.PointCloud(positions, colors=points.colors),
+        points.positions,
+        path,
+        node=NODE,
+        extras={"voxel": points.edge},
+    )
+    return f"{source.points_summary(points)} in {path}, in the input's axes"
+
+
+def write_glb_scene(
+    geometry: Callable[[NDArray[np.float32]], Any],
+    positions: NDArray[np.float64],
+    path: Path,
+    *,
+    node: str,
+    extras: Mapping[str, Any] | None = None,
+) -> None:
+    """Write a scene of one node.
+
+    Args:
+        geometry: makes trimesh's geometry of positions (N, 3) around the node's origin.
+        positions: (N, 3) world frame, scene units.
+        path: the file.
+        node: its name.
+        extras: what the node says beside its origin and frame.
+    """
+    import trimesh
+
+    center = box_middle(positions)
+    move = np.eye(4)
+    move[:3, 3] = center
+    scene = trimesh.Scene()
+    scene.add_geometry(
+        geometry((positions - center).astype(np.float32)),
+        node_name=node,
+        geom_name=node,
+        transform=move,
+        metadata={"origin": center.tolist(), "frame": FRAME, **(extras or {})},
+    )
+    buffer = io.BytesIO(scene.export(file_type="glb"))
+    with replaced_when_written(path) as temporary:
+        temporary.write_bytes(buffer.getbuffer())
