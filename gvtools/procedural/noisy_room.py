@@ -138,12 +138,7 @@ MILLIMETRES = 1e-3
 
 
 def write_noisy_room(
-    folder: Path,
-    *,
-    seed: int = 0,
-    views: int = 20,
-    width: int = 480,
-    height: int = 360,
+    folder: Path, *, seed: int = 0, views: int = 20, width: int = 480, height: int = 360
 ) -> RoomSample:
     """Write the recording of a seed's room; a folder that holds it already is left as it is.
 

@@ -48,12 +48,7 @@ class RoomSample:
 
 
 def write_room(
-    folder: Path,
-    *,
-    seed: int = 0,
-    views: int = 20,
-    width: int = 480,
-    height: int = 360,
+    folder: Path, *, seed: int = 0, views: int = 20, width: int = 480, height: int = 360
 ) -> RoomSample:
     """Write the room of a seed; a folder that holds it already is left as it is.
 

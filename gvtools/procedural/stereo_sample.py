@@ -80,11 +80,7 @@ def motorcycle_cameras(width: int, height: int) -> Cameras:
     pose = np.repeat(np.eye(4)[None], 2, axis=0)
     pose[1, 0, 3] = -BASELINE
     return Cameras(
-        np.stack([left, right]),
-        pose,
-        np.full(2, width),
-        np.full(2, height),
-        (LEFT, RIGHT),
+        np.stack([left, right]), pose, np.full(2, width), np.full(2, height), (LEFT, RIGHT)
     )
 
 

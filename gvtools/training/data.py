@@ -136,10 +136,7 @@ class TrainingSamples:
         if not isinstance(self._train, Mixture):
             return None
         return {
-            source.name: {
-                "share": float(share),
-                "digest": digest(source.samples.describe()),
-            }
+            source.name: {"share": float(share), "digest": digest(source.samples.describe())}
             for source, share in zip(self._train.sources, self._train.shares, strict=True)
         }
 

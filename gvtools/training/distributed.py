@@ -109,8 +109,7 @@ class Processes:
 def join_processes(device: str = "auto") -> Iterator[Processes]:
     """The processes of this training; joins the group that ``torchrun`` describes.
 
-    Args:
-        device: "auto", "cpu" or "cuda".
+    ``device``: "auto", "cpu" or "cuda".
     """
     if device == "cuda" and not torch.cuda.is_available():
         raise OptionError("device cuda, and torch sees no CUDA device here; use cpu")

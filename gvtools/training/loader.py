@@ -134,10 +134,9 @@ def batches(
 ) -> Generator[TrainingBatch, None, None]:
     """Batches of the samples with these numbers; closing the iterator ends the workers.
 
-    Args:
-        data: the data set; has to be picklable when there are workers.
-        parts: numbers of each batch's samples, without end.
-        workers: processes that make samples; 0 makes them when they are asked for.
+    ``data``: the data set; has to be picklable when there are workers. ``parts``: numbers of each
+    batch's samples, without end. ``workers``: processes that make samples; 0 makes them when they
+    are asked for.
     """
     if not workers:
         for part in parts:

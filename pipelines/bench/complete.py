@@ -155,10 +155,7 @@ class TimedPass:
         start = self.now()
         with self.precision():
             self.model.generate(
-                self.batch,
-                bounds=self.bounds,
-                cascade_bounds=self.cascade_bounds,
-                video=self.video,
+                self.batch, bounds=self.bounds, cascade_bounds=self.cascade_bounds, video=self.video
             )
         return self.now() - start
 

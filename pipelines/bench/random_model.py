@@ -11,11 +11,7 @@ from torch import Tensor, nn
 from gvtools.completers.geoverse.conditioning import ViewBatch
 from gvtools.completers.geoverse.config import GeoVerseConfig
 from gvtools.completers.geoverse.model import GeoVerse
-from gvtools.completers.geoverse.video_prior import (
-    VideoFeatures,
-    VideoPrior,
-    VideoPriorConfig,
-)
+from gvtools.completers.geoverse.video_prior import VideoFeatures, VideoPrior, VideoPriorConfig
 from gvtools.completers.geoverse.wan import dtype_of, empty_network
 
 # Of random weights: small enough for the activations of deep networks to stay finite.

@@ -113,9 +113,7 @@ def _checked(args: argparse.Namespace) -> RunSettings:
 def context_of(scene: Scene, config: RunSettings, folder: Path, *, console: Console) -> Scene:
     """A scene's context with the depth and the poses that a run without a fit would take.
 
-    Args:
-        config: how a run would read it; its targets are not looked at.
-        folder: where computed depth goes.
+    Targets of ``config`` are not looked at; computed depth goes into ``folder``.
     """
     from gvtools.runs.depth_cache import DepthCache
     from gvtools.settings import with_values

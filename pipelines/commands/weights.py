@@ -100,11 +100,7 @@ def _pack(args: argparse.Namespace, console: Console) -> None:
 
 
 def _check(args: argparse.Namespace, console: Console) -> None:
-    from gvtools.completers.geoverse.weights import (
-        check_folder,
-        check_is_folder,
-        config_of,
-    )
+    from gvtools.completers.geoverse.weights import check_folder, check_is_folder, config_of
     from gvtools.files import write_json
     from pipelines.weights import print_parts
 

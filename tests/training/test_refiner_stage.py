@@ -76,9 +76,7 @@ def test_errors_are_of_holes_alone():
 @pytest.fixture(scope="module")
 def stage() -> RefinerStage:
     configuration = micro.config(
-        hints={"fill": "surfaces"},
-        composition="correction",
-        refiner=RefinerConfig(widths=(8, 16)),
+        hints={"fill": "surfaces"}, composition="correction", refiner=RefinerConfig(widths=(8, 16))
     )
     return RefinerStage(micro.model(configuration), RefinerStageOptions())
 

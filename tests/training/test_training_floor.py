@@ -9,11 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from gvtools.completers.geoverse.flow import (
-    interpolate,
-    velocity_from_clean,
-    velocity_target,
-)
+from gvtools.completers.geoverse.flow import interpolate, velocity_from_clean, velocity_target
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.training.batch import Draws
 from gvtools.training.data import TrainingSamples

@@ -11,11 +11,7 @@ import pytest
 from gvtools.errors import OptionError
 from gvtools.settings import with_texts
 from gvtools.training.data import TrainingSamples
-from gvtools.training.options import (
-    EncoderStageOptions,
-    OptimizerOptions,
-    shipped_or_read,
-)
+from gvtools.training.options import EncoderStageOptions, OptimizerOptions, shipped_or_read
 
 
 def test_the_rate_rises_and_falls_once_a_cycle():
@@ -54,10 +50,7 @@ def test_the_faults_of_observations_are_settings():
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
-        (
-            "encoder.optimizer.cycles=9999",
-            "cycles 9999; expected at most optimizer.steps",
-        ),
+        ("encoder.optimizer.cycles=9999", "cycles 9999; expected at most optimizer.steps"),
         ("data.cache=here data.pool=0", "data.cache needs data.pool"),
         ("heads.ray=0 heads.rgb=0 heads.depth=0", "ray, rgb and depth are all 0"),
         ("heads.origin.deep=3", "heads.origin is a value without settings below it"),

@@ -77,10 +77,7 @@ def test_attention_costs_four_flops_a_pair_and_channel(monkeypatch):
             layer(torch.randn(2, 7, 30))
 
     monkeypatch.setattr(one.model, "generate", generate)
-    assert one.flops() == {
-        stages.HINTS: 4 * 2 * 3 * 11 * 17 * 8,
-        stages.DECODE: 2 * 14 * 30 * 50,
-    }
+    assert one.flops() == {stages.HINTS: 4 * 2 * 3 * 11 * 17 * 8, stages.DECODE: 2 * 14 * 30 * 50}
 
 
 def test_the_control_branch_is_part_of_a_step():

@@ -124,10 +124,7 @@ def test_the_tables_and_the_figures(tmp_path):
 
 def test_what_fits_a_card():
     figures = {
-        "inference": [
-            {"model": "M", "total_bytes": 3e9},
-            {"model": "M", "total_bytes": 7e9},
-        ],
+        "inference": [{"model": "M", "total_bytes": 3e9}, {"model": "M", "total_bytes": 7e9}],
         "training": [
             {"model": "M", "stage": "S", "recompute": False, "total_bytes": 30e9},
             {"model": "M", "stage": "S", "recompute": True, "total_bytes": 9e9},
