@@ -1,4 +1,4 @@
-"""Settings of training."""
+"""Settings of training, and its log."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from gvtools.errors import OptionError
 from gvtools.settings import with_texts
 from gvtools.training.data import TrainingSamples
 from gvtools.training.options import EncoderStageOptions, OptimizerOptions, shipped_or_read
+from gvtools.training.records import TrainingLog, read_log
 
 
 def test_the_rate_rises_and_falls_once_a_cycle():
@@ -77,3 +78,15 @@ def test_a_stage_is_left_out_and_taken_back(tmp_path):
     assert without.encoder is None and shipped_or_read(str(path)) == (without, tmp_path)
     path.write_text(json.dumps({**without.to_dict(), "encoder": {}}))
     assert shipped_or_read(str(path))[0].encoder == EncoderStageOptions()
+
+
+def test_a_resumed_training_takes_back_the_steps_that_it_repeats(tmp_path):
+    log = TrainingLog(tmp_path)
+    for step in (20, 40, 60):
+        log.write(step, {"loss": float(step)})
+    # The last state was saved after step 40; step 60 is made again, and comes out otherwise.
+    again = TrainingLog(tmp_path, step=40)
+    again.write(60, {"loss": -60.0})
+    (tmp_path / "log.jsonl").open("a").write('{"step": 80, "lo')  # killed while writing
+    records = [(record["step"], record["loss"]) for record in read_log(tmp_path)]
+    assert records == [(20, 20.0), (40, 40.0), (60, -60.0)]
