@@ -1,4 +1,4 @@
-"""How kernels are compiled, and run in threads."""
+"""Compilation of kernels, and their execution in threads."""
 
 from __future__ import annotations
 

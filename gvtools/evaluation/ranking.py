@@ -1,4 +1,4 @@
-"""What a measurement needs to be ranked beside published figures.
+"""Conditions under which a measurement is ranked beside published figures.
 
 A measured row joins the ranking figure by figure, where its data set, its scenes, its resolution,
 its views and the figure's definition are those of the source. What the source leaves open and the

@@ -1,4 +1,4 @@
-"""Which points would stand in space that an observed ray saw to be free."""
+"""Free space: points that would stand where an observed ray passed."""
 
 from __future__ import annotations
 

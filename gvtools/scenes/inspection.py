@@ -1,4 +1,4 @@
-"""What a run would read of a scene, and what is wrong with it."""
+"""Inspection of a scene: what a run would read of it, and what is wrong with it."""
 
 from __future__ import annotations
 

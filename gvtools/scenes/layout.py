@@ -1,4 +1,4 @@
-"""How posed pictures lie on disk: an RGB-D folder, a phone's export, or a data set's download."""
+"""Layouts of posed pictures on disk: RGB-D folders, phones' exports, downloads of data sets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a run reads: views with cameras and lazily loaded pictures, sparse points, findings."""
+"""Scenes: views with cameras and lazily loaded pictures, sparse points, findings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What settings mean, printed from the models: for ``--help-settings`` and as Markdown."""
+"""Documentation of settings from their models: for ``--help-settings`` and as Markdown."""
 
 from __future__ import annotations
 

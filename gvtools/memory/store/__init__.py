@@ -1,1 +1,1 @@
-"""What the memory consists of: columns of observations, source views, the voxel index."""
+"""Store of the memory: columns of observations, source views, the voxel index."""

@@ -1,4 +1,4 @@
-"""Which voxel holds which observations: a two-level hash that never looks at the whole memory.
+"""Voxel index: a two-level hash of observations that never looks at the whole memory.
 
 Space is cut into blocks of 16³ voxels of one edge; blocks of voxels twice, four times, ... as wide
 lie beside them. A hash of block coordinates and level gives a block number; each block owns a small
