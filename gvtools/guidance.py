@@ -18,25 +18,15 @@ IMAGES = ("rgb", "depth", "valid", "confidence", "generated", "scanned")
 
 @dataclass(frozen=True, eq=False)
 class Guidance:
-    """Memory projected into V cameras of one image size.
-
-    Attributes:
-        cameras: the V target cameras.
-        rgb: (V, H, W, 3) float32 in [0, 1]; 0 where not valid.
-        depth: (V, H, W) float32 z-depth, scene units; 0 where not valid.
-        valid: (V, H, W) bool, True where memory supports the pixel.
-        confidence: (V, H, W) float32 >= 0; 0 where not valid.
-        generated: (V, H, W) bool, True where the support is generated content.
-        scanned: (V, H, W) bool, True where it is a scan's alone, which no photograph saw; None is
-            nowhere.
-    """
+    """Memory projected into V cameras of one image size."""
 
     cameras: Cameras
-    rgb: NDArray[np.float32]
-    depth: NDArray[np.float32]
-    valid: NDArray[np.bool_]
-    confidence: NDArray[np.float32]
-    generated: NDArray[np.bool_]
+    rgb: NDArray[np.float32]  # (V, H, W, 3) in [0, 1]; 0 where not valid
+    depth: NDArray[np.float32]  # (V, H, W) z-depth, scene units; 0 where not valid
+    valid: NDArray[np.bool_]  # (V, H, W) where memory supports the pixel
+    confidence: NDArray[np.float32]  # (V, H, W) >= 0; 0 where not valid
+    generated: NDArray[np.bool_]  # (V, H, W) where the support is generated content
+    # (V, H, W) where it is a scan's alone, which no photograph saw; None is nowhere.
     scanned: NDArray[np.bool_] = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:

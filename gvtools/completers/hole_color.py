@@ -58,15 +58,8 @@ def fill_color(
     if not len(holes):
         return filled
     result = filled.astype(np.float64)
-    _seed_colors(
-        result,
-        holes,
-        surface.inverse,
-        surface.hits,
-        surface.planes,
-        surface.plane_of.ravel(),
-        DIRECTIONS,
-    )
+    flat = surface.plane_of.ravel()
+    _seed_colors(result, holes, surface.inverse, surface.hits, surface.planes, flat, DIRECTIONS)
     hint, weight = np.zeros((1, 1, 3), np.float32), np.zeros((1, 1), np.float32)
     if evidence is not None:
         hint, weight = evidence

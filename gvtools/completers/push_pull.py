@@ -28,13 +28,11 @@ class Filled:
     # none was looked at.
     looked_up: NDArray[np.float32] | None = None
 
-    def rows(self, index: Sequence[int]) -> Filled:
+    def select(self, index: Sequence[int]) -> Filled:
         """Some views, in that order."""
         rows = list(index)
-        confidence, looked_up = (
-            None if values is None else values[rows] for values in (self.confidence, self.looked_up)
-        )
-        return Filled(self.rgb[rows], self.depth[rows], confidence, looked_up)
+        images = {name: values for name, values in vars(self).items() if values is not None}
+        return Filled(**{name: values[rows] for name, values in images.items()})
 
 
 def push_pull(values: Tensor, valid: Tensor) -> Tensor:

@@ -17,7 +17,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gvtools.cameras import Cameras
 from gvtools.completers.base import Completion, ContextView
 from gvtools.completers.inpaint import InpaintCompleter
 from gvtools.completers.push_pull import Filled, push_pull, push_pull_depth
@@ -44,12 +43,8 @@ def surface_fill(
     completion, looked_up = InpaintCompleter().filled(context, guidance)
     known = guidance.valid
     if shared and len(guidance) > 1:
-        known = _shared(context, guidance, completion, looked_up=looked_up)
-    rgb, depth, confidence = (
-        completion.rgb.copy(),
-        completion.depth.copy(),
-        completion.confidence.copy(),
-    )
+        known = _share_fills(context, guidance, completion, looked_up=looked_up)
+    rgb, depth, confidence = completion.rgb, completion.depth, completion.confidence
     holes = ~(depth > 0) & known.any(axis=(1, 2), keepdims=True)
     for index in np.flatnonzero(holes.any(axis=(1, 2))):
         hole = holes[index]
@@ -63,13 +58,13 @@ def surface_fill(
     return Filled(rgb, depth, confidence, looked_up)
 
 
-def _shared(
+def _share_fills(
     context: Sequence[ContextView],
     guidance: Guidance,
     completion: Completion,
     *,
     looked_up: NDArray[np.float32],
-) -> NDArray[np.bool_]:  # (V, H, W) where memory or another view's fill knows
+) -> NDArray[np.bool_]:
     """(V, H, W) where memory or another view's fill knows, the best known view being filled first.
 
     ``completion`` and ``looked_up`` are written into.
@@ -85,17 +80,17 @@ def _shared(
             surer = ~view.valid & carried.valid
             surer &= carried.confidence > SURER * completion.confidence[index]
             if surer.any():
-                view = _with(view, carried, surer)
+                view = _with_carried(view, carried, surer)
                 again, weight = InpaintCompleter().filled(context, view)
                 completion.rgb[index], completion.depth[index] = again.rgb[0], again.depth[0]
                 completion.confidence[index], looked_up[index] = again.confidence[0], weight[0]
                 known[index] = view.valid[0]
         if index != order[-1]:
-            memory = _lifted(memory, view, completion, index=index)
+            memory = _lift(memory, view, completion, index=index)
     return known
 
 
-def _with(view: Guidance, carried: Guidance, where: NDArray[np.bool_]) -> Guidance:
+def _with_carried(view: Guidance, carried: Guidance, where: NDArray[np.bool_]) -> Guidance:
     """A view that knows what is carried there, too."""
     return replace(
         view,
@@ -106,7 +101,7 @@ def _with(view: Guidance, carried: Guidance, where: NDArray[np.bool_]) -> Guidan
     )
 
 
-def _lifted(
+def _lift(
     memory: SpatialMemory | None, view: Guidance, completion: Completion, *, index: int
 ) -> SpatialMemory | None:
     """The memory of the fills, with what this view filled itself."""
@@ -115,9 +110,11 @@ def _lifted(
     if not own.any():
         return memory
     if memory is None:
-        memory = SpatialMemory(
-            _footprint(completion.depth[index], view.cameras), origin=view.cameras.centers[0]
-        )
+        # Voxels of a pixel's edge at the median depth.
+        depth, K = completion.depth[index], view.cameras.K[0]
+        focal = float(np.sqrt(K[0, 0] * K[1, 1]))
+        voxel = float(np.median(depth[depth > 0])) / focal
+        memory = SpatialMemory(voxel, origin=view.cameras.centers[0])
     memory.observe(
         np.rint(np.clip(completion.rgb[index], 0, 1) * 255).astype(np.uint8),
         completion.depth[index],
@@ -129,9 +126,3 @@ def _lifted(
         mask=own,
     )
     return memory
-
-
-def _footprint(depth: NDArray[np.float32], camera: Cameras) -> float:
-    """A pixel's edge at the median depth, scene units."""
-    focal = float(np.sqrt(camera.K[0, 0, 0] * camera.K[0, 1, 1]))
-    return float(np.median(depth[depth > 0])) / focal

@@ -32,6 +32,28 @@ DTYPES = {"float32": torch.float32, "float16": torch.float16, "bfloat16": torch.
 
 # Bytes to a multiple of which torch allocates.
 _ALIGNMENT = 64
+INDEX = ".safetensors.index.json"
+STORED_TYPES = {
+    "F64": torch.float64,
+    "F32": torch.float32,
+    "F16": torch.float16,
+    "BF16": torch.bfloat16,
+    "F8_E4M3": torch.float8_e4m3fn,
+    "F8_E5M2": torch.float8_e5m2,
+    "C64": torch.complex64,
+    "I64": torch.int64,
+    "I32": torch.int32,
+    "I16": torch.int16,
+    "I8": torch.int8,
+    "U8": torch.uint8,
+    "BOOL": torch.bool,
+}
+# The format's own limit of a header, bytes.
+_LARGEST_HEADER = 100_000_000
+_ZIP, _PICKLE = b"PK\x03\x04", b"\x80"
+# The number that torch.save before PyTorch 1.6 pickled first.
+_LEGACY = b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P\x19."
+_PLACEHOLDER = b"version https://git-lfs"
 
 
 @dataclass(frozen=True)
@@ -208,30 +230,6 @@ def _to_store(
             "bfloat16 or float32; nothing is written"
         )
     return stored
-
-
-INDEX = ".safetensors.index.json"
-STORED_TYPES = {
-    "F64": torch.float64,
-    "F32": torch.float32,
-    "F16": torch.float16,
-    "BF16": torch.bfloat16,
-    "F8_E4M3": torch.float8_e4m3fn,
-    "F8_E5M2": torch.float8_e5m2,
-    "C64": torch.complex64,
-    "I64": torch.int64,
-    "I32": torch.int32,
-    "I16": torch.int16,
-    "I8": torch.int8,
-    "U8": torch.uint8,
-    "BOOL": torch.bool,
-}
-# The format's own limit of a header, bytes.
-_LARGEST_HEADER = 100_000_000
-_ZIP, _PICKLE = b"PK\x03\x04", b"\x80"
-# The number that torch.save before PyTorch 1.6 pickled first.
-_LEGACY = b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P\x19."
-_PLACEHOLDER = b"version https://git-lfs"
 
 
 class _Entry(NamedTuple):

@@ -170,7 +170,7 @@ def test_what_one_view_is_surer_of_is_carried_to_the_others(corner):
 def test_memory_stays_as_it_is_and_the_order_of_the_views_does_not_matter(corner):
     known = corner[0]
     fill = surface_fill([], known, shared=True)
-    turned = surface_fill([], known.select([1, 0]), shared=True).rows([1, 0])
+    turned = surface_fill([], known.select([1, 0]), shared=True).select([1, 0])
     for name in ("rgb", "depth", "confidence"):
         values = getattr(fill, name)
         np.testing.assert_array_equal(values, getattr(turned, name))

@@ -182,7 +182,7 @@ class GeoVerseCompleter(Completer):
             for first in range(0, len(incomplete), targets_per_pass):
                 rows = incomplete[first : first + targets_per_pass]
                 part = guidance.select(rows)
-                fill = None if filled is None else filled.rows(range(first, first + len(rows)))
+                fill = None if filled is None else filled.select(range(first, first + len(rows)))
                 chosen = choose_views(
                     context, part.cameras, part.depth if fill is None else fill.depth,
                     count=context_count, selection=self.settings.context_selection,

@@ -107,13 +107,13 @@ class Refiner(nn.Module):
         self.down = nn.ModuleList(
             nn.Conv2d(above, below, 3, stride=2, padding=1) for above, below in pairwise(widths)
         )
-        self.descending = nn.ModuleList(_Block(width) for width in widths)
+        self.descending = nn.ModuleList(_ResidualBlock(width) for width in widths)
         self.whole = nn.Linear(widths[-1], widths[-1])
-        self.deepest = _Block(widths[-1])
+        self.deepest = _ResidualBlock(widths[-1])
         self.up = nn.ModuleList(
             nn.Conv2d(above + below, above, 3, padding=1) for above, below in pairwise(widths)
         )
-        self.ascending = nn.ModuleList(_Block(width) for width in widths[:-1])
+        self.ascending = nn.ModuleList(_ResidualBlock(width) for width in widths[:-1])
         self.leave = nn.Conv2d(widths[0], 1 + GUESSES + 3 + 1, 1)
         # Untrained it changes little.
         bias = torch.zeros(1 + GUESSES + 3 + 1)
@@ -148,19 +148,16 @@ class Refiner(nn.Module):
         return Refinement(share, torch.where(some, rest, 0.0), out[:, -1:])
 
 
-class _Block(nn.Module):
+class _ResidualBlock(nn.Module):
     """Two convolutions beside the identity."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
-        self.layers = nn.Sequential(
-            nn.GroupNorm(GROUPS, width),
-            nn.SiLU(),
-            nn.Conv2d(width, width, 3, padding=1),
-            nn.GroupNorm(GROUPS, width),
-            nn.SiLU(),
-            nn.Conv2d(width, width, 3, padding=1),
-        )
+        layers: list[nn.Module] = []
+        for _ in range(2):
+            conv = nn.Conv2d(width, width, 3, padding=1)
+            layers += [nn.GroupNorm(GROUPS, width), nn.SiLU(), conv]
+        self.layers = nn.Sequential(*layers)
 
     def forward(self, x: Tensor) -> Tensor:
         return x + self.layers(x)
