@@ -119,20 +119,15 @@ def evaluate(
     from gvtools.runs.run import load_run
     from pipelines.console import Console
     from pipelines.scoring.evaluation import evaluate_run
-    from pipelines.scoring.measurement import PARTS
+    from pipelines.scoring.measurement import PARTS, MeasureOptions
 
     unknown = [part for part in parts if part not in PARTS]
     if unknown or not parts:
         raise OptionError(f"parts {tuple(parts)}; expected some of {', '.join(PARTS)}")
     finished = load_run(Path(run)) if isinstance(run, (Path, str)) else run
-    found = evaluate_run(
-        finished,
-        parts=parts,
-        lpips=lpips,
-        no_lpips=None if lpips else "no network was given",
-        seed=seed,
-        console=Console(quiet=quiet),
-    )
+    absent = None if lpips else "no network was given"
+    options = MeasureOptions(parts=parts, lpips=lpips, no_lpips=absent, seed=seed)
+    found = evaluate_run(finished, options, console=Console(quiet=quiet))
     mean = found["images"]["mean"] if "images" in found else {}
     psnr, ssim, perceptual = (mean.get(key, {}).get("mean") for key in ("psnr", "ssim", "lpips"))
     return RunFigures(found["coverage"], psnr, ssim, perceptual, found["views"], found)

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from gvtools.scenes.scene import Scene
     from gvtools.settings import Settings
     from pipelines.console import Console
+    from pipelines.scoring.measurement import MeasureOptions
 
 
 def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
@@ -183,6 +184,27 @@ def open_lpips(args: argparse.Namespace) -> tuple[Lpips | None, str | None]:
         if args.lpips_weights is not None:
             raise
         return None, str(error)
+
+
+def measure_options(args: argparse.Namespace) -> MeasureOptions:
+    """What ``add_measurement_arguments`` and ``add_lpips_arguments`` ask for, with ``--seed``."""
+    from pipelines.scoring.measurement import PARTS, MeasureOptions
+
+    if args.seed < 0:
+        raise OptionError(f"--seed {args.seed}; expected at least 0")
+    parts = tuple(part.strip() for part in args.parts.split(",") if part.strip())
+    if not parts or set(parts) - set(PARTS):
+        raise OptionError(f"--parts {args.parts!r}; expected some of {', '.join(PARTS)}")
+    lpips, no_lpips = open_lpips(args)
+    return MeasureOptions(
+        parts=parts,
+        lpips=lpips,
+        no_lpips=no_lpips,
+        lpips_net=args.lpips_net,
+        matcher=args.matcher,
+        control=not args.no_control,
+        seed=args.seed,
+    )
 
 
 class HelpSettings(argparse.Action):

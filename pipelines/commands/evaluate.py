@@ -11,7 +11,7 @@ from pipelines.commands.arguments import (
     add_lpips_arguments,
     add_measurement_arguments,
     add_scene_arguments,
-    open_lpips,
+    measure_options,
 )
 
 if TYPE_CHECKING:
@@ -75,50 +75,34 @@ def run(args: argparse.Namespace, console: Console) -> None:
     from gvtools.evaluation.published import benchmark_names
     from gvtools.files import write_json
     from pipelines.scoring.evaluation import (
-        EvaluationOptions,
         evaluate_runs,
         load_benchmarks,
         load_runs,
         write_evaluation,
     )
 
-    if args.seed < 0:
-        raise OptionError(f"--seed {args.seed}; expected at least 0")
     shown = benchmark_names() if "all" in args.against else tuple(args.against)
     benchmarks = load_benchmarks(shown, args.data_set)
     if args.project is not None and len(args.runs) > 1:
         raise OptionError("--project: names the project of one run; give one run")
     out = _folder(args)
-    lpips, no_lpips = open_lpips(args)
-    options = EvaluationOptions(
-        name=args.name,
-        parts=parts_of(args.parts),
-        matcher=args.matcher,
-        control=not args.no_control,
-        seed=args.seed,
-        data_set=args.data_set,
-        lpips_net=args.lpips_net,
-        lpips_measured=lpips is not None,
-    )
+    options = measure_options(args)
     paths = args.runs if args.protocol is None else [_run_protocol(args, out, console)]
     runs = load_runs(paths, project=args.project)
-    evaluations = evaluate_runs(runs, options, lpips=lpips, no_lpips=no_lpips, console=console)
+    evaluations = evaluate_runs(runs, options, console=console)
     figures = write_evaluation(
-        runs, evaluations, options, benchmarks=benchmarks, shown=shown, out=out, console=console
+        runs,
+        evaluations,
+        options,
+        name=args.name,
+        data_set=args.data_set,
+        benchmarks=benchmarks,
+        shown=shown,
+        out=out,
+        console=console,
     )
     if args.json is not None:
         write_json(args.json, figures)
-
-
-def parts_of(text: str) -> tuple[str, ...]:
-    """The parts that a list with commas names."""
-    from pipelines.scoring.measurement import PARTS
-
-    parts = tuple(part.strip() for part in text.split(",") if part.strip())
-    unknown = [part for part in parts if part not in PARTS]
-    if unknown or not parts:
-        raise OptionError(f"--parts {text!r}; expected some of {', '.join(PARTS)}")
-    return parts
 
 
 def _folder(args: argparse.Namespace) -> Path:

@@ -12,7 +12,7 @@ from pipelines.commands.arguments import (
     add_lpips_arguments,
     add_measurement_arguments,
     add_scene_arguments,
-    open_lpips,
+    measure_options,
 )
 
 if TYPE_CHECKING:
@@ -79,33 +79,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace, console: Console) -> None:
     """Match, measure, print, write."""
     from gvtools.files import make_folder, write_json
-    from pipelines.commands.evaluate import parts_of
-    from pipelines.scoring.judging import JudgeOptions, judge
+    from pipelines.scoring.judging import judge
     from pipelines.scoring.method_pictures import method_names
 
-    for name, value in (("seed", args.seed), ("sheet-views", args.sheet_views)):
-        if value < 0:
-            raise OptionError(f"--{name} {value}; expected at least 0")
+    if args.sheet_views < 0:
+        raise OptionError(f"--sheet-views {args.sheet_views}; expected at least 0")
     names = method_names(args.pictures, args.name)
-    options = JudgeOptions(
-        parts=parts_of(args.parts),
-        matcher=args.matcher,
-        control=not args.no_control,
-        rule=args.match,
-        sheet_views=args.sheet_views,
-        seed=args.seed,
-        lpips_net=args.lpips_net,
-    )
     _check_apart(args.pictures, args.out)
-    lpips, no_lpips = open_lpips(args)
+    options = measure_options(args)
     make_folder(args.out)
     figures = judge(
         args.pictures,
         names,
         _reference(args, console),
         options=options,
-        lpips=lpips,
-        no_lpips=no_lpips,
+        rule=args.match,
+        sheet_views=args.sheet_views,
         out=args.out,
         console=console,
     )

@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from gvtools.evaluation.splits import SceneSplit
     from gvtools.scenes.scene import Scene
     from pipelines.reconstruction.settings import RunSettings
+    from pipelines.scoring.measurement import MeasureOptions
 
 MEASURED = "measured"
 DEFAULT = "default"
@@ -181,11 +182,12 @@ class _OpenCell:
     lpips: Lpips | None
 
     @property
-    def parts(self) -> tuple[str, ...]:
-        """The parts of ``gvtools evaluate`` that the benchmark's figures need."""
-        from pipelines.scoring.measurement import PARTS
+    def options(self) -> MeasureOptions:
+        """The measures that the benchmark's figures need."""
+        from pipelines.scoring.measurement import PARTS, MeasureOptions
 
-        return PARTS if BEYOND_PICTURES & set(self.benchmark.figures) else ("images",)
+        parts = PARTS if BEYOND_PICTURES & set(self.benchmark.figures) else ("images",)
+        return MeasureOptions(parts=parts, lpips=self.lpips, control=False)
 
     @property
     def views(self) -> dict[str, str]:
@@ -233,9 +235,7 @@ def _of_run(opened: _OpenCell) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     seconds = _reconstruct(opened)
     peak = peak_bytes()
     run = load_run(opened.cell.run)
-    figures = evaluate_run(
-        run, parts=opened.parts, lpips=opened.lpips, no_lpips=None, control=False, console=Silent()
-    )
+    figures = evaluate_run(run, opened.options, console=Silent())
     pictures = {target.name: files.picture for target, files, _ in run.targets()}
     return {
         **_summary(with_run(figures, run)),
@@ -305,13 +305,7 @@ def _of_pictures(opened: _OpenCell) -> tuple[dict[str, Any], dict[str, np.ndarra
             "of their targets"
         )
     measured = Measurement(
-        parts=opened.parts,
-        context=reference.context,
-        truths=[],
-        lpips=opened.lpips,
-        no_lpips=None,
-        control=False,
-        console=Silent(),
+        options=opened.options, context=reference.context, truths=[], console=Silent()
     ).of(reference.with_surfaces(method.targets))
     evaluation = {**measured, "coverage": None, "versions": versions()}
     pictures = {target.picture.name: target.picture.rgb for target in method.targets}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +24,7 @@ from pipelines.console import Console
 from pipelines.report import nested
 from pipelines.scoring.measurement import (
     Measurement,
+    MeasureOptions,
     context_pictures,
     matcher_called,
     mean,
@@ -39,26 +40,11 @@ from pipelines.scoring.tables import (
 )
 
 if TYPE_CHECKING:
-    from gvtools.evaluation.lpips_distance import Lpips
     from gvtools.features import FeatureMatcher
     from gvtools.scenes.scene import Scene
 
 # Context and target views of a round, and rounds.
 PROTOCOLS = {"pass": (2, 6, 1), "long": (2, 6, 3)}
-
-
-@dataclass(frozen=True, kw_only=True)
-class EvaluationOptions:
-    """What is measured, and how."""
-
-    name: str  # of the measured row
-    parts: tuple[str, ...]  # of measurement.PARTS
-    matcher: str  # of the pose probe, "sift" or "lightglue"
-    control: bool  # measure the true pictures of the targets as well
-    seed: int  # of resampling, matching and robust estimates
-    data_set: str | None  # that the runs are scenes of; None ranks nothing
-    lpips_net: str
-    lpips_measured: bool  # whether the network's weights are there
 
 
 def load_benchmarks(shown: Sequence[str], data_set: str | None) -> dict[str, Benchmark]:
@@ -136,31 +122,23 @@ def run_protocol(
 
 def evaluate_run(
     run: Run,
+    options: MeasureOptions,
     *,
-    parts: Sequence[str],
-    lpips: Lpips | None,
-    no_lpips: str | None,
     matcher: FeatureMatcher | None = None,
-    control: bool = True,
-    seed: int = 0,
     console: Console,
 ) -> dict[str, Any]:
-    """Measure one run with at least one round of targets; arguments as of ``Measurement``.
+    """Measure one run with at least one round of targets.
 
     The figures are JSON-ready, by part; what could not be measured is None, with the reason under
     ``notes``.
     """
     targets, reports = run_targets(run), run.rounds[1:]
     measurement = Measurement(
-        parts=parts,
+        options=options,
         context=lambda: context_pictures(run, load_memory(run.path, up_to=0)),
         truths=true_pictures(targets),
-        lpips=lpips,
-        no_lpips=no_lpips,
-        matcher=matcher,
-        control=control,
-        seed=seed,
         console=console,
+        matcher=matcher,
     )
     views = sum(len(report["views"]) for report in reports)
     return {
@@ -173,12 +151,7 @@ def evaluate_run(
 
 
 def evaluate_runs(
-    runs: Sequence[Run],
-    options: EvaluationOptions,
-    *,
-    lpips: Lpips | None,
-    no_lpips: str | None,
-    console: Console,
+    runs: Sequence[Run], options: MeasureOptions, *, console: Console
 ) -> list[dict[str, Any]]:
     """The figures of each run, with what they were measured on."""
     matcher = matcher_called(options.matcher)
@@ -187,16 +160,7 @@ def evaluate_runs(
         console.line(f"{run.path}: {len(run.rounds) - 1} rounds")
         if not run.complete:
             console.warn(f"{run.path}: not every round is done; measured are those that are")
-        figures = evaluate_run(
-            run,
-            parts=options.parts,
-            lpips=lpips,
-            no_lpips=no_lpips,
-            matcher=matcher,
-            control=options.control,
-            seed=options.seed,
-            console=console,
-        )
+        figures = evaluate_run(run, options, matcher=matcher, console=console)
         evaluations.append(with_run(figures, run))
     # Runs of one name are told apart by the folders that they lie in.
     names = [evaluation["name"] for evaluation in evaluations]
@@ -234,8 +198,10 @@ def _seconds(run: Run) -> float:
 def write_evaluation(
     runs: Sequence[Run],
     evaluations: Sequence[dict[str, Any]],
-    options: EvaluationOptions,
+    options: MeasureOptions,
     *,
+    name: str,
+    data_set: str | None,
     benchmarks: dict[str, Benchmark],
     shown: Sequence[str],
     out: Path,
@@ -243,17 +209,18 @@ def write_evaluation(
 ) -> dict[str, Any]:
     """Write evaluation.json and the tables, print the summary, and return the figures.
 
-    The tables of all benchmarks are written, those shown are printed as well.
+    The measured row has the name; only runs of a data set are ranked. The tables of all benchmarks
+    are written, those shown are printed as well.
     """
-    setting = _setting(options, runs, evaluations)
-    row = measured_row(options.name, evaluations, setting)
+    setting = _setting(options, runs, evaluations, data_set=data_set)
+    row = measured_row(name, evaluations, setting)
     comparisons = {}
-    for name, benchmark in benchmarks.items():
+    for key, benchmark in benchmarks.items():
         # Of several numbers of context views, that of the runs, if there are rows of it.
         alike = benchmark.at(
             setting.context if setting.context in benchmark.views else benchmark.context
         )
-        comparisons[name] = comparison_table(side_by_side([row], alike), alike)
+        comparisons[key] = comparison_table(side_by_side([row], alike), alike)
     figures = _over_runs(evaluations, row.figures, options)
     over = figures["over_scenes"] if len(evaluations) > 1 else {}
     tables = {"summary": summary_table(evaluations, "Evaluation", over)}
@@ -262,10 +229,10 @@ def write_evaluation(
             views = evaluation["images"]["views"]
             key = "views" if len(evaluations) == 1 else f"views_{number:03d}"
             tables[key] = view_table(views, evaluation["name"])
-    tables |= {f"published_{name}": table for name, table in comparisons.items()}
+    tables |= {f"published_{key}": table for key, table in comparisons.items()}
     write_json(out / "evaluation.json", figures)
     write_tables(out, tables)
-    for table in (tables["summary"], *(comparisons[name] for name in shown)):
+    for table in (tables["summary"], *(comparisons[key] for key in shown)):
         if table.caption:
             console.line(table.caption)
         print_table(table, console, ranks=True)
@@ -274,7 +241,11 @@ def write_evaluation(
 
 
 def _setting(
-    options: EvaluationOptions, runs: Sequence[Run], evaluations: Sequence[Mapping[str, Any]]
+    options: MeasureOptions,
+    runs: Sequence[Run],
+    evaluations: Sequence[Mapping[str, Any]],
+    *,
+    data_set: str | None,
 ) -> Setting:
     """How the figures were measured, as far as it decides what they may be ranked with."""
     reports = [report for run in runs for report in run.rounds[1:]]
@@ -290,7 +261,7 @@ def _setting(
         (e["images"]["settings"]["masked_share"] for e in evaluations if "images" in e), default=0
     )
     return Setting(
-        data_set=options.data_set,
+        data_set=data_set,
         # Mixed sizes and numbers are none of the published ones.
         resolution=sizes.pop() if len(sizes) == 1 else None,
         context=_common([len(run.record["context"]) for run in runs]),
@@ -298,7 +269,7 @@ def _setting(
         rounds=_common([len(run.rounds) - 1 for run in runs]),
         scenes=len({run.record["project"] for run in runs}),
         pixels="inside masks" if masked > 0 else "all",
-        lpips_net=options.lpips_net if options.lpips_measured else None,
+        lpips_net=options.lpips_net if options.lpips else None,
         poses_from=f"pose probe ({options.matcher}), {located[0]} of {located[1]} views located",
         pose_unit="scene units",
         reprojection=None,
@@ -314,7 +285,7 @@ def _common(numbers: Sequence[int]) -> int | None:
 def _over_runs(
     evaluations: Sequence[Mapping[str, Any]],
     row: Mapping[str, float | None],
-    options: EvaluationOptions,
+    options: MeasureOptions,
 ) -> dict[str, Any]:
     """What evaluation.json holds: figures over all runs at the top, then each run's."""
     over = {}

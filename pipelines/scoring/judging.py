@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +17,7 @@ from pipelines.scoring.measurement import (
     JUDGED,
     MeasuredTarget,
     Measurement,
+    MeasureOptions,
     evenly,
     matcher_called,
     true_pictures,
@@ -26,24 +27,10 @@ from pipelines.scoring.tables import differences, judge_markdown, judge_tables, 
 from viz.report.pictures import JudgedView, method_sheet
 
 if TYPE_CHECKING:
-    from gvtools.evaluation.lpips_distance import Lpips
     from gvtools.evaluation.tables import Table
     from pipelines.console import Console
 
 VIEWS_A_SHEET = 4
-
-
-@dataclass(frozen=True, kw_only=True)
-class JudgeOptions:
-    """What is measured, and how."""
-
-    parts: tuple[str, ...]  # of measurement.PARTS
-    matcher: str  # of the pose probe, "sift" or "lightglue"
-    control: bool  # measure the true pictures as well
-    rule: str  # how pictures are matched with views, see match_pictures
-    sheet_views: int  # views on the contact sheets; 0 writes none
-    seed: int  # of resampling, matching and robust estimates
-    lpips_net: str
 
 
 def judge(
@@ -51,33 +38,34 @@ def judge(
     names: Sequence[str],
     reference: JudgeReference,
     *,
-    options: JudgeOptions,
-    lpips: Lpips | None,
-    no_lpips: str | None,
+    options: MeasureOptions,
+    rule: str,
+    sheet_views: int,
     out: Path,
     console: Console,
 ) -> dict[str, Any]:
     """Measure the methods, write figures, tables and sheets, print the table.
 
-    The figures are what ``judge.json`` holds.
+    Pictures are matched with views by a rule of ``match_pictures``. The figures are what
+    ``judge.json`` holds.
     """
     targets = reference.targets
     measurement = Measurement(
-        parts=options.parts,
+        options=options,
         context=reference.context,
         truths=true_pictures(targets),
-        lpips=lpips,
-        no_lpips=no_lpips,
-        matcher=matcher_called(options.matcher),
-        control=options.control,
         names=JUDGED,
-        seed=options.seed,
         console=console,
+        matcher=matcher_called(options.matcher),
     )
-    sheets = _SheetPictures(targets, options.sheet_views)
+    sheets = _SheetPictures(targets, sheet_views)
     measured = []
     for path, name in zip(paths, names, strict=True):
-        method = _open(path, name, reference, options=options, console=console)
+        method = open_method(path, name, reference.targets, rule=rule)
+        if "consistency" in options.parts:
+            # Pictures without depth get the memory's.
+            method = replace(method, targets=reference.with_surfaces(method.targets))
+        _tell(method, len(targets), console)
         sheets.add(method)
         measured.append(_measure(method, measurement))
     figures = {
@@ -90,7 +78,17 @@ def judge(
         "with_truth": sum(target.truth is not None for target in targets),
         "methods": measured,
         "differences": differences(measured, options.seed) if "images" in options.parts else [],
-        "judge": {**asdict(options), "lpips_measured": lpips is not None, **provenance()},
+        "judge": {
+            "parts": list(options.parts),
+            "matcher": options.matcher,
+            "control": options.control,
+            "rule": rule,
+            "sheet_views": sheet_views,
+            "seed": options.seed,
+            "lpips_net": options.lpips_net,
+            "lpips_measured": options.lpips is not None,
+            **provenance(),
+        },
     }
     tables = judge_tables(figures)
     files = _write(figures, tables, sheets.views(), out=out)
@@ -103,16 +101,11 @@ def judge(
     return figures
 
 
-def _open(
-    path: Path, name: str, reference: JudgeReference, *, options: JudgeOptions, console: Console
-) -> MethodPictures:
-    """The method's pictures; those without depth get the memory's, where it is needed."""
-    method = open_method(path, name, reference.targets, rule=options.rule)
-    if "consistency" in options.parts:
-        method = replace(method, targets=reference.with_surfaces(method.targets))
-    matching, pictures = method.matching, method.pictures
+def _tell(method: MethodPictures, targets: int, console: Console) -> None:
+    """Say how the pictures were read and matched."""
+    name, matching, pictures = method.name, method.matching, method.pictures
     console.line(
-        f"{name}: {len(method.targets)} of {len(reference.targets)} views, matched by "
+        f"{name}: {len(method.targets)} of {targets} views, matched by "
         f"{matching.rule} ({pictures.layout})"
     )
     for note in pictures.notes:
@@ -124,7 +117,6 @@ def _open(
         console.line(f"  {len(matching.left_over)} pictures of no judged view left out")
     for (width, height), count in sorted(method.resized.items()):
         console.warn(f"{name}: {count} pictures of {width}x{height} pixels resized to their views'")
-    return method
 
 
 def _measure(method: MethodPictures, measurement: Measurement) -> dict[str, Any]:

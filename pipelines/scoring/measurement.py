@@ -109,19 +109,28 @@ def matcher_called(name: str) -> FeatureMatcher | None:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Measurement:
-    """What is measured, how, and against which context and truth."""
+class MeasureOptions:
+    """What is measured of pictures, and how."""
 
     parts: Sequence[str]  # of PARTS
+    lpips: Lpips | None = None
+    no_lpips: str | None = None  # why there is none
+    lpips_net: str = "vgg"  # that was asked for
+    matcher: str = "sift"  # of the pose probe, or "lightglue"
+    control: bool = True  # measure the true pictures as well, to read the figures by
+    seed: int = 0  # of resampling, matching and robust estimates
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Measurement:
+    """Measures sets of pictures of the same targets, against one context and truth."""
+
+    options: MeasureOptions
     context: Callable[[], list[PosedPicture]]  # with the memory's depth; called when needed
     truths: Sequence[PosedPicture]  # the true pictures of all targets
-    lpips: Lpips | None
-    no_lpips: str | None  # why there is none
-    matcher: FeatureMatcher | None = None
-    control: bool = True  # measure the true pictures as well, to read the figures by
-    names: Sequence[str] = FIGURES  # or JUDGED
-    seed: int = 0  # of resampling, matching and robust estimates
+    names: Sequence[str] = FIGURES  # of figures of pictures, or JUDGED
     console: Console
+    matcher: FeatureMatcher | None = None  # None is the pose probe's own, SIFT
 
     def of(self, targets: Sequence[MeasuredTarget]) -> dict[str, Any]:
         """The figures by part, JSON-ready; what could not be measured is None.
@@ -129,11 +138,11 @@ class Measurement:
         Reasons stand under ``notes`` and ``status``.
         """
         out: dict[str, Any] = {}
-        if "images" in self.parts:
+        if "images" in self.options.parts:
             out["images"] = self._images(targets)
-        if "consistency" in self.parts:
+        if "consistency" in self.options.parts:
             out["consistency"] = self._consistency(targets)
-        if "poses" in self.parts:
+        if "poses" in self.options.parts:
             out["poses"] = self._poses([target.picture for target in targets])
         return out
 
@@ -142,11 +151,14 @@ class Measurement:
         views = [self._view(target) for target in self.console.track(targets, "images")]
 
         def means(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-            return {name: interval([row[name] for row in rows], self.seed) for name in self.names}
+            return {
+                name: interval([row[name] for row in rows], self.options.seed)
+                for name in self.names
+            }
 
         notes = {}
-        if self.no_lpips and not self.lpips:
-            notes["lpips"] = self.no_lpips
+        if self.options.no_lpips and not self.options.lpips:
+            notes["lpips"] = self.options.no_lpips
         if not any(target.truth for target in targets):
             notes["psnr"] = "no target has a true picture"
         if any(view["psnr"] == float("inf") for view in views):
@@ -162,7 +174,9 @@ class Measurement:
             "settings": {
                 "psnr": "peak 1, mean over pixels and channels",
                 "ssim": "Gaussian window 11x11, sigma 1.5, population covariances, data range 1",
-                "lpips": f"lpips package, network {self.lpips.net}" if self.lpips else None,
+                "lpips": f"lpips package, network {self.options.lpips.net}"
+                if self.options.lpips
+                else None,
                 # Of the true picture of which the least counts.
                 "masked_share": max((1 - float(mask.mean()) for mask in masks), default=0.0),
             },
@@ -186,7 +200,7 @@ class Measurement:
                 generated=target.generated,
                 others={NEVER_OBSERVED: ~target.observed} if self.names == JUDGED else {},
                 depth=target.picture.depth,
-                lpips=self.lpips,
+                lpips=self.options.lpips,
             )
         return figures
 
@@ -198,7 +212,7 @@ class Measurement:
             for picture, target in zip(pictures, targets, strict=True)
         ]
         generated = self._agreement(pictures, surfaces, label="consistency")
-        if not self.control or len(self.truths) < 2:
+        if not self.options.control or len(self.truths) < 2:
             return {"generated": generated}
         return {"generated": generated, "true_pictures": self._true_consistency}
 
@@ -223,19 +237,19 @@ class Measurement:
         features = [feature_consistency(first, second) for first, second in pairs]
         matched = [pictures[row] for row in evenly(len(pictures), MOST_MATCHED)]
         self.console.line(f"{label}: matching {len(matched)} pictures")
-        geometry = asdict(verify_geometry(matched, seed=self.seed))
+        geometry = asdict(verify_geometry(matched, seed=self.options.seed))
         return {
             "pairs": "consecutive views in the order of the run",
             "depth_reprojection": depth,
             "geometric_verification": geometry | {"sampled_of": len(pictures)},
             "feature_consistency": {
                 "network": features[0].network if features else None,
-                "score": interval([pair.score for pair in features], self.seed),
+                "score": interval([pair.score for pair in features], self.options.seed),
                 "unrelated": mean([pair.unrelated for pair in features]),
                 "overlap": mean([pair.overlap for pair in features]),
                 "pairs": [asdict(pair) for pair in features],
             },
-            "met3r": _met3r(pictures, self.seed),
+            "met3r": _met3r(pictures, self.options.seed),
         }
 
     def _poses(self, pictures: Sequence[PosedPicture]) -> dict[str, Any]:
@@ -256,7 +270,7 @@ class Measurement:
         from gvtools.evaluation.pose_probe import PoseProbe
 
         try:
-            return PoseProbe(self._context, matcher=self.matcher, seed=self.seed)
+            return PoseProbe(self._context, matcher=self.matcher, seed=self.options.seed)
         except DegenerateError as error:
             return str(error)
 
@@ -268,7 +282,7 @@ class Measurement:
     def _true_poses(self) -> dict[str, Any]:
         """The same of the true pictures, and of context views that the others locate."""
         probe, out = self._probe, {}
-        if isinstance(probe, str) or not self.control:
+        if isinstance(probe, str) or not self.options.control:
             return {}
         if self.truths:
             tracked = self.console.track(self.truths, "pose probe, true pictures")
