@@ -1,4 +1,4 @@
-"""Which views to look at: the nearest to some cameras, those that see the same, a few of many.
+"""Selection of views: the nearest to some cameras, those that see the same, a few of many.
 
 Needs numpy alone. Rows of ``Cameras`` come back, the best first.
 """

@@ -1,4 +1,4 @@
-"""What is wrong with real observations, done to clean ones before they are lifted to memory.
+"""Corruption of clean observations, as sensors and poses corrupt real ones.
 
 Every fault has its own range and switch. A sample draws each fault's strength once, uniformly, and
 the fault itself for every context view. Targets and the truth stay clean.

@@ -1,4 +1,4 @@
-"""What a user would otherwise call: Open3D's TSDF volume and its point clouds.
+"""Open3D peers of the timings: its TSDF volume and its point clouds.
 
 Open3D counts pixel centres as integers; K is moved by half a pixel on the way in.
 """

@@ -1,4 +1,4 @@
-"""How long a model is tuned to a scene."""
+"""Options of tuning a model to a scene."""
 
 from __future__ import annotations
 

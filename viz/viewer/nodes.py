@@ -1,4 +1,4 @@
-"""What the web viewer shows in its scene: points, Gaussians, a mesh, cameras, the rendered view."""
+"""Nodes of the web viewer's scene: points, Gaussians, a mesh, cameras, the rendered view."""
 
 from __future__ import annotations
 
