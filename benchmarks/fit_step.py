@@ -28,7 +28,7 @@ from gvtools.appearance.appearance import Appearance
 from gvtools.appearance.fit import Fit
 from gvtools.appearance.gaussians import Gaussians
 from gvtools.poses.views import FitView
-from gvtools.scenes.reduced import reduced
+from gvtools.scenes.resized import reduced
 
 REPEATS = 5
 # Progress of a fit at which no Gaussians are added any more.

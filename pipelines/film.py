@@ -101,7 +101,7 @@ def _path_cameras(memory: SpatialMemory, captured: Cameras, path: str) -> Camera
     from gvtools.scenes.selection import select
 
     if Path(place).suffix.lower() == ".json":
-        from gvtools.scenes.transforms_json import read_transforms_cameras
+        from gvtools.scenes.transforms import read_transforms_cameras
 
         cameras = read_transforms_cameras(Path(place))
         return cameras[list(map(cameras.names.index, select(cameras.names, selection or "all")))]

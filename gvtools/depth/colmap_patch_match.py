@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from gvtools.depth.source import DepthMap, RecordedDepth
 from gvtools.errors import DegenerateError, ProjectError
-from gvtools.scenes.colmap_depth import depth_map_path, read_depth_map
-from gvtools.scenes.colmap_writer import write_colmap
+from gvtools.scenes.colmap import depth_map_path, read_depth_map
+from gvtools.scenes.colmap_model import write_colmap
 from gvtools.scenes.scene import Frame, Scene, View
 
 # Source pictures of each, chosen by COLMAP from co-visibility.

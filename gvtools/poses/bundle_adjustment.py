@@ -31,7 +31,7 @@ from gvtools.poses.colmap import (
 )
 from gvtools.poses.motions import centers_of, mean_near, motions_between, moved, nearest_pairs
 from gvtools.poses.refinement import RefinedPoses
-from gvtools.scenes.colmap_writer import reconstruction
+from gvtools.scenes.colmap_model import build_reconstruction
 from gvtools.scenes.scene import Frame, Scene
 from gvtools.similarity import align_poses
 
@@ -268,7 +268,7 @@ def _triangulated(
 def _model(cameras: Cameras, tracks: Tracks) -> pycolmap.Reconstruction:
     """Views at their given poses with the points that they show; image ids are rows + 1."""
     black = np.zeros(tracks.positions.shape, np.uint8)
-    return reconstruction(
+    return build_reconstruction(
         cameras, tracks.positions, black, point_index=tracks.point, view_index=tracks.view,
         xy=tracks.xy,
     )  # fmt: skip

@@ -109,7 +109,7 @@ class Run:
         """The project, and the scene with the true pictures of the targets, if there is one."""
         from gvtools.scenes.layout import is_address
         from gvtools.scenes.project import open_project, open_recorded
-        from gvtools.scenes.reduced import reduced
+        from gvtools.scenes.resized import reduced
 
         max_side = self.settings.get("max_side")
         project, reading = self.record["project"], self.record["reading"]

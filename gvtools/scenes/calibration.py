@@ -12,8 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gvtools.errors import ProjectError
 from gvtools.scenes.scene import Finding
-from gvtools.scenes.transforms_frame import LensParameters
-from gvtools.scenes.undistort import camera_of
+from gvtools.scenes.undistort import LensParameters, camera_of
 from gvtools.untrusted import read_bytes, read_json, read_text
 
 Float64 = NDArray[np.float64]

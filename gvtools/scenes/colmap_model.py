@@ -1,25 +1,42 @@
-"""A COLMAP model in memory, read through pycolmap."""
+"""COLMAP models: their files, read through pycolmap, and written.
+
+pycolmap refuses most damage by itself, but takes whatever memory a wrong count asks for, and does
+not notice that a binary file ends early: binary files are walked record by record before.
+"""
 
 from __future__ import annotations
 
+import os
+import shutil
+import struct
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.cameras import rigid_transform
-from gvtools.errors import ProjectError
-from gvtools.scenes.colmap_files import ModelFiles, check_cameras, model_files, text_names
+from gvtools.cameras import Cameras, rigid_transform
+from gvtools.errors import ProjectError, ShapeError
 from gvtools.scenes.faces import perspective_views
 from gvtools.scenes.photographs import rotation_findings
 from gvtools.scenes.scene import Finding, SparsePoints, natural_key
 from gvtools.scenes.undistort import Undistortion, undistortion
+from gvtools.untrusted import number_key, read_bytes, read_text, regular
 
 if TYPE_CHECKING:
     import pycolmap
 
+# What readers know a model by.
+CAMERAS = "cameras.bin"
+NO_POINTS, NO_TRACKS = np.zeros((0, 3)), np.zeros(0, np.int64)
+REQUIRED = ("cameras", "images", "points3D")
+RIGGED = ("rigs", "frames")
+# Where a model lies inside a workspace, best first. A place may hold several, numbered from 0.
+PLACES = ("sparse", ".", "colmap/sparse", "sparse_txt")
+# Bytes of the smallest record of each binary file.
+LEAST_BYTES = {"cameras": 24, "images": 73, "points3D": 51, "rigs": 8, "frames": 68}
 # What the reader's terser complaints mean.
 REASONS = {
     "camera.VerifyParams()": "a camera has not as many parameters as its model needs",
@@ -30,6 +47,210 @@ REASONS = {
     "line_stream ": "a line of points3D.txt is malformed",
     "Rig with ID": "an image, camera, rig or frame is named that is not there",
 }
+
+
+@dataclass(frozen=True)
+class ModelFiles:
+    """A model on disk.
+
+    Attributes:
+        folder: where its files are.
+        suffix: ".bin" or ".txt".
+        others: further models of the workspace that are not read, with their image counts.
+    """
+
+    folder: Path
+    suffix: str
+    others: tuple[tuple[str, int], ...] = ()
+
+
+def has_model(folder: Path) -> bool:
+    """Whether a folder holds a camera file of COLMAP."""
+    return any((folder / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt"))
+
+
+def find_model(root: Path, *, number: int | None = None) -> Path | None:
+    """The model folder of a workspace, or ``root`` when it is one; None when there is none.
+
+    Args:
+        root: the workspace.
+        number: of the model, where the workspace holds several (``sparse/0``, ``sparse/1``, ...);
+            None takes the one with most images, the first of equals.
+    """
+    for place in PLACES:
+        numbered = _numbered(root / place)
+        if number is not None:
+            if number in numbered:
+                return numbered[number]
+            continue
+        if numbered:
+            return max(numbered.values(), key=_count_images)
+        if has_model(root / place):
+            return root / place
+    if number is None:
+        return None
+    known = [str(key) for place in PLACES for key in _numbered(root / place)]
+    raise ProjectError(
+        f"{root}: no COLMAP model of number {number}; it holds {', '.join(known) or 'none'}"
+    )
+
+
+def _numbered(folder: Path) -> dict[int, Path]:
+    """Models in sub-folders that are numbers, by these, ascending."""
+    if folder.name not in ("sparse", "sparse_txt") or not folder.is_dir():
+        return {}
+    found = [path for path in folder.iterdir() if path.name.isdecimal() and has_model(path)]
+    return {int(path.name): path for path in sorted(found, key=lambda path: int(path.name))}
+
+
+def model_files(folder: Path) -> ModelFiles:
+    """The files of the model in ``folder``, complete and with counts that they can hold."""
+    suffix = _suffix(folder)
+    rigged = [stem for stem in RIGGED if (folder / f"{stem}{suffix}").is_file()]
+    if len(rigged) == 1:
+        missing = next(stem for stem in RIGGED if stem not in rigged)
+        raise ProjectError(
+            f"{folder}: has {rigged[0]}{suffix} without {missing}{suffix}; "
+            "expected both or none; copy the whole model again"
+        )
+    if suffix == ".bin":
+        for stem in (*REQUIRED, *rigged):
+            path = folder / f"{stem}.bin"
+            size, count = path.stat().st_size, _count(path)
+            if size < 8 or count * LEAST_BYTES[stem] + 8 > size:
+                raise _damaged(path, f"{count} records that its head names cannot be in it")
+        for stem in (*REQUIRED, *rigged):
+            if stem != "cameras":
+                _check_records(folder / f"{stem}.bin")
+    else:
+        _check_points(folder / "points3D.txt")
+    return ModelFiles(folder, suffix, _siblings(folder))
+
+
+def check_cameras(folder: Path, model: pycolmap.Reconstruction) -> None:
+    """Compare the size of cameras.bin with the cameras that a reader got from it."""
+    path = folder / "cameras.bin"
+    expected = 8 + sum(24 + 8 * len(camera.params) for camera in model.cameras.values())
+    if path.stat().st_size != expected:
+        raise _damaged(path, f"its cameras take {expected}")
+
+
+def _check_records(path: Path) -> None:
+    """Walk a file by the counts in each record."""
+    data = read_bytes(path)
+    offset, record_end = 8, _RECORD_ENDS[path.stem]
+    try:
+        for _ in range(_count(path)):
+            offset = record_end(data, offset)
+            if offset > len(data):
+                break
+    except (struct.error, ValueError):
+        offset = -1
+    if offset != len(data):
+        raise _damaged(path, "its records take another number")
+
+
+def _image_end(data: bytes, at: int) -> int:
+    name_end = data.index(b"\0", at + 64)
+    return name_end + 9 + 24 * int(struct.unpack_from("<Q", data, name_end + 1)[0])
+
+
+def _point_end(data: bytes, at: int) -> int:
+    return at + 51 + 8 * int(struct.unpack_from("<Q", data, at + 43)[0])
+
+
+def _rig_end(data: bytes, at: int) -> int:
+    """Its id, and its sensors: the first is the reference, the others may have a pose to it."""
+    sensors = int(struct.unpack_from("<I", data, at + 4)[0])
+    at += 8 + (8 if sensors else 0)
+    for _ in range(sensors - 1):
+        if at >= len(data):
+            break
+        at += 9 + (56 if struct.unpack_from("<B", data, at + 8)[0] else 0)
+    return at
+
+
+def _frame_end(data: bytes, at: int) -> int:
+    return at + 68 + 16 * int(struct.unpack_from("<I", data, at + 64)[0])
+
+
+_RECORD_ENDS: dict[str, Callable[[bytes, int], int]] = {
+    "images": _image_end,
+    "points3D": _point_end,
+    "rigs": _rig_end,
+    "frames": _frame_end,
+}
+
+
+def _check_points(path: Path) -> None:
+    """Refuse a line of points3D.txt that lacks a number: pycolmap would read the rest shifted."""
+    for at, line in enumerate(read_text(path, errors="replace").splitlines(), 1):
+        words = 0 if line.startswith("#") else len(line.split())
+        if words and (words < 8 or words % 2):
+            raise ProjectError(
+                f"{path}, line {at}: {words} values; expected id, x, y, z, r, g, b, error, pairs "
+                "of image and feature; export the model again"
+            )
+
+
+def _damaged(path: Path, reason: str) -> ProjectError:
+    return ProjectError(
+        f"{path}: {path.stat().st_size} bytes, and {reason}; the file is truncated or damaged; "
+        "copy or export it again"
+    )
+
+
+def _suffix(folder: Path) -> str:
+    for suffix in (".bin", ".txt"):
+        if all((folder / f"{stem}{suffix}").is_file() for stem in REQUIRED):
+            return suffix
+    found = sorted(path.name for path in folder.iterdir() if path.suffix in (".bin", ".txt"))
+    raise ProjectError(
+        f"{folder}: an incomplete model, with {', '.join(found)}; expected cameras, images and "
+        "points3D, all .bin or all .txt; copy the whole model again"
+    )
+
+
+def _siblings(folder: Path) -> tuple[tuple[str, int], ...]:
+    if folder.parent.name not in ("sparse", "sparse_txt"):
+        return ()
+    return tuple(
+        (path.name, _count_images(path))
+        for path in sorted(folder.parent.iterdir())
+        if path != folder and path.is_dir() and has_model(path)
+    )
+
+
+def _count_images(folder: Path) -> int:
+    """How many images the model in ``folder`` claims to hold; 0 when that cannot be told."""
+    if (folder / "images.bin").is_file():
+        return _count(folder / "images.bin")
+    return len(text_names(folder)) if (folder / "images.txt").is_file() else 0
+
+
+def _count(path: Path) -> int:
+    """The count of records that a binary file begins with."""
+    with regular(path).open("rb") as file:
+        head = file.read(8)
+    return int(struct.unpack("<Q", head)[0]) if len(head) == 8 else 0
+
+
+def text_names(folder: Path) -> dict[int, str]:
+    """The images' whole names in a text model, by id; pycolmap stops at the first blank."""
+    path = folder / "images.txt"
+    try:
+        lines = read_text(path).splitlines()
+    except UnicodeDecodeError as error:
+        raise ProjectError(f"{path}: no text in UTF-8 ({error.reason})") from None
+    # An image has two lines, the second of which may be empty; empty ones before it do not count.
+    names, rest = {}, iter(lines)
+    for line in rest:
+        if line.strip() and not line.startswith("#"):
+            row = line.split(maxsplit=9)
+            if len(row) == 10 and row[0].isdecimal():
+                names[number_key(row[0])] = row[9].strip()
+            next(rest, None)
+    return names
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,3 +481,120 @@ def _observations(
     # Faces meet at their sides: the first that shows a detection takes it.
     shown = np.isfinite(places).all(-1).argmax(0)
     return point_index, np.array(rows, np.int32)[shown], places[shown, np.arange(len(xy))]
+
+
+def write_colmap(
+    folder: Path,
+    cameras: Cameras,
+    *,
+    points: NDArray[np.float64] = NO_POINTS,
+    colors: NDArray[np.uint8] | None = None,
+    point_index: NDArray[np.integer[Any]] = NO_TRACKS,
+    view_index: NDArray[np.integer[Any]] = NO_TRACKS,
+    xy: NDArray[np.float64] = NO_POINTS[:, :2],
+) -> None:
+    """Write a binary model that COLMAP and pycolmap read back, in the cameras' own frame.
+
+    Cameras become PINHOLE cameras (views of equal K and size share one), images get the ids
+    1..V in the cameras' order and the cameras' names, points the ids 1..N.
+
+    Args:
+        folder: the model folder itself, usually ``workspace/sparse/0``; made when absent.
+        cameras: V cameras; K without skew, each with a name of its own.
+        points: (N, 3), world frame, scene units.
+        colors: (N, 3); None is black.
+        point_index: (M,), for each track element its point.
+        view_index: (M,), and its view.
+        xy: (M, 2), and where it was seen, pixels with the first centre at (0.5, 0.5).
+    """
+    if len(set(cameras.names)) != len(cameras):
+        raise ShapeError("cameras: two views share a name; a model needs unique image names")
+    if colors is None:
+        colors = np.zeros(points.shape, np.uint8)
+    model = build_reconstruction(
+        cameras, points, colors, point_index=point_index, view_index=view_index, xy=xy
+    )
+    partial = folder / ".model.part"
+    try:
+        # What a kill left of an earlier attempt.
+        shutil.rmtree(partial, ignore_errors=True)
+        partial.mkdir(parents=True)
+        model.write_binary(str(partial))
+        # The writer does not notice a full disk; the walk over the records does.
+        model_files(partial)
+        # A kill in between leaves no model, rather than one of new and old files.
+        (folder / CAMERAS).unlink(missing_ok=True)
+        for file in sorted(partial.iterdir(), key=lambda file: (file.name == CAMERAS, file.name)):
+            os.replace(file, folder / file.name)
+    except OSError as error:
+        raise ProjectError(f"{folder}: the model could not be written ({error})") from None
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def build_reconstruction(
+    cameras: Cameras,
+    positions: NDArray[np.float64],
+    colors: NDArray[np.uint8],
+    *,
+    point_index: NDArray[np.integer[Any]],
+    view_index: NDArray[np.integer[Any]],
+    xy: NDArray[np.float64],
+) -> pycolmap.Reconstruction:
+    """The model in memory; see ``write_colmap``."""
+    import pycolmap
+
+    model = pycolmap.Reconstruction()
+    camera_ids = _add_cameras(model, cameras)
+    # Track elements sorted by view give each image its key points in one block.
+    order = np.argsort(view_index, kind="stable")
+    start = np.searchsorted(view_index[order], np.arange(len(cameras) + 1))
+    keypoint = np.empty(len(order), np.int64)
+    keypoint[order] = np.arange(len(order)) - start[view_index[order]]
+    for i, name in enumerate(cameras.names):
+        image = pycolmap.Image(
+            name=name,
+            keypoints=xy[order[start[i] : start[i + 1]]],
+            camera_id=camera_ids[i],
+            image_id=i + 1,
+        )
+        model.add_image_with_trivial_frame(
+            image, pycolmap.Rigid3d(np.ascontiguousarray(cameras.cam_from_world[i, :3]))
+        )
+    by_point = np.argsort(point_index, kind="stable")
+    first = np.searchsorted(point_index[by_point], np.arange(len(positions) + 1))
+    for i, position in enumerate(positions):
+        rows = by_point[first[i] : first[i + 1]]
+        track = pycolmap.Track(
+            [pycolmap.TrackElement(int(view_index[row]) + 1, int(keypoint[row])) for row in rows]
+        )
+        model.add_point3D(position, track, colors[i])
+    model.update_point_3d_errors()
+    return model
+
+
+def _add_cameras(model: pycolmap.Reconstruction, cameras: Cameras) -> list[int]:
+    import pycolmap
+
+    known: dict[tuple[float, ...], int] = {}
+    ids = []
+    for K, width, height, name in zip(
+        cameras.K, cameras.width, cameras.height, cameras.names, strict=True
+    ):
+        expected = np.array([[K[0, 0], 0, K[0, 2]], [0, K[1, 1], K[1, 2]], [0, 0, 1]])
+        if not np.allclose(K, expected, atol=1e-9) or not np.isfinite(K).all():
+            raise ShapeError(f"cameras: K of {name!r} has skew or is no pinhole matrix: {K}")
+        key = (K[0, 0], K[1, 1], K[0, 2], K[1, 2], int(width), int(height))
+        if key not in known:
+            known[key] = len(known) + 1
+            model.add_camera_with_trivial_rig(
+                pycolmap.Camera(
+                    model="PINHOLE",
+                    width=int(width),
+                    height=int(height),
+                    params=[float(value) for value in key[:4]],
+                    camera_id=known[key],
+                )
+            )
+        ids.append(known[key])
+    return ids

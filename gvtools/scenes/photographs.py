@@ -33,8 +33,7 @@ from gvtools.scenes.images import (
 )
 from gvtools.scenes.matching import named
 from gvtools.scenes.scene import Finding, Frame, Scene, View, natural_key
-from gvtools.scenes.transforms_frame import LensParameters
-from gvtools.scenes.undistort import Undistortion, undistortion
+from gvtools.scenes.undistort import LensParameters, Undistortion, undistortion
 from gvtools.untrusted import named_file
 
 Depth = NDArray[np.float32]

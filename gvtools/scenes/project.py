@@ -14,15 +14,15 @@ from gvtools.errors import OptionError, ProjectError, UnposedError
 from gvtools.files import digest
 from gvtools.scenes.calibration import load_matrix
 from gvtools.scenes.collection import SceneCollection, of_scenes
-from gvtools.scenes.colmap_files import find_model
+from gvtools.scenes.colmap_model import find_model
 from gvtools.scenes.layout import FORM, SPEC, is_address
 from gvtools.scenes.matching import named
 from gvtools.scenes.phones import POLYCAM, SCANNER_APP, STRAY_SCANNER
 from gvtools.scenes.record3d import RECORD3D
 from gvtools.scenes.rgbd import LAYOUTS, RgbdOptions, count_unposed
 from gvtools.scenes.scene import Finding, Scene
-from gvtools.scenes.transforms_json import FILE as TRANSFORMS
-from gvtools.scenes.transforms_json import read_transforms
+from gvtools.scenes.transforms import FILE as TRANSFORMS
+from gvtools.scenes.transforms import read_transforms
 
 PICTURES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg")

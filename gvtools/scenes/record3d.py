@@ -38,7 +38,7 @@ from gvtools.scenes.layout import Layout
 from gvtools.scenes.phones import confident, phone_scene
 from gvtools.scenes.photographs import Depth, PosedFrame
 from gvtools.scenes.scene import Finding, Frame, Scene
-from gvtools.scenes.transforms_frame import LensParameters
+from gvtools.scenes.undistort import LensParameters
 from gvtools.untrusted import archive, open_picture, parse_json, read_bytes
 
 ARCHIVE, EXPORT = ".r3d", "EXR_RGBD"

@@ -1,4 +1,4 @@
-"""A scene with pictures of one size, and with what some of its views alone would tell."""
+"""Scenes with resampled pictures: reduced, of one size; and with some views' points alone."""
 
 from __future__ import annotations
 
@@ -8,11 +8,56 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from gvtools.errors import OptionError
 from gvtools.scenes.images import resize_nearest
-from gvtools.scenes.scene import Frame, Scene, SparsePoints, View
+from gvtools.scenes.scene import Finding, Frame, Scene, SparsePoints, View
 
 # Left, top, width and height of a picture's window, pixels.
 Window = tuple[int, int, int, int]
+# Below this side, nothing of a picture is left to work with.
+SMALLEST = 64
+
+
+def reduced(scene: Scene, max_side: int | None) -> Scene:
+    """The scene with no picture's longer side above ``max_side``.
+
+    Colours are averaged over what they stand for; depth and masks take the nearest pixel, so that
+    no depth lies between two surfaces. Cameras and detections of sparse points follow.
+
+    Args:
+        scene: left as it is.
+        max_side: pixels; None keeps every size.
+    """
+    check_max_side(max_side)
+    sizes = np.array([(view.camera.width[0], view.camera.height[0]) for view in scene.views])
+    if max_side is None or not len(sizes) or sizes.max() <= max_side:
+        return scene
+    factor = np.minimum(max_side / sizes.max(axis=1), 1.0)
+    targets = np.maximum(np.rint(sizes * factor[:, None]), 1).astype(int)
+    views = tuple(
+        view
+        if (size == target).all()
+        else _resized_view(view, (0, 0, *size), width=int(target[0]), height=int(target[1]))
+        for view, size, target in zip(scene.views, sizes.tolist(), targets, strict=True)
+    )
+    points = scene.points
+    if points is not None:
+        share = targets / sizes
+        points = replace(points, xy=points.xy * share[points.view_index])
+    count = int((sizes.max(axis=1) > max_side).sum())
+    largest = sizes[sizes.max(axis=1).argmax()]
+    message = (
+        f"{count} pictures are reduced to {max_side} pixels on their longer side (the largest is "
+        f"{largest[0]}x{largest[1]}); max_side says how far"
+    )
+    findings = (*scene.findings, Finding("info", message))
+    return replace(scene, views=views, points=points, findings=findings)
+
+
+def check_max_side(max_side: int | None) -> None:
+    """Refuse a size at which nothing is left."""
+    if max_side is not None and not max_side >= SMALLEST:
+        raise OptionError(f"max_side {max_side}; expected at least {SMALLEST}")
 
 
 def resized(scene: Scene, width: int, height: int) -> Scene:

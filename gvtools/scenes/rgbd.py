@@ -58,7 +58,7 @@ from gvtools.scenes.photographs import (
     posed_scene,
 )
 from gvtools.scenes.scene import Finding, Scene
-from gvtools.scenes.transforms_frame import LensParameters
+from gvtools.scenes.undistort import LensParameters
 from gvtools.settings import Settings, changes, with_file
 from gvtools.trajectory_files import read_poses
 from gvtools.untrusted import read_text

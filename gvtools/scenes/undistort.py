@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,6 +26,17 @@ ROUND_TRIP_TOLERANCE = 0.05
 MOST_PIXELS = 200_000
 # Cameras whose positions in the recorded picture are kept, six bytes a pixel.
 KEPT = 4
+
+
+class LensParameters(NamedTuple):
+    """A camera model of COLMAP with its parameters in COLMAP's order, and its picture's size.
+
+    Lengths are in pixels; the first pixel's centre is (0.5, 0.5).
+    """
+
+    model: str
+    values: tuple[float, ...]
+    size: tuple[int, int]
 
 
 @dataclass(frozen=True, eq=False)

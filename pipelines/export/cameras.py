@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from gvtools.files import link_or_copy, write_text
 from gvtools.memory.thinning import thinned
-from gvtools.scenes.colmap_writer import write_colmap as write_model
-from gvtools.scenes.transforms_json import FILE as TRANSFORMS
-from gvtools.scenes.transforms_json import write_transforms as write_frames
-from gvtools.scenes.transforms_json import written_here
+from gvtools.scenes.colmap_model import write_colmap as write_model
+from gvtools.scenes.transforms import FILE as TRANSFORMS
+from gvtools.scenes.transforms import write_transforms as write_frames
+from gvtools.scenes.transforms import written_here
 from pipelines.export.source import DistinctCameras, ExportOptions, ExportSource
 
 GENERATED = "generated.txt"

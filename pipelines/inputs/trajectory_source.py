@@ -28,7 +28,7 @@ def open_trajectory(path: Path, *, layout: str = "auto", root: Path | None = Non
         layout: of a file, see gvtools.trajectory_files.read_poses.
         root: of the download, for spec:NAME:SCENE; not looked at for anything else.
     """
-    from gvtools.scenes.colmap_files import find_model
+    from gvtools.scenes.colmap_model import find_model
     from gvtools.scenes.data_sets.catalogue import open_address
     from gvtools.scenes.layout import is_address
     from gvtools.trajectory_files import Trajectory, read_poses

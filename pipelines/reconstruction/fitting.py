@@ -42,7 +42,7 @@ from gvtools.poses.views import FitView
 from gvtools.prefetch import prefetch
 from gvtools.runs.poses import RunPoses
 from gvtools.scenes.images import resize_nearest
-from gvtools.scenes.reduced import reduced
+from gvtools.scenes.resized import reduced
 from gvtools.scenes.scene import Frame, View
 from gvtools.untrusted import load_arrays
 from gvtools.view_selection import evenly_spread

@@ -18,7 +18,7 @@ from gvtools.errors import OptionError
 from gvtools.runs.digests import array_digest, fingerprint
 from gvtools.runs.poses import RunPoses, posed, with_poses
 from gvtools.scenes.layout import is_address
-from gvtools.scenes.reduced import reduced
+from gvtools.scenes.resized import reduced
 from gvtools.scenes.scene import Scene, View
 from gvtools.scenes.selection import check_disjoint, select
 from gvtools.settings import changes

@@ -17,7 +17,7 @@ from gvtools.poses.views import FitView
 from gvtools.prefetch import prefetch
 from gvtools.runs.layout import POSES, TUNED
 from gvtools.runs.poses import RunPoses, posed, with_poses
-from gvtools.scenes.reduced import reduced
+from gvtools.scenes.resized import reduced
 from gvtools.scenes.scene import Frame, Scene
 from gvtools.scenes.selection import select
 from gvtools.view_selection import evenly_spread

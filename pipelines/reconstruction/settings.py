@@ -15,7 +15,7 @@ from gvtools.depth.stereo.options import StereoOptions
 from gvtools.memory.back_projection import BackProjectionOptions
 from gvtools.memory.spatial_memory import MemoryOptions
 from gvtools.memory.splat.api import SplatOptions
-from gvtools.scenes.reduced import SMALLEST
+from gvtools.scenes.resized import SMALLEST
 from gvtools.settings import Settings
 from pipelines.tuning.options import TuneOptions
 

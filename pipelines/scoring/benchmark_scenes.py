@@ -107,8 +107,7 @@ def at_benchmark_size(scene: Scene, split: SceneSplit, *, size: tuple[int, int] 
 
     Without a size, pictures are reduced to what a run takes by default.
     """
-    from gvtools.scenes.reduced import reduced
-    from gvtools.scenes.resized import resized, seen_by
+    from gvtools.scenes.resized import reduced, resized, seen_by
     from pipelines.reconstruction.settings import RunSettings
 
     scene = reduced(scene, RunSettings().max_side) if size is None else resized(scene, *size)

@@ -18,8 +18,7 @@ from gvtools.depth.source import DepthMap, MixedDepth, RecordedDepth, is_recorde
 from gvtools.depth.stereo.options import StereoOptions
 from gvtools.depth.stereo.plane_sweep import PlaneSweepStereo
 from gvtools.errors import CheckpointError, DegenerateError, OptionError, ProjectError
-from gvtools.scenes.colmap import read_colmap
-from gvtools.scenes.colmap_depth import write_depth_map
+from gvtools.scenes.colmap import read_colmap, write_depth_map
 from gvtools.scenes.rgbd import SEVENSCENES
 from gvtools.scenes.scene import Frame, Scene, SparsePoints, View
 from pipelines.cli import main

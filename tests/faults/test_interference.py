@@ -16,7 +16,7 @@ from gvtools.capture.project import replaced_folder
 from gvtools.errors import ProjectError
 from gvtools.prefetch import prefetch
 from gvtools.runs.folder_lock import folder_lock
-from gvtools.scenes.colmap_writer import CAMERAS
+from gvtools.scenes.colmap_model import CAMERAS
 from pipelines.cli import main
 
 RUN = (*PLAIN, "--quiet")

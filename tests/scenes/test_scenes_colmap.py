@@ -6,8 +6,7 @@ import pytest
 from scenes_workspace import HEIGHT, LENSES, WIDTH, ramp, save, workspace
 
 from gvtools.errors import ProjectError
-from gvtools.scenes.colmap import read_colmap
-from gvtools.scenes.colmap_depth import write_depth_map
+from gvtools.scenes.colmap import read_colmap, write_depth_map
 from gvtools.scenes.inspection import reprojection_errors
 from gvtools.scenes.project import open_as, open_project
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from gvtools.cameras import Cameras, concatenate
 from gvtools.errors import GvError, OptionError
-from gvtools.scenes.transforms_json import write_transforms, written_here
+from gvtools.scenes.transforms import write_transforms, written_here
 from gvtools.trajectories import interpolate
 from viz.plots.canvas import GREEN, rgb_of
 from viz.viewer.nodes import SHARE, add_frustum, vertical_field_of_view

@@ -28,7 +28,7 @@ from gvtools.scenes.layout import Layout
 from gvtools.scenes.matching import pose_at, scenes_holding
 from gvtools.scenes.photographs import Depth, PosedFrame, posed_scene
 from gvtools.scenes.scene import Finding, Frame, Scene
-from gvtools.scenes.transforms_frame import LensParameters
+from gvtools.scenes.undistort import LensParameters
 from gvtools.untrusted import read_text
 
 if TYPE_CHECKING:

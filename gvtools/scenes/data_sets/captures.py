@@ -36,7 +36,7 @@ from gvtools.scenes.matching import natural, pictures_by_stem, pose_at, scenes_h
 from gvtools.scenes.photographs import Depth, PosedFrame, Registration, first_size, posed_scene
 from gvtools.scenes.rgbd import SCANNET, SCANNET_FOLDER, SEVENSCENES, RgbdOptions, rgbd_scene
 from gvtools.scenes.scene import Finding, Frame, Scene
-from gvtools.scenes.transforms_frame import LensParameters
+from gvtools.scenes.undistort import LensParameters
 from gvtools.untrusted import read_text, regular
 
 # --- 7-Scenes as published: ``SCENE/seq-NN/frame-NNNNNN.{color.png, depth.png, pose.txt}`` ------

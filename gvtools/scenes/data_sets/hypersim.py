@@ -44,7 +44,7 @@ from gvtools.scenes.layout import Layout
 from gvtools.scenes.matching import natural
 from gvtools.scenes.photographs import Depth, PosedFrame, posed_scene
 from gvtools.scenes.scene import Finding, Frame, Scene
-from gvtools.scenes.transforms_frame import LensParameters
+from gvtools.scenes.undistort import LensParameters
 from gvtools.untrusted import read_text
 
 PARAMETERS = "metadata_camera_parameters.csv"

@@ -17,7 +17,7 @@ import numpy as np
 
 from gvtools.errors import ProjectError
 from gvtools.scenes.calibration import MILLIMETRES, Float64, load_matrix, pinhole_lens
-from gvtools.scenes.colmap_files import find_model
+from gvtools.scenes.colmap_model import find_model
 from gvtools.scenes.data_sets.reconstructed import MIPNERF360
 from gvtools.scenes.depth_files import read_pfm_depth
 from gvtools.scenes.layout import Layout

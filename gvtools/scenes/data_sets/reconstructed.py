@@ -24,8 +24,14 @@ from gvtools.scenes.calibration import (
     json_file,
     pinhole_lens,
 )
-from gvtools.scenes.colmap_files import find_model, has_model
-from gvtools.scenes.colmap_model import ColmapModel, RegisteredImage, load_model, sparse_points
+from gvtools.scenes.colmap_model import (
+    ColmapModel,
+    RegisteredImage,
+    find_model,
+    has_model,
+    load_model,
+    sparse_points,
+)
 from gvtools.scenes.images import read_depth, readings
 from gvtools.scenes.layout import Layout
 from gvtools.scenes.matching import (
@@ -36,10 +42,9 @@ from gvtools.scenes.matching import (
 )
 from gvtools.scenes.photographs import Depth, PosedFrame, first_size, posed_scene
 from gvtools.scenes.scene import Finding, Scene, SparsePoints
-from gvtools.scenes.transforms_frame import LensParameters, frame_keys
-from gvtools.scenes.transforms_json import FILE as TRANSFORMS
-from gvtools.scenes.transforms_json import load_frames
-from gvtools.scenes.undistort import Undistortion
+from gvtools.scenes.transforms import FILE as TRANSFORMS
+from gvtools.scenes.transforms import frame_keys, load_frames
+from gvtools.scenes.undistort import LensParameters, Undistortion
 from gvtools.untrusted import is_file, load_array, regular
 
 FULL = "images"

@@ -35,7 +35,7 @@ from gvtools.scenes.layout import Layout
 from gvtools.scenes.matching import natural, numbers_in, scenes_holding
 from gvtools.scenes.photographs import Depth, PosedFrame, first_size, posed_scene
 from gvtools.scenes.scene import Finding, Frame, Scene
-from gvtools.scenes.transforms_frame import LensParameters
+from gvtools.scenes.undistort import LensParameters
 from gvtools.untrusted import open_picture, read_json
 
 LensOf = Callable[[Sequence[float], tuple[int, int]], LensParameters | None]

@@ -25,7 +25,7 @@ from gvtools.scenes.layout import Layout
 from gvtools.scenes.matching import natural
 from gvtools.scenes.photographs import PosedFrame, posed_scene
 from gvtools.scenes.scene import Finding, Frame, Scene
-from gvtools.scenes.transforms_frame import LensParameters
+from gvtools.scenes.undistort import LensParameters
 from gvtools.untrusted import regular
 
 CAMERAS = {1: "front", 2: "front_left", 3: "front_right", 4: "side_left", 5: "side_right"}

@@ -18,7 +18,7 @@ from typing import Any
 from gvtools.errors import GvError, OptionError, ProjectError
 from gvtools.files import make_folder, replaced_when_written, write_text
 from gvtools.scenes.collection import SceneCollection
-from gvtools.scenes.reduced import check_max_side, reduced
+from gvtools.scenes.resized import check_max_side, reduced
 from gvtools.scenes.scene import Scene, View
 from gvtools.scenes.shards.index import (
     INDEX,

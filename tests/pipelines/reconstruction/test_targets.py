@@ -81,7 +81,7 @@ def test_a_second_project_with_smaller_copies_of_the_pictures_is_refused(scene, 
     """Other files, sizes and intrinsics, but the same shots."""
     from PIL import Image
 
-    from gvtools.scenes.transforms_json import write_transforms
+    from gvtools.scenes.transforms import write_transforms
 
     cameras = scene.cameras.resized(48, 36)
     for name in cameras.names:

@@ -12,7 +12,7 @@ from data_sets.miniature import read_miniature as read
 from gvtools.errors import ProjectError
 from gvtools.scenes.colmap import read_colmap
 from gvtools.scenes.scene import Scene, natural_key
-from gvtools.scenes.transforms_json import read_transforms
+from gvtools.scenes.transforms import read_transforms
 
 ALL = miniatures()
 PARTIAL = [miniature for miniature in ALL if miniature.pictures]

@@ -30,7 +30,7 @@ from gvtools.scenes.data_sets.hypersim import read_color, turned_pinhole
 from gvtools.scenes.data_sets.mvs import decomposed
 from gvtools.scenes.matching import pose_at
 from gvtools.scenes.scene import Scene
-from gvtools.scenes.transforms_frame import LensParameters
+from gvtools.scenes.undistort import LensParameters
 from gvtools.scenes.video import read_frame
 
 

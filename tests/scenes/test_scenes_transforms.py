@@ -26,7 +26,7 @@ from gvtools.cameras import Cameras
 from gvtools.errors import GvError, ProjectError
 from gvtools.scenes.colmap import read_colmap
 from gvtools.scenes.scene import Finding
-from gvtools.scenes.transforms_json import read_transforms, write_transforms
+from gvtools.scenes.transforms import read_transforms, write_transforms
 from pipelines.cli import main
 
 
