@@ -52,12 +52,7 @@ def phone_scene(
 ) -> Scene:
     """The scene of an app's export, metric, in the poses' own world.
 
-    Args:
-        root: the export.
-        name: the app's.
-        frames: poses are world_from_cam for OpenCV's axes.
-        upright: whether y of the world points up, as gravity has it.
-        findings: what the reader met.
+    Poses are world_from_cam for OpenCV's axes; ``upright`` says that y of the world points up.
     """
     scene = posed_scene(
         root, frames, poses="world_from_cam", metric=True, kind=name, findings=tuple(findings)

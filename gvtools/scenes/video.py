@@ -17,17 +17,11 @@ from gvtools.untrusted import regular
 
 @dataclass(frozen=True)
 class VideoHeader:
-    """What a video's head says.
+    """Size and length of a video."""
 
-    Attributes:
-        size: width and height, pixels.
-        seconds: its length; infinity where the file does not say.
-        frame_seconds: from one frame to the next, on average.
-    """
-
-    size: tuple[int, int]
-    seconds: float
-    frame_seconds: float
+    size: tuple[int, int]  # width and height, pixels
+    seconds: float  # infinity where the file does not say
+    frame_seconds: float  # from one frame to the next, on average
 
 
 def video_header(path: Path) -> VideoHeader:
@@ -48,9 +42,7 @@ def video_header(path: Path) -> VideoHeader:
 def frame_seconds(path: Path, *, edits: bool = True) -> NDArray[np.float64]:
     """(N,) seconds of all frames from the video's beginning, in their order; nothing is decoded.
 
-    Args:
-        path: the video.
-        edits: whether frames that the file's edit list hides are left out.
+    With ``edits``, frames that the file's edit list hides are left out.
     """
     try:
         with _opened(path, edits=edits) as container:
@@ -67,13 +59,7 @@ def frame_seconds(path: Path, *, edits: bool = True) -> NDArray[np.float64]:
 
 
 def read_frame(path: Path, *, seconds: float, edits: bool = True) -> Frame:
-    """The frame of a video whose time stamp is nearest.
-
-    Args:
-        path: the video.
-        seconds: from its beginning.
-        edits: whether frames that the file's edit list hides are left out.
-    """
+    """The frame whose time stamp is nearest, in seconds from the video's beginning."""
     best, best_off = None, np.inf
     try:
         with _opened(path, edits=edits) as container:

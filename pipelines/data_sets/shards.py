@@ -59,7 +59,7 @@ def shards(args: argparse.Namespace, console: Console) -> None:
     if args.scenes:
         collection = collection.subset(args.scenes)
 
-    def said(done: WrittenShard) -> None:
+    def report(done: WrittenShard) -> None:
         shard = done.shard
         at = shard.views[-1].scene + 1
         console.line(
@@ -68,7 +68,7 @@ def shards(args: argparse.Namespace, console: Console) -> None:
         )
 
     options = ShardOptions(args.size, args.max_side)
-    index = write_shards(collection, args.out, options=options, progress=said)
+    index = write_shards(collection, args.out, options=options, progress=report)
     views = sum(scene.views for scene in index.scenes)
     depth = sum(scene.with_depth for scene in index.scenes)
     _warn(index.skipped, console)

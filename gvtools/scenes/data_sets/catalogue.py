@@ -86,7 +86,7 @@ class Licence(_Record):
 class GeometrySource(_Record):
     """Where the poses and depth of training samples come from (the paper's appendix)."""
 
-    # Own: the data set's. Estimated: by a network alone. Mixed: drawn at ``own_share``.
+    # Own: the data set's. Estimated: by a network alone. Mixed: sampled at ``own_share``.
     source: Literal["own", "estimated", "mixed"]
     # Probability of the data set's own geometry: 2/3 where own and estimated mix 2:1.
     own_share: float = Field(ge=0, le=1)

@@ -42,12 +42,9 @@ class MvsCamera:
     def frame(
         self, image: Path, *, sizes: tuple[tuple[int, int], ...], unit: float = 1.0
     ) -> PosedFrame:
-        """A frame of this camera.
+        """A frame of this camera, in units of ``unit`` scene units.
 
-        Args:
-            image: where its picture should be.
-            sizes: further sizes that the intrinsics may be of.
-            unit: scene units in a stored unit.
+        ``sizes`` are further ones that the intrinsics may be of.
         """
         size = size_of_intrinsics(self.K, first_size([image]) or (2, 2), *sizes)
         pose = self.cam_from_world.copy()
