@@ -247,7 +247,7 @@ def refine(
     guidance: Guidance,  # the targets' projections
     refiner: Refiner,  # on the device of the pass
     *,
-    batch: ViewBatch,  # filled as the model saw it (``conditioning.filled``)
+    batch: ViewBatch,  # filled as the model saw it (``conditioning.fill_holes``)
     generated: Generated,  # of the pass, with the hints' decoding
 ) -> Completed:
     """Completed views with the refiner's colours, and its confidence, in their holes."""

@@ -107,10 +107,10 @@ class GeoVerseConfig:
     # "hint" or "field".
     alignment: str = "centres"
     # Whether generated colours stay "unchanged" (the paper) or follow the memory's by a "field",
-    # see ``postprocess.aligned_color``.
+    # see ``composition.align_color``.
     color_alignment: str = "unchanged"
     # The completion is the model's "decoded" pictures and depth (the paper), or a "correction" of
-    # the filled projection, see ``correction``; it needs ``hints.fill``.
+    # the filled projection, see ``composition``; it needs ``hints.fill``.
     composition: str = "decoded"
     # What is asked how far completions are to be trusted, see ``refiner``; None for a model without
     # one. It needs ``composition = "correction"``.

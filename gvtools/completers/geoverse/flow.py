@@ -271,7 +271,7 @@ def teacher_times(upper: Tensor, lower: Tensor, *, steps: int, shift: float = 1.
 
 
 def reflow_pair(
-    # The many-step velocity of (B, ...) and t (B,); with guidance, see ``flow.guide``.
+    # The many-step velocity of (B, ...) and t (B,); with guidance, see ``guide``.
     teacher: Velocity,
     clean: Tensor,  # (B, ...) reference latents F^1
     noise: Tensor,  # (B, ...)
@@ -280,7 +280,7 @@ def reflow_pair(
     t: Tensor,  # (B,) in each interval, see ``interval_times``
     bounds: Sequence[float],  # tau_0 .. tau_K
     steps: int,  # of the teacher in each interval
-    shift: float = 1.0,  # of the teacher's time, see ``flow.shift_time``
+    shift: float = 1.0,  # of the teacher's time, see ``shift_time``
 ) -> ReflowPair:
     """Run the frozen teacher through one interval a sample and draw the straight line."""
     upper, lower = interval_ends(intervals, bounds)

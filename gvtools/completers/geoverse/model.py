@@ -2,7 +2,7 @@
 
 Data flow of one pass (tensor shapes in the README.md beside this file; equations are the paper's)::
 
-    pictures, projections --filled--> encode_hints (Eq. 1) --> hints
+    pictures, projections --fill_holes--> encode_hints (Eq. 1) --> hints
     hints, cameras, depth --> Conditions;  video prior --> control residuals | shared keys (once)
     noise --level-1 denoiser (Eq. 2), K Euler steps--> level 1 --cascade (Eq. 3)--> level 0
     level 1 --frozen blocks--> levels 2, 3;  all four --heads--> pictures, depth, rays
@@ -143,7 +143,7 @@ class GeoVerse(nn.Module):
                 heads=config.level1.heads,
                 video_channels=config.video.channels,
             )
-        # Used on completions, see ``composition.refined``; it stays float32.
+        # Used on completions, see ``composition.refine``; it stays float32.
         self.refiner = None if config.refiner is None else Refiner(config.refiner)
         # Not a submodule: its weights live in a folder of their own and are never trained.
         self._video: list[VideoPrior] = []

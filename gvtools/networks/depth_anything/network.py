@@ -69,7 +69,7 @@ class DepthAnything3(nn.Module):
         self.cam_dec = CameraDecoder(config.encoder.channels)
 
     def hold_in(self, dtype: torch.dtype) -> None:
-        """Keep products' weights in autocast's type, see ``precision``; the head is float32."""
+        """Keep products' weights in autocast's type, see ``compute``; the head is float32."""
         hold_in(dtype, self.backbone, self.cam_enc, self.cam_dec)
 
     @property
