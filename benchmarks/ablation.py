@@ -68,7 +68,7 @@ PARTS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "pose refinement": ({"refine.poses": False}, {}),
     "depth in the loss": ({"refine.depth": 0.0}, {}),
     # More views than are asked.
-    "check of depth by other views": ({}, {"gvtools.depth.view_check.LEAST": 255}),
+    "check of depth by other views": ({}, {"gvtools.depth.source.LEAST": 255}),
     # The default, 0, keeps all.
     "completions of little confidence": ({"fusion.min_confidence": 0.35}, {}),
     "Gaussians' colours in holes": (

@@ -30,7 +30,7 @@ from benchmarks.made_scenes import PLACES, write_place
 from benchmarks.reliability import reliability
 from gvtools import open_project
 from gvtools.cameras import Cameras, concatenate
-from gvtools.depth.stereo.consistency import agreement
+from gvtools.depth.stereo.filtering import agreement
 from gvtools.runs.context_depth import context_depth_files
 from gvtools.runs.layout import round_folder
 from gvtools.runs.run import Run, load_run

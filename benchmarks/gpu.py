@@ -184,7 +184,7 @@ def gaussians(sizes: Sizes) -> Figures:
 
 def plane_sweep(sizes: Sizes) -> Figures:
     """Depth of one view of the demo's room from its photographs."""
-    from gvtools.depth.stereo.options import StereoOptions
+    from gvtools.depth.options import StereoOptions
     from gvtools.depth.stereo.plane_sweep import PlaneSweepStereo
     from gvtools.procedural.room_sample import write_room
     from gvtools.scenes.project import open_project

@@ -22,8 +22,8 @@ import numpy as np
 
 from benchmarks.exposures import Exposures, estimate_exposures
 from gvtools.depth.choice import choose_source
+from gvtools.depth.options import StereoOptions
 from gvtools.depth.source import DepthMap
-from gvtools.depth.stereo.options import StereoOptions
 from gvtools.evaluation.images import psnr
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.store.views import PointSet

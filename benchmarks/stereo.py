@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.reliability import Reliability, reliability
-from gvtools.depth.stereo.options import StereoOptions
+from gvtools.depth.options import StereoOptions
 from gvtools.depth.stereo.plane_sweep import PlaneSweepStereo
 from gvtools.procedural.room_sample import write_room
 from gvtools.scenes.project import open_project

@@ -6,9 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from gvtools.depth.colmap_patch_match import ColmapPatchMatch, has_patch_match
-from gvtools.depth.foundation.options import FoundationOptions
+from gvtools.depth.options import FoundationOptions, StereoOptions
 from gvtools.depth.source import DepthSource, MixedDepth, RecordedDepth
-from gvtools.depth.stereo.options import StereoOptions
 from gvtools.errors import OptionError, ProjectError
 from gvtools.scenes.scene import Scene, View
 from gvtools.settings import changes
@@ -74,7 +73,7 @@ def rough_source(scene: Scene, source: DepthSource) -> DepthSource:
     """
     if isinstance(source, MixedDepth):
         return rough_source(scene, source.computed)
-    from gvtools.depth.foundation.source import FoundationDepth
+    from gvtools.depth.foundation import FoundationDepth
     from gvtools.depth.stereo.plane_sweep import PlaneSweepStereo
 
     if not isinstance(source, (PlaneSweepStereo, ColmapPatchMatch, FoundationDepth)):
@@ -89,7 +88,7 @@ def rough_source(scene: Scene, source: DepthSource) -> DepthSource:
 
 def is_estimated(source: DepthSource, view: View) -> bool:
     """Whether a network that has learnt depth gives that of ``view``."""
-    from gvtools.depth.foundation.source import FoundationDepth
+    from gvtools.depth.foundation import FoundationDepth
 
     if isinstance(source, MixedDepth):
         return not source.recorded.covers(view) and is_estimated(source.computed, view)
@@ -167,7 +166,7 @@ def _stereo(scene: Scene, views: Sequence[str], options: StereoOptions | None) -
 
 
 def _foundation(scene: Scene, views: Sequence[str], options: FoundationOptions) -> DepthSource:
-    from gvtools.depth.foundation.source import FoundationDepth
+    from gvtools.depth.foundation import FoundationDepth
 
     return FoundationDepth(scene, views=views, options=options)
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gvtools.appearance.appearance import Appearance
 from gvtools.depth.source import DepthMap
-from gvtools.depth.stereo.consistency import agreement
+from gvtools.depth.stereo.filtering import agreement
 from gvtools.scenes.images import resize_nearest
 from gvtools.scenes.scene import Frame, Scene, View
 from gvtools.view_selection import nearest_views

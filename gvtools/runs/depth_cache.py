@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.depth.fitted_depth import FittedDepth
-from gvtools.depth.scale_check import disagrees, scale_to_points
+from gvtools.depth.scale import disagrees, scale_to_points
 from gvtools.depth.source import DepthMap, DepthSource, RecordedDepth, is_recorded
 from gvtools.errors import DegenerateError, ProjectError
 from gvtools.runs.context_depth import (

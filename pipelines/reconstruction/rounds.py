@@ -25,7 +25,7 @@ from gvtools.completers.base import (
     run_completer,
 )
 from gvtools.depth.from_memory import MEMORY, depth_from_memory
-from gvtools.depth.scale_check import disagrees, scale_to_points
+from gvtools.depth.scale import disagrees, scale_to_points
 from gvtools.depth.source import DepthMap
 from gvtools.errors import ProjectError
 from gvtools.guidance import Guidance, concatenate

@@ -10,8 +10,7 @@ from pydantic import Field
 
 from gvtools.appearance.fit_options import FitOptions
 from gvtools.completers.effort import EffortPolicy
-from gvtools.depth.foundation.options import FoundationOptions
-from gvtools.depth.stereo.options import StereoOptions
+from gvtools.depth.options import FoundationOptions, StereoOptions
 from gvtools.memory.back_projection import BackProjectionOptions
 from gvtools.memory.spatial_memory import MemoryOptions
 from gvtools.memory.splat.api import SplatOptions

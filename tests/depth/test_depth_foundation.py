@@ -11,10 +11,10 @@ from safetensors.torch import save_file
 from tiny_scan import SQUARE, WALL, render, write_colmap_scan, write_scan
 
 from gvtools.completers.geoverse.views import resample
+from gvtools.depth import foundation as module
 from gvtools.depth.choice import choose_source
-from gvtools.depth.foundation import source as module
-from gvtools.depth.foundation.options import FoundationOptions
-from gvtools.depth.foundation.source import FoundationDepth
+from gvtools.depth.foundation import FoundationDepth
+from gvtools.depth.options import FoundationOptions
 from gvtools.depth.source import MixedDepth
 from gvtools.errors import CheckpointError, DegenerateError, ProjectError
 from gvtools.networks.depth_anything.encoder import EncoderConfig

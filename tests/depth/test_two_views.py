@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from walls import camera_at, photograph
 
-from gvtools.depth.stereo.options import StereoOptions
+from gvtools.depth.options import StereoOptions
 from gvtools.depth.stereo.plane_sweep import PlaneSweepStereo
 from gvtools.procedural.stereo_sample import write_motorcycle
 from gvtools.scenes.project import open_project

@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gvtools.depth.foundation.options import FoundationOptions
-from gvtools.depth.stereo.options import StereoOptions
+from gvtools.depth.options import FoundationOptions, StereoOptions
 from gvtools.errors import OptionError
 from gvtools.scenes.rgbd import RgbdOptions
 from gvtools.settings import (

@@ -9,31 +9,31 @@ import torch
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras, concatenate
+from gvtools.depth.options import StereoOptions
 from gvtools.depth.source import DepthMap
-from gvtools.depth.stereo import cleanup, silhouettes
-from gvtools.depth.stereo.back_ends import make_matcher
-from gvtools.depth.stereo.confidence import confidence_of
-from gvtools.depth.stereo.consistency import agreement
-from gvtools.depth.stereo.depth_range import DepthRange, estimate_range
-from gvtools.depth.stereo.motion import enough_disparity, only_turned
-from gvtools.depth.stereo.options import StereoOptions
-from gvtools.depth.stereo.pyramid import (
+from gvtools.depth.stereo import filtering
+from gvtools.depth.stereo.filtering import agreement, confidence_of
+from gvtools.depth.stereo.geometry import DepthRange, choose_sources, estimate_range
+from gvtools.depth.stereo.matching import (
+    Matcher,
     Pyramid,
     build_pyramid,
     resampled,
     resampled_colors,
+    textured,
     working_size,
 )
-from gvtools.depth.stereo.residual_flow import residual_flow
+from gvtools.depth.stereo.matching_cpu import CpuMatcher
+from gvtools.depth.stereo.matching_torch import TorchMatcher, residual_flow
 from gvtools.depth.stereo.single_view import (
     CoarseDepth,
     RawDepth,
     coarse_depth,
+    enough_disparity,
     fine_depth,
     narrowed,
+    only_turned,
 )
-from gvtools.depth.stereo.sources import choose_sources
-from gvtools.depth.stereo.texture import textured
 from gvtools.errors import DegenerateError, OptionError
 from gvtools.poses.dense_adjustment import PoseEquations, adjusted, pose_equations
 from gvtools.scenes.scene import Frame, Scene, View
@@ -109,11 +109,11 @@ class PlaneSweepStereo:
         guide = self._pyramid(view, frame).images[0].numpy()
         trust = confidence.cpu().numpy()
         known = self._outlined(depth, matched.cpu().numpy(), confirmed.cpu().numpy(), frame=frame)
-        known = cleanup.weighted_median(known, guide, trust, 2)
+        known = filtering.weighted_median(known, guide, trust, 2)
         height, width = frame.rgb.shape[:2]
         if known.shape != (height, width):
             full = build_pyramid(frame.rgb, view.camera, max_side=max(height, width), levels=1)
-            known, trust = cleanup.enlarged(known, guide, full.images[0].numpy(), trust)
+            known, trust = filtering.enlarged(known, guide, full.images[0].numpy(), trust)
         if frame.mask is not None:
             known = np.where(frame.mask, known, np.float32(0))
         return DepthMap(known, np.where(known > 0, trust, np.float32(1)), self.name)
@@ -130,16 +130,16 @@ class PlaneSweepStereo:
         options = self.options
         nothing = np.float32(0)
         known = np.where(confirmed, depth, nothing)
-        known = cleanup.without_speckles(known, options.tolerance, options.speckle)
+        known = filtering.without_speckles(known, options.tolerance, options.speckle)
         if not (options.trim or options.regrow):
             return known
         rgb = resampled_colors(frame.rgb, depth.shape[1], depth.shape[0])
         candidates = np.where(matched, depth, known)
         if options.trim:
-            known = silhouettes.trimmed(known, rgb, options.window // 2 + 2)
+            known = filtering.trimmed(known, rgb, options.window // 2 + 2)
         if options.regrow:
-            known = silhouettes.regrown(known, candidates, rgb, options.tolerance, options.regrow)
-        return cleanup.without_speckles(known, options.tolerance, options.speckle)
+            known = filtering.regrown(known, candidates, rgb, options.tolerance, options.regrow)
+        return filtering.without_speckles(known, options.tolerance, options.speckle)
 
     def raw(self, view: View, frame: Frame | None = None) -> RawDepth:
         """A view's own estimate, before other views are asked; kept for the views in ``views``."""
@@ -293,6 +293,17 @@ class PlaneSweepStereo:
         pose = self._poses.cam_from_world[self.views.index(view.name)][None]
         cameras = tuple(replace(camera, cam_from_world=pose) for camera in pyramid.cameras)
         return replace(pyramid, cameras=cameras)
+
+
+def make_matcher(options: StereoOptions) -> tuple[Matcher, torch.device]:
+    """The back end of the options, and where its tensors live."""
+    if options.backend == "cpu":
+        return CpuMatcher(options), torch.device("cpu")
+    there = torch.cuda.is_available()
+    if options.device == "cuda" and not there:
+        raise OptionError("stereo device 'cuda': torch sees no CUDA device; choose 'auto' or 'cpu'")
+    cuda = options.device == "cuda" or (options.device == "auto" and there)
+    return TorchMatcher(options), torch.device("cuda" if cuda else "cpu")
 
 
 def _halved(pyramid: Pyramid) -> Pyramid:

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from stereo_scenes import plane_scene
 
+from gvtools.depth.options import StereoOptions
 from gvtools.depth.source import DepthMap
-from gvtools.depth.stereo.cleanup import enlarged, weighted_median, without_speckles
-from gvtools.depth.stereo.options import StereoOptions
+from gvtools.depth.stereo.filtering import enlarged, weighted_median, without_speckles
 from gvtools.depth.stereo.plane_sweep import PlaneSweepStereo
 from gvtools.errors import DegenerateError, OptionError, ProjectError
 from gvtools.scenes.scene import Frame, Scene

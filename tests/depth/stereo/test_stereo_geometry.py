@@ -12,11 +12,16 @@ from scipy.spatial.transform import Rotation
 from stereo_scenes import plane_scene
 
 from gvtools.cameras import Cameras, invert_rigid
-from gvtools.depth.stereo.consistency import agreement
-from gvtools.depth.stereo.depth_range import estimate_range, range_of_depths, seen_points
-from gvtools.depth.stereo.pyramid import build_pyramid, level_of
-from gvtools.depth.stereo.residual_flow import residual_flow
-from gvtools.depth.stereo.sources import choose_sources, parallax
+from gvtools.depth.stereo.filtering import agreement
+from gvtools.depth.stereo.geometry import (
+    choose_sources,
+    estimate_range,
+    parallax,
+    range_of_depths,
+    seen_points,
+)
+from gvtools.depth.stereo.matching import build_pyramid, level_of
+from gvtools.depth.stereo.matching_torch import residual_flow
 from gvtools.errors import DegenerateError
 from gvtools.poses.dense_adjustment import adjusted, pose_equations
 from gvtools.scenes.scene import Scene, SparsePoints

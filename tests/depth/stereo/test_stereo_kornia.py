@@ -8,8 +8,8 @@ from scipy.ndimage import map_coordinates, uniform_filter
 from scipy.spatial.transform import Rotation
 
 from gvtools.cameras import Cameras
+from gvtools.depth.stereo.matching import build_pyramid
 from gvtools.depth.stereo.matching_torch import bilinear, window_mean
-from gvtools.depth.stereo.pyramid import build_pyramid
 from gvtools.poses.dense_adjustment import _rigid
 
 RNG = np.random.default_rng(5)

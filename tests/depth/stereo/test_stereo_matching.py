@@ -9,15 +9,20 @@ import pytest
 import torch
 from stereo_scenes import plane_scene
 
-from gvtools.depth.stereo.back_ends import make_matcher
-from gvtools.depth.stereo.depth_range import DepthRange
-from gvtools.depth.stereo.hypotheses import best_plane, parabola, plane_hypotheses
+from gvtools.depth.options import StereoOptions
+from gvtools.depth.stereo.geometry import (
+    DepthRange,
+    best_plane,
+    disparity_rate,
+    parabola,
+    plane_hypotheses,
+    relative_warps,
+)
+from gvtools.depth.stereo.matching import build_pyramid, level_of, window_taps, window_weights
 from gvtools.depth.stereo.matching_cpu import CpuMatcher
 from gvtools.depth.stereo.matching_torch import TorchMatcher
-from gvtools.depth.stereo.options import StereoOptions
-from gvtools.depth.stereo.pyramid import build_pyramid, level_of, window_taps, window_weights
-from gvtools.depth.stereo.refinement import fitted, refined, upsampled
-from gvtools.depth.stereo.warps import disparity_rate, relative_warps
+from gvtools.depth.stereo.plane_sweep import make_matcher
+from gvtools.depth.stereo.single_view import fitted, refined, upsampled
 from gvtools.errors import OptionError
 
 OPTIONS = StereoOptions(sources=2, best=1)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from stereo_scenes import plane_scene
 
-from gvtools.depth.stereo.options import StereoOptions
+from gvtools.depth.options import StereoOptions
+from gvtools.depth.stereo.filtering import ALIKE, ROUNDS, regrown, trimmed
 from gvtools.depth.stereo.plane_sweep import PlaneSweepStereo
-from gvtools.depth.stereo.silhouettes import ALIKE, ROUNDS, regrown, trimmed
 
 ROOF, SKY = 60, 230
 

@@ -11,11 +11,11 @@ import torch
 from scipy import ndimage
 from stereo_scenes import niche_depth, niche_scene, plane_scene, turning_scene
 
-from gvtools.depth.stereo.depth_range import DepthRange, baselines
-from gvtools.depth.stereo.motion import enough_disparity
-from gvtools.depth.stereo.options import StereoOptions
+from gvtools.depth.options import StereoOptions
+from gvtools.depth.stereo.geometry import DepthRange, baselines
+from gvtools.depth.stereo.matching import CLEAR, detail_of, noise_of, textured
 from gvtools.depth.stereo.plane_sweep import PlaneSweepStereo
-from gvtools.depth.stereo.texture import CLEAR, detail_of, noise_of, textured
+from gvtools.depth.stereo.single_view import enough_disparity
 from gvtools.errors import DegenerateError
 from gvtools.scenes.scene import Scene, View
 

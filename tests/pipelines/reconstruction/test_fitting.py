@@ -20,7 +20,7 @@ from gvtools.appearance.gaussians import Gaussians
 from gvtools.appearance.picture import Picture
 from gvtools.appearance.splat.project_kernels import VALUES
 from gvtools.appearance.start import from_points
-from gvtools.depth.foundation.source import FoundationDepth
+from gvtools.depth.foundation import FoundationDepth
 from gvtools.depth.source import DepthMap
 from gvtools.errors import DegenerateError, MemoryFileError, ProjectError
 from gvtools.memory.projection import project

@@ -1,4 +1,4 @@
-"""What can be chosen about stereo, and in which ranges."""
+"""Options of computed depth: the plane sweep and Depth Anything 3."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Literal
 from pydantic import Field, model_validator
 
 from gvtools.errors import OptionError
+from gvtools.networks import Precision
 from gvtools.settings import Settings
 
 
@@ -47,7 +48,7 @@ class StereoOptions(Settings):
     poses come from a tracker or a sensor, not from a bundle adjustment."""
     trim: bool = True
     """Take back depth that windows carried past the outlines of the picture; see
-    gvtools.depth.stereo.silhouettes."""
+    gvtools.depth.stereo.filtering."""
     regrow: int = Field(20, ge=0)
     """How far depth is then continued, where colour and depth run on, into pixels of the finest
     level that match but that no other view confirms; 0 for not at all. [px]"""
@@ -68,3 +69,27 @@ class StereoOptions(Settings):
         if self.window % 2 == 0:
             raise OptionError(f"stereo.window {self.window}; expected an odd number")
         return self
+
+
+class FoundationOptions(Settings):
+    """How Depth Anything 3 is run."""
+
+    section = "da3"
+
+    weights: str | None = None
+    """Folder with ``model.safetensors`` of DA3-SMALL or DA3-BASE, or a GeoVerse folder."""
+    longest: int = Field(504, ge=28)
+    """Longer side of the network's pictures, rounded to its patch. 504 is what the released models
+    are used with. [px]"""
+    views: int = Field(8, ge=1)
+    """Most views a pass; memory grows with its square."""
+    cameras: bool = True
+    """The known cameras go into the network. Without them every pass has a unit of its own, and
+    each needs its own support for a scale."""
+    min_confidence: float = Field(0.2, ge=0, lt=1)
+    """Pixels below this, of 1 - 1 / (the head's confidence), are left empty."""
+    precision: Precision = "auto"
+    """``auto`` is float32 on a CPU and bfloat16 on a GPU, float16 before compute capability 8.0.
+    The geometry head is float32 everywhere."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where the network runs; "auto" takes CUDA where there is one."""

@@ -17,8 +17,8 @@ import torch
 from gvtools.cameras import concatenate
 from gvtools.completers.geoverse.camera_encoding import normalised_poses
 from gvtools.completers.geoverse.views import model_size, resample, resample_depth
-from gvtools.depth.foundation.options import FoundationOptions
-from gvtools.depth.foundation.scale import FoundationScale, Pass, fit_scale
+from gvtools.depth.options import FoundationOptions
+from gvtools.depth.scale import FoundationScale, Pass, fit_scale
 from gvtools.depth.source import DepthMap
 from gvtools.errors import CheckpointError, DegenerateError, OptionError
 from gvtools.networks.compute import autocast, inference_type

@@ -1,1 +1,0 @@
-"""Depth Anything 3 as a depth source; see ``source.py``."""
