@@ -40,7 +40,7 @@ def exported(run, tmp_path_factory):
     folder = tmp_path_factory.mktemp("exported")
 
     def export(name: str, form: str, *words: object) -> Path:
-        export_run(run.folder, "--format", form, "--out", folder / name, *words)
+        export_run(run.folder, form, folder / name, *words)
         return folder / name
 
     return export

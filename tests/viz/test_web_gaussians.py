@@ -55,7 +55,7 @@ def unpacked(viewer):
 def test_the_page_gets_the_gaussians_of_the_exported_file(viewer, run, tmp_path):
     viewer._show_look(SPLATS)
     centers, covariances, rgba, rounds = unpacked(viewer)
-    export_run(run.folder, "--format", "splat", "--out", tmp_path / "out.ply")
+    export_run(run.folder, "splat", tmp_path / "out.ply")
     file = read_splats(tmp_path / "out.ply")
     order, other = np.lexsort(centers.round(4).T), np.lexsort(file["positions"].round(4).T)
     np.testing.assert_allclose(centers[order], file["positions"][other], atol=2e-4)
@@ -89,7 +89,7 @@ def test_rounds_and_looks_say_which_nodes_are_shown(viewer):
 def test_a_browser_draws_them_as_a_plain_rasteriser_does(viewer, run, scene, tmp_path):
     viewer._show_look(SPLATS)
     viewer._cameras.set_kinds(dict.fromkeys(("context", "target"), False))
-    export_run(run.folder, "--format", "splat", "--out", tmp_path / "out.ply")
+    export_run(run.folder, "splat", tmp_path / "out.ply")
     file = read_splats(tmp_path / "out.ply")
     shown = viewer.run.gaussians_of(viewer.budget)
     np.testing.assert_allclose(shown.centers, file["positions"], atol=1e-6)

@@ -72,27 +72,27 @@ def test_points_all_around_the_origin_are_thinned_to_few(limit):
 
 
 def test_ply_is_what_plyfile_reads(memory, saved, tmp_path):
-    export_run(saved, "--format", "ply", "--out", tmp_path / "cloud.ply")
+    export_run(saved, "ply", tmp_path / "cloud.ply")
     vertex = PlyData.read(tmp_path / "cloud.ply")["vertex"]
     xyz = np.stack([vertex[axis] for axis in "xyz"], axis=1)
     np.testing.assert_allclose(xyz, memory.positions, atol=1e-6)
     assert vertex["generated"].sum() == memory.generated.sum()
-    export_run(saved, "--format", "ply", "--out", tmp_path / "cloud.ply", "--max-points", 200)
+    export_run(saved, "ply", tmp_path / "cloud.ply", "--max-points", 200)
     assert 0 < PlyData.read(tmp_path / "cloud.ply")["vertex"].count <= 200
 
 
 def test_an_earlier_round(memory, saved, tmp_path):
-    export_run(saved, "--format", "ply", "--out", tmp_path / "cloud.ply", "--round", 1)
+    export_run(saved, "ply", tmp_path / "cloud.ply", "--round", 1)
     vertex = PlyData.read(tmp_path / "cloud.ply")["vertex"]
     rounds = memory.views.round[memory.columns.view[: len(memory)]]
     assert vertex.count == int((rounds <= 1).sum())
     assert not vertex["generated"].any()
     with pytest.raises(OptionError, match="rounds 0, 1, 2"):
-        export_run(saved, "--format", "ply", "--out", tmp_path / "cloud.ply", "--round", 7)
+        export_run(saved, "ply", tmp_path / "cloud.ply", "--round", 7)
 
 
 def test_colmap_reads_the_model_back(scene, memory, saved, tmp_path):
-    export_run(saved, "--format", "colmap", "--out", tmp_path / "out", "--max-points", 1500)
+    export_run(saved, "colmap", tmp_path / "out", "--max-points", 1500)
     model = pycolmap.Reconstruction(tmp_path / "out" / "sparse" / "0")
     assert model.num_reg_images() == 3
     for image in model.images.values():
@@ -118,7 +118,7 @@ def test_colmap_reads_the_model_back(scene, memory, saved, tmp_path):
 
 
 def test_each_track_element_is_an_observation_of_its_view(scene, memory, saved, tmp_path):
-    export_run(saved, "--format", "colmap", "--out", tmp_path / "out", "--max-points", 100_000)
+    export_run(saved, "colmap", tmp_path / "out", "--max-points", 100_000)
     model = pycolmap.Reconstruction(tmp_path / "out" / "sparse" / "0")
     assert model.num_points3D() == memory.voxels
     # The kept observation projects onto its own detection exactly.
@@ -138,9 +138,7 @@ def test_each_track_element_is_an_observation_of_its_view(scene, memory, saved, 
 
 def test_transforms_open_as_a_project(scene, memory, saved, tmp_path):
     folder = scene.root
-    export_run(
-        saved, "--format", "transforms", "--out", tmp_path / "out", "--images", folder / "images"
-    )
+    export_run(saved, "transforms", tmp_path / "out", "--images", folder / "images")
     project = open_project(tmp_path / "out" / "transforms.json")
     by_name = {view.name.split("/")[-1]: view for view in project}
     assert set(by_name) == {"view_0.png", "view_2.png", "view_4.png"}
@@ -160,7 +158,7 @@ def test_transforms_open_as_a_project(scene, memory, saved, tmp_path):
 
 def test_glb_is_what_trimesh_reads(memory, saved, tmp_path):
     trimesh = pytest.importorskip("trimesh")
-    export_run(saved, "--format", "glb", "--out", tmp_path / "cloud.glb")
+    export_run(saved, "glb", tmp_path / "cloud.glb")
     scene = trimesh.load_scene(tmp_path / "cloud.glb")
     (cloud,) = scene.dump()
     kept = thinned(memory, None)
@@ -175,7 +173,7 @@ def test_glb_keeps_millimetres_far_from_the_origin(scene, tmp_path):
     far.frame = LocalFrame.at(ORIGIN)
     far.views.frame = far.frame
     far.save(tmp_path / "memory.npz")
-    export_run(tmp_path / "memory.npz", "--format", "glb", "--out", tmp_path / "cloud.glb")
+    export_run(tmp_path / "memory.npz", "glb", tmp_path / "cloud.glb")
     loaded = trimesh.load_scene(tmp_path / "cloud.glb")
     matrix, name = loaded.graph[loaded.graph.nodes_geometry[0]]
     local = np.asarray(loaded.geometry[name].vertices)
@@ -196,14 +194,14 @@ def test_an_absent_package_is_named_with_what_to_install(saved, tmp_path, monkey
         monkeypatch.setitem(sys.modules, package, None)
     out = tmp_path / f"out{next(iter(form.suffixes))}"
     with pytest.raises(OptionError, match=rf"{form.needs[0]}.*pip install 'gvtools\[export\]'"):
-        export_run(saved, "--format", kind, "--out", out)
+        export_run(saved, kind, out)
     assert not out.exists()
 
 
 @pytest.mark.parametrize("kind", [name for name, form in FORMATS.items() if form.suffixes])
 def test_another_suffix_is_refused(saved, tmp_path, kind):
     with pytest.raises(OptionError, match=f"ends with {next(iter(FORMATS[kind].suffixes))}"):
-        export_run(saved, "--format", kind, "--out", tmp_path / "out.jpg")
+        export_run(saved, kind, tmp_path / "out.jpg")
     assert not (tmp_path / "out.jpg").exists()
 
 
@@ -216,28 +214,28 @@ def test_the_command_line_ends_with_2_for_a_wrong_name(saved, tmp_path, capsys):
 
 def test_a_view_fused_twice_is_one_camera(scene, tmp_path):
     fused(scene, [0, 0, 2]).save(tmp_path / "memory.npz")
-    export_run(tmp_path / "memory.npz", "--format", "colmap", "--out", tmp_path / "out")
+    export_run(tmp_path / "memory.npz", "colmap", tmp_path / "out")
     model = pycolmap.Reconstruction(tmp_path / "out" / "sparse" / "0")
     assert sorted(i.name for i in model.images.values()) == ["view_0.png", "view_2.png"]
 
 
 def test_options_that_make_no_sense(saved, tmp_path):
     with pytest.raises(OptionError, match="1 or more"):
-        export_run(saved, "--format", "ply", "--out", tmp_path / "a.ply", "--max-points", 0)
+        export_run(saved, "ply", tmp_path / "a.ply", "--max-points", 0)
     with pytest.raises(OptionError, match="transforms does not take it"):
-        export_run(saved, "--format", "transforms", "--out", tmp_path / "a", "--max-points", 5)
+        export_run(saved, "transforms", tmp_path / "a", "--max-points", 5)
     with pytest.raises(OptionError, match=r"las does not take it \(mesh do"):
-        export_run(saved, "--format", "las", "--out", tmp_path / "a.las", "--voxel", 0.1)
+        export_run(saved, "las", tmp_path / "a.las", "--voxel", 0.1)
     for option, value in (("--voxel", 0), ("--voxel", "nan"), ("--max-triangles", 0)):
         with pytest.raises(OptionError, match="expected"):
-            export_run(saved, "--format", "mesh", "--out", tmp_path / "a.ply", option, value)
+            export_run(saved, "mesh", tmp_path / "a.ply", option, value)
 
 
 @pytest.mark.parametrize("kind", ["colmap", "transforms", "mesh"])
 def test_a_ply_has_no_cameras_to_export(memory, tmp_path, kind):
     export_memory_ply(memory, tmp_path / "cloud.ply")
     with pytest.raises(OptionError, match="a PLY, which holds no cameras"):
-        export_run(tmp_path / "cloud.ply", "--format", kind, "--out", tmp_path / "out.ply")
+        export_run(tmp_path / "cloud.ply", kind, tmp_path / "out.ply")
     assert not (tmp_path / "out.ply").exists()
 
 
@@ -253,7 +251,7 @@ def test_a_target_that_cannot_be_written(saved, tmp_path, kind):
         (name / "in the way").mkdir(parents=True)
     before = sorted(tmp_path.rglob("*"))
     with pytest.raises(ProjectError, match=r"written"):
-        export_run(saved, "--format", kind, "--out", out)
+        export_run(saved, kind, out)
     assert sorted(tmp_path.rglob("*")) == before
 
 
@@ -266,13 +264,13 @@ def test_files_that_are_no_export_and_the_input_itself_are_kept(saved, tmp_path)
         ("ply", tmp_path, "ends with .ply"),
     ):
         with pytest.raises(OptionError, match=text):
-            export_run(saved, "--format", form, "--out", out)
+            export_run(saved, form, out)
     (tmp_path / "mine.ply").write_text("notes")
     with pytest.raises(OptionError, match="no PLY file"):
-        export_run(saved, "--format", "ply", "--out", tmp_path / "mine.ply")
+        export_run(saved, "ply", tmp_path / "mine.ply")
     assert (tmp_path / "mine.ply").read_text() == "notes"
     assert memory.read_bytes() == before
-    export_run(saved, "--format", "ply", "--out", tmp_path / "one.ply")
-    export_run(saved, "--format", "ply", "--out", tmp_path / "one.ply", "--max-points", 50)
+    export_run(saved, "ply", tmp_path / "one.ply")
+    export_run(saved, "ply", tmp_path / "one.ply", "--max-points", 50)
     with pytest.raises(OptionError, match="the input"):
-        export_run(tmp_path / "one.ply", "--format", "ply", "--out", tmp_path / "one.ply")
+        export_run(tmp_path / "one.ply", "ply", tmp_path / "one.ply")

@@ -2,33 +2,21 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 
 import numpy as np
 import pycolmap
 import pytest
 from box_project import VOXEL, fused
+from export_runs import export_run
 from PIL import Image
 
 from gvtools.cameras import Cameras
 from gvtools.errors import OptionError, ProjectError
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.store.views import SourceView
-from pipelines.commands import export
-from pipelines.console import Console
 
 ORIGIN = (431_000.0, 5_650_000.0, 120.0)
-
-
-def parsed(*words: object) -> argparse.Namespace:
-    parser = argparse.ArgumentParser()
-    export.add_arguments(parser)
-    return parser.parse_args([str(word) for word in words])
-
-
-def run(*words: object) -> None:
-    export.run(parsed(*words), Console(quiet=True))
 
 
 @pytest.fixture
@@ -61,7 +49,7 @@ def test_two_observed_cameras_of_one_name_are_refused(scene, tmp_path, kind):
     add_view(memory, memory.views[1].camera, "view_0.png", number=1, generated=False)
     memory.save(tmp_path / "memory.npz")
     with pytest.raises(ProjectError, match="two different observed cameras"):
-        run(tmp_path / "memory.npz", "--format", kind, "--out", tmp_path / "out")
+        export_run(tmp_path / "memory.npz", kind, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -92,7 +80,7 @@ def test_generated_views_give_way_to_names_that_are_taken(scene, tmp_path):
         "generated/own.png": 5,
         "generated_2/view_0.png": 4,
     }
-    run(run_folder, "--format", "colmap", "--out", tmp_path / "out")
+    export_run(run_folder, "colmap", tmp_path / "out")
     poses, generated = exported(tmp_path / "out")
     assert set(poses) == set(expected)
     for name, row in expected.items():
@@ -113,7 +101,7 @@ def test_new_names_stand_in_transforms_too(scene, tmp_path):
     add_view(memory, scene.views[3].camera, "view_0.png", number=2, generated=True)
     memory.save(tmp_path / "memory.npz")
     out = tmp_path / "out"
-    run(tmp_path / "memory.npz", "--format", "transforms", "--out", out)
+    export_run(tmp_path / "memory.npz", "transforms", out)
     frames = json.loads((out / "transforms.json").read_text())["frames"]
     assert {frame["file_path"]: frame.get("generated", False) for frame in frames} == {
         "images/view_0.png": False,
@@ -134,7 +122,7 @@ def test_track_elements_follow_the_renamed_views(scene, tmp_path):
     count = int(memory.generated.sum())
     assert count
     memory.save(tmp_path / "memory.npz")
-    run(tmp_path / "memory.npz", "--format", "colmap", "--out", tmp_path / "out")
+    export_run(tmp_path / "memory.npz", "colmap", tmp_path / "out")
     model = pycolmap.Reconstruction(tmp_path / "out" / "sparse" / "0")
     (image,) = (i for i in model.images.values() if i.name == "generated/view_0.png")
     errors = [
@@ -164,7 +152,7 @@ def test_cameras_far_from_the_origin_are_told_apart(scene, tmp_path):
     memory.observe(frame.rgb, frame.depth, far[0], round=0)
     add_view(memory, near, "a.png", number=1, generated=True)
     memory.save(tmp_path / "memory.npz")
-    run(tmp_path / "memory.npz", "--format", "colmap", "--out", tmp_path / "out")
+    export_run(tmp_path / "memory.npz", "colmap", tmp_path / "out")
     poses, _ = exported(tmp_path / "out")
     assert set(poses) == {"a.png", "generated/a.png"}
 
@@ -174,7 +162,7 @@ def test_a_view_observed_and_generated_shows_its_photograph(scene, saved, tmp_pa
     add_view(memory, scene.views[0].camera, "view_0.png", number=2, generated=True)
     memory.save(saved / "memory.npz")
     Image.new("RGB", (96, 72)).save(saved / "round_002" / "generated_view_0.png")
-    run(saved, "--format", "transforms", "--out", tmp_path / "out")
+    export_run(saved, "transforms", tmp_path / "out")
     frames = json.loads((tmp_path / "out" / "transforms.json").read_text())["frames"]
     assert [frame["file_path"] for frame in frames] == ["images/view_0.png", "images/view_2.png"]
     assert not any("generated" in frame for frame in frames)
@@ -185,7 +173,7 @@ def test_pictures_are_named_from_anywhere(saved, tmp_path, monkeypatch):
     picture = saved / "round_002" / "generated_view_4.png"
     Image.new("RGB", (96, 72)).save(picture)
     monkeypatch.chdir(tmp_path)
-    run(saved.relative_to(tmp_path), "--format", "colmap", "--out", "out")
+    export_run(saved.relative_to(tmp_path), "colmap", "out")
     assert exported(tmp_path / "out")[1] == {"generated/view_4.png": str(picture.resolve())}
 
 
@@ -198,7 +186,7 @@ def test_no_picture_outside_the_run_is_named(saved, tmp_path, stem):
     report = {"views": [{"name": "view_4.png", "stem": stem}]}
     (folder / "report.json").write_text(json.dumps(report))
     with pytest.raises(ProjectError, match="lies outside"):
-        run(saved, "--format", "transforms", "--out", tmp_path / "out")
+        export_run(saved, "transforms", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -229,15 +217,15 @@ def test_models_of_others_are_kept(saved, tmp_path, kind, out, files):
         put(folder / name)
     before = contents(folder)
     with pytest.raises(OptionError, match=r"was not written by gvtools export") as error:
-        run(saved, "--format", kind, "--out", folder / out)
+        export_run(saved, kind, folder / out)
     assert str(folder / files[0].split("/")[0]) in str(error.value)
     assert "\n" not in str(error.value)
     assert contents(folder) == before
     # Another export beside it does not make it ours.
     other = ("transforms", "other.json") if kind == "colmap" else ("colmap", "")
-    run(saved, "--format", other[0], "--out", folder / other[1])
+    export_run(saved, other[0], folder / other[1])
     with pytest.raises(OptionError, match=r"not written by gvtools export"):
-        run(saved, "--format", kind, "--out", folder / out)
+        export_run(saved, kind, folder / out)
 
 
 def test_an_export_replaces_an_earlier_one(scene, saved, tmp_path):
@@ -246,13 +234,13 @@ def test_an_export_replaces_an_earlier_one(scene, saved, tmp_path):
     exports = (("colmap", ""), ("transforms", ""), ("transforms", "a.json"))
     for _ in range(2):
         for kind, out in exports:
-            run(saved, "--format", kind, "--out", folder / out)
+            export_run(saved, kind, folder / out)
         before = contents(folder)
     for kind, out in exports:
-        run(saved, "--format", kind, "--out", folder / out)
+        export_run(saved, kind, folder / out)
     assert contents(folder) == before
     fused(scene, [0]).save(saved / "memory.npz")
     for kind, out in exports:
-        run(saved, "--format", kind, "--out", folder / out)
+        export_run(saved, kind, folder / out)
     assert set(contents(folder)) == set(before)
     assert not exported(folder)[1]

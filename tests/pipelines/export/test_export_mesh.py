@@ -1,4 +1,4 @@
-"""Meshes, as other libraries read them and rays meet them."""
+"""Meshes and their textures, as other libraries read them and rays meet them."""
 
 from __future__ import annotations
 
@@ -15,31 +15,37 @@ from gvtools.memory.spatial_memory import SpatialMemory
 from pipelines.export import surfaces
 from pipelines.export.mesh import simplify
 from pipelines.export.surfaces import tsdf_mesh
+from pipelines.export.texture import atlas
 
 trimesh = pytest.importorskip("trimesh")
 
 ORIGIN = (431_000.0, 5_650_000.0, 120.0)
 
 
-def seen(vertices, faces, view):
-    """(H, W) z-depth of a mesh in a view; infinite where no ray meets it."""
+def cast(vertices, faces, view):
+    """What rays of a view's pixels meet of a mesh, by name."""
     rays = o3d.t.geometry.RaycastingScene()
     rays.add_triangles(
-        o3d.core.Tensor(np.asarray(vertices, np.float32)), o3d.core.Tensor(faces.astype(np.uint32))
+        o3d.core.Tensor(np.asarray(vertices, np.float32)),
+        o3d.core.Tensor(np.asarray(faces, np.uint32)),
     )
     camera = view.camera
     K, pose = (
         o3d.core.Tensor(np.ascontiguousarray(x[0])) for x in (camera.K, camera.cam_from_world)
     )
     size = int(camera.width[0]), int(camera.height[0])
-    return rays.cast_rays(rays.create_rays_pinhole(K, pose, *size))["t_hit"].numpy()
+    hits = rays.cast_rays(rays.create_rays_pinhole(K, pose, *size))
+    return {name: values.numpy() for name, values in hits.items()}
+
+
+def seen(vertices, faces, view):
+    """(H, W) z-depth of a mesh in a view; infinite where no ray meets it."""
+    return cast(vertices, faces, view)["t_hit"]
 
 
 @pytest.mark.parametrize("method", ["tsdf", "poisson"])
 def test_trimesh_reads_the_walls(scene, bare_run, tmp_path, method):
-    export_run(
-        bare_run.folder, "--format", "mesh", "--out", tmp_path / "out.ply", "--method", method
-    )
+    export_run(bare_run.folder, "mesh", tmp_path / "out.ply", "--method", method)
     mesh = trimesh.load(tmp_path / "out.ply", process=False)
     view = scene.views[1]  # not in the memory
     frame = view.load()
@@ -59,7 +65,7 @@ def test_trimesh_reads_the_walls(scene, bare_run, tmp_path, method):
 
 
 def test_triangles_face_the_cameras(scene, bare_run, tmp_path):
-    export_run(bare_run.folder, "--format", "mesh", "--out", tmp_path / "out.ply")
+    export_run(bare_run.folder, "mesh", tmp_path / "out.ply")
     mesh = trimesh.load(tmp_path / "out.ply", process=False)
     away = mesh.triangles_center - scene.views[0].camera.centers[0]
     assert ((mesh.face_normals * away).sum(axis=1) < 0).mean() > 0.95
@@ -69,7 +75,7 @@ def test_all_suffixes_hold_one_mesh(bare_run, tmp_path):
     read = []
     for suffix in (".ply", ".obj", ".glb"):
         out = tmp_path / f"out{suffix}"
-        export_run(bare_run.folder, "--format", "mesh", "--out", out)
+        export_run(bare_run.folder, "mesh", out)
         read.append(trimesh.load(out, process=False, force="mesh"))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out.glb", "out.obj", "out.ply"]
     for mesh in read[1:]:
@@ -82,7 +88,7 @@ def test_all_suffixes_hold_one_mesh(bare_run, tmp_path):
         assert apart.max() <= 1
     # Open3D reads the PLY as well, and an export may be replaced by another.
     assert len(o3d.io.read_triangle_mesh(str(tmp_path / "out.ply")).triangles) == len(read[0].faces)
-    export_run(bare_run.folder, "--format", "mesh", "--out", tmp_path / "out.obj", "--voxel", 0.1)
+    export_run(bare_run.folder, "mesh", tmp_path / "out.obj", "--voxel", 0.1)
     assert len(trimesh.load(tmp_path / "out.obj", force="mesh").faces) < len(read[0].faces) / 2
 
 
@@ -100,7 +106,7 @@ def test_a_mesh_far_from_the_origin_keeps_its_digits(scene, tmp_path):
     for name in ("near", "far"):
         for suffix in (".ply", ".glb"):
             out = tmp_path / f"{name}{suffix}"
-            export_run(tmp_path / f"{name}.npz", "--format", "mesh", "--out", out)
+            export_run(tmp_path / f"{name}.npz", "mesh", out)
             read[name, suffix] = trimesh.load(out, process=False, force="mesh").vertices
     for suffix in (".ply", ".glb"):
         one, two = read["near", suffix], read["far", suffix] - ORIGIN
@@ -148,17 +154,100 @@ def test_triangles_without_area_do_not_stop_the_simplification(bare_run):
 def test_voxels_that_would_fill_the_memory_are_refused_or_widened(bare_run, tmp_path, monkeypatch):
     monkeypatch.setattr(surfaces, "MOST_BLOCKS", 20)
     with pytest.raises(OptionError, match=r"--voxel 0.02: the scene has \d+ blocks"):
-        export_run(
-            bare_run.folder, "--format", "mesh", "--out", tmp_path / "out.ply", "--voxel", 0.02
-        )
+        export_run(bare_run.folder, "mesh", tmp_path / "out.ply", "--voxel", 0.02)
     assert not (tmp_path / "out.ply").exists()
-    export_run(bare_run.folder, "--format", "mesh", "--out", tmp_path / "out.ply")
+    export_run(bare_run.folder, "mesh", tmp_path / "out.ply")
     assert len(trimesh.load(tmp_path / "out.ply").faces)
 
 
 def test_voxels_larger_than_the_scene_leave_no_triangle(bare_run, tmp_path):
     with pytest.raises(DegenerateError, match="no triangle"):
-        export_run(
-            bare_run.folder, "--format", "mesh", "--out", tmp_path / "out.ply", "--voxel", 1e6
-        )
+        export_run(bare_run.folder, "mesh", tmp_path / "out.ply", "--voxel", 1e6)
     assert not (tmp_path / "out.ply").exists()
+
+
+FEW = ("--max-triangles", 400)
+
+
+def shown(mesh, view):
+    """(H, W, 3) colours 0 to 255 of trimesh's mesh in a view; NaN where no ray meets it."""
+    hit = cast(mesh.vertices, mesh.faces, view)
+    face, at, met = hit["primitive_ids"], hit["primitive_uvs"], np.isfinite(hit["t_hit"])
+    corners = mesh.faces[face[met]]
+    weights = np.stack([1 - at[met].sum(axis=1), *at[met].T], axis=1)
+    out = np.full((*met.shape, 3), np.nan)
+    if mesh.visual.kind == "texture":
+        uv = (mesh.visual.uv[corners] * weights[..., None]).sum(axis=1)
+        out[met] = mesh.visual.material.to_color(uv)[:, :3]
+    else:
+        out[met] = (mesh.visual.vertex_colors[corners, :3] * weights[..., None]).sum(axis=1)
+    return out
+
+
+def error(mesh, view):
+    """Root mean square difference to a view's photograph."""
+    return float(np.sqrt(np.nanmean(np.square(shown(mesh, view) - view.load().rgb))))
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".obj"])
+def test_few_triangles_show_the_photographs(scene, reconstructed_run, tmp_path, suffix):
+    plain, out = tmp_path / "plain.ply", tmp_path / f"a box{suffix}"
+    export_run(reconstructed_run.path, "mesh", plain, *FEW)
+    export_run(reconstructed_run.path, "mesh", out, "--texture", 512, *FEW)
+    mesh = trimesh.load(out, process=False, force="mesh")
+    assert len(mesh.faces) == len(trimesh.load(plain, process=False).faces)
+    files = {"a box.glb"} if suffix == ".glb" else {"a box.obj", "a_box.mtl", "a_box.png"}
+    assert {path.name for path in tmp_path.iterdir()} == files | {"plain.ply"}
+    for row in (1, 4):  # not in the memory as observed
+        view = scene.views[row]
+        assert error(mesh, view) < 0.7 * error(trimesh.load(plain, process=False), view)
+
+
+@pytest.mark.slow
+def test_triangles_lie_apart_and_larger_ones_have_more_texels():
+    rng = np.random.default_rng(0)
+    scale = rng.choice([0.01, 0.05, 0.2], size=(300, 1, 1))
+    triangles = rng.normal(size=(300, 1, 3)) + scale * rng.normal(size=(300, 3, 3))
+    corners = atlas(triangles, 256)
+    assert corners.min() >= 0.5 and corners.max() <= 255.5
+    y, x = np.mgrid[:1024, :1024] / 4 + 0.125
+    count = np.zeros(x.shape, int)
+    for triangle in corners:
+        sides = []
+        for start, end in zip(triangle, np.roll(triangle, -1, axis=0), strict=True):
+            edge = end - start
+            # Grown by less than half a texel, into which reading between texels reaches.
+            apart = (edge[0] * (y - start[1]) - edge[1] * (x - start[0])) / np.hypot(*edge)
+            sides.append(apart > -0.45)
+        count += np.logical_and.reduce(sides)
+    assert count.max() == 1
+    texels = np.linalg.norm(corners[:, 0] - corners[:, 1], axis=1)
+    large = scale.ravel() == 0.2
+    assert np.median(texels[large]) > 2 * np.median(texels[~large])
+
+
+@pytest.mark.parametrize(
+    ("name", "words", "match"),
+    [
+        ("out.ply", ("--texture", 256), ".glb and .obj take a texture"),
+        ("out.glb", ("--texture", 32), "expected 64 to 4096"),
+        ("out.glb", ("--texture", 64, "--max-triangles", 500), "give --max-triangles 51"),
+    ],
+)
+def test_textures_that_cannot_be_are_refused(reconstructed_run, tmp_path, name, words, match):
+    out = tmp_path / name
+    with pytest.raises(OptionError, match=match):
+        export_run(reconstructed_run.path, "mesh", out, *words)
+    assert not out.exists()
+
+
+def test_a_memory_alone_has_no_photographs(bare_run, tmp_path):
+    with pytest.raises(OptionError, match="is no run"):
+        export_run(bare_run.folder, "mesh", tmp_path / "out.glb", "--texture", 256)
+
+
+def test_files_that_no_export_wrote_are_kept(reconstructed_run, tmp_path):
+    (tmp_path / "out.png").write_bytes(b"mine")
+    with pytest.raises(OptionError, match=r"out.png: is there already"):
+        export_run(reconstructed_run.path, "mesh", tmp_path / "out.obj", "--texture", 256, *FEW)
+    assert (tmp_path / "out.png").read_bytes() == b"mine"

@@ -29,7 +29,7 @@ def test_laspy_reads_points_colours_and_what_is_known_of_each(bare_run, tmp_path
     laspy = pytest.importorskip("laspy")
     pytest.importorskip("lazrs")
     out = tmp_path / f"out{suffix}"
-    export_run(bare_run.folder, "--format", "las", "--out", out)
+    export_run(bare_run.folder, "las", out)
     cloud = laspy.read(out)
     memory, rows = bare_run.memory, thinned(bare_run.memory, None).rows
     assert cloud.header.version == "1.4" and cloud.header.are_points_compressed == (
@@ -52,7 +52,7 @@ def test_las_keeps_its_steps_far_from_the_origin(far, tmp_path):
     laspy = pytest.importorskip("laspy")
     pytest.importorskip("lazrs")
     memory, positions = far
-    export_run(memory, "--format", "las", "--out", tmp_path / "out.las")
+    export_run(memory, "las", tmp_path / "out.las")
     cloud = laspy.read(tmp_path / "out.las")
     np.testing.assert_allclose(cloud.xyz, positions, atol=0.51 * cloud.header.scales[0] + 1e-6)
 
@@ -63,7 +63,7 @@ def test_pxr_reads_the_points(bare_run, tmp_path, suffix):
     from pxr import Usd, UsdGeom
 
     out = tmp_path / f"out{suffix}"
-    export_run(bare_run.folder, "--format", "usd", "--out", out)
+    export_run(bare_run.folder, "usd", out)
     assert sorted(tmp_path.iterdir()) == [out]
     stage = Usd.Stage.Open(str(out))
     assert UsdGeom.GetStageMetersPerUnit(stage) == 1
@@ -88,7 +88,7 @@ def test_usd_moves_far_points_by_a_double_translation(far, tmp_path):
     from pxr import Usd, UsdGeom
 
     memory, positions = far
-    export_run(memory, "--format", "usd", "--out", tmp_path / "out.usdc")
+    export_run(memory, "usd", tmp_path / "out.usdc")
     stage = Usd.Stage.Open(str(tmp_path / "out.usdc"))
     cloud = UsdGeom.Points(stage.GetPrimAtPath("/gvtools/memory"))
     local = np.array(cloud.GetPointsAttr().Get(), np.float64)
@@ -103,7 +103,7 @@ def test_observed_leaves_out_what_was_generated(bare_run, tmp_path, form):
     laspy = pytest.importorskip("laspy")
     pytest.importorskip("lazrs")
     out = tmp_path / f"out.{form}"
-    export_run(bare_run.folder, "--format", form, "--out", out, "--observed")
+    export_run(bare_run.folder, form, out, "--observed")
     memory = bare_run.memory
     if form == "ply":
         count, expected = len(trimesh.load(out).vertices), int((~memory.generated).sum())
@@ -123,9 +123,7 @@ def test_nothing_observed_is_said(scene, tmp_path):
     fused(scene, [0], generated=(0,)).save(tmp_path / "memory.npz")
     for form, name in (("splat", "out.ply"), ("ply", "cloud.ply")):
         with pytest.raises(OptionError, match="observed"):
-            export_run(
-                tmp_path / "memory.npz", "--format", form, "--out", tmp_path / name, "--observed"
-            )
+            export_run(tmp_path / "memory.npz", form, tmp_path / name, "--observed")
         assert not (tmp_path / name).exists()
 
 

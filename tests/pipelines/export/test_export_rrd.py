@@ -39,7 +39,7 @@ def points(path):
 
 
 def test_points_come_with_their_rounds(reconstructed_run, tmp_path):
-    export_run(reconstructed_run.path, "--format", "rrd", "--out", tmp_path / "out.rrd")
+    export_run(reconstructed_run.path, "rrd", tmp_path / "out.rrd")
     memory = reconstructed_run.memory
     rows = thinned(memory, None).rows
     rounds, made = memory.columns.round[rows], memory.generated[rows]
@@ -58,7 +58,7 @@ def test_points_come_with_their_rounds(reconstructed_run, tmp_path):
 
 
 def test_cameras_stand_where_they_stood_with_their_pictures(reconstructed_run, tmp_path):
-    export_run(reconstructed_run.path, "--format", "rrd", "--out", tmp_path / "out.rrd")
+    export_run(reconstructed_run.path, "rrd", tmp_path / "out.rrd")
     found = {
         entity.split("/")[-1].replace("\\", ""): (entity, columns)
         for entity, columns in chunks(tmp_path / "out.rrd")
@@ -87,9 +87,7 @@ def test_cameras_stand_where_they_stood_with_their_pictures(reconstructed_run, t
 
 
 def test_an_earlier_round_has_no_later_cameras(reconstructed_run, tmp_path):
-    export_run(
-        reconstructed_run.path, "--format", "rrd", "--out", tmp_path / "out.rrd", "--round", 0
-    )
+    export_run(reconstructed_run.path, "rrd", tmp_path / "out.rrd", "--round", 0)
     entities = [entity for entity, _ in chunks(tmp_path / "out.rrd")]
     assert entities and not any("generated" in entity for entity in entities)
 
@@ -99,7 +97,7 @@ def test_a_memory_alone_far_from_the_origin(tmp_path):
     near = memory.positions[thinned(memory, None).rows]
     memory.frame = memory.views.frame = LocalFrame.at(ORIGIN)
     memory.save(tmp_path / "far.npz")
-    export_run(tmp_path / "far.npz", "--format", "rrd", "--out", tmp_path / "out.rrd")
+    export_run(tmp_path / "far.npz", "rrd", tmp_path / "out.rrd")
     read = np.concatenate([positions for _, positions in points(tmp_path / "out.rrd").values()])
     assert len(read) == len(near)
     np.testing.assert_allclose(np.sort(read, axis=0), np.sort(near, axis=0), atol=1e-5)

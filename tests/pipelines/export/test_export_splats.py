@@ -47,7 +47,7 @@ def losses(scene, fitted_run, file):
 
 
 def test_the_ply_has_inrias_properties_in_order(fitted_run, tmp_path):
-    export_run(fitted_run.folder, "--format", "splat", "--out", tmp_path / "out.ply")
+    export_run(fitted_run.folder, "splat", tmp_path / "out.ply")
     vertex = PlyData.read(tmp_path / "out.ply")["vertex"]
     names = [each.name for each in vertex.properties]
     assert names[:9] == ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
@@ -59,7 +59,7 @@ def test_the_ply_has_inrias_properties_in_order(fitted_run, tmp_path):
 
 def test_gsply_reads_fitted_and_generated_gaussians(fitted_run, tmp_path):
     gsply = pytest.importorskip("gsply")
-    export_run(fitted_run.folder, "--format", "splat", "--out", tmp_path / "out.ply")
+    export_run(fitted_run.folder, "splat", tmp_path / "out.ply")
     read = gsply.plyread(tmp_path / "out.ply")
     made = thinned(fitted_run.memory, None, among=fitted_run.memory.generated).rows
     gaussians = fitted_run.appearance.gaussians
@@ -76,18 +76,18 @@ def test_gsply_reads_fitted_and_generated_gaussians(fitted_run, tmp_path):
     assert not read.shN[fitted:].any()
     colors = 0.5 + 0.28209479177387814 * read.sh0[fitted:]
     np.testing.assert_allclose(colors * 255, fitted_run.memory.columns.colors[made], atol=1e-2)
-    export_run(fitted_run.folder, "--format", "splat", "--out", tmp_path / "out.ply", "--observed")
+    export_run(fitted_run.folder, "splat", tmp_path / "out.ply", "--observed")
     assert len(gsply.plyread(tmp_path / "out.ply").means) == fitted
 
 
 def test_another_rasteriser_shows_what_render_shows(scene, fitted_run, tmp_path):
-    export_run(fitted_run.folder, "--format", "splat", "--out", tmp_path / "out.ply")
+    export_run(fitted_run.folder, "splat", tmp_path / "out.ply")
     assert max(losses(scene, fitted_run, tmp_path / "out.ply")) < 1
 
 
 def test_exposures_are_in_the_colours(scene, fitted_run, tmp_path):
     # All cameras of the box stand in one place, so that directions tell but a part of it.
-    export_run(fitted_run.folder, "--format", "splat", "--out", tmp_path / "out.ply", "--observed")
+    export_run(fitted_run.folder, "splat", tmp_path / "out.ply", "--observed")
     splats = read_splats(tmp_path / "out.ply")
     plain = replace(fitted_run.appearance, exposures=None)
     for row in (0, 1):
@@ -97,7 +97,7 @@ def test_exposures_are_in_the_colours(scene, fitted_run, tmp_path):
 
 
 def test_a_memory_without_a_fit_shows_its_points(scene, bare_run, tmp_path):
-    export_run(bare_run.folder, "--format", "splat", "--out", tmp_path / "out.ply")
+    export_run(bare_run.folder, "splat", tmp_path / "out.ply")
     splats = read_splats(tmp_path / "out.ply")
     assert len(splats["positions"]) == bare_run.memory.voxels
     assert splats["harmonics"].shape[1] == 1
@@ -109,9 +109,7 @@ def test_a_memory_without_a_fit_shows_its_points(scene, bare_run, tmp_path):
     shown = bare_run.memory.project(camera)
     both = shown.valid[0]
     assert psnr(drawn(splats, camera)[both], shown.rgb[0][both]) > 28
-    export_run(
-        bare_run.folder, "--format", "splat", "--out", tmp_path / "out.ply", "--max-points", 300
-    )
+    export_run(bare_run.folder, "splat", tmp_path / "out.ply", "--max-points", 300)
     assert 50 < len(read_splats(tmp_path / "out.ply")["positions"]) <= 300
 
 
@@ -120,7 +118,7 @@ def test_far_from_the_origin_positions_count_from_a_point_that_the_header_names(
     near = memory.positions.copy()
     memory.frame = memory.views.frame = LocalFrame.at(ORIGIN)
     memory.save(tmp_path / "memory.npz")
-    export_run(tmp_path / "memory.npz", "--format", "splat", "--out", tmp_path / "out.ply")
+    export_run(tmp_path / "memory.npz", "splat", tmp_path / "out.ply")
     data = PlyData.read(tmp_path / "out.ply")
     (line,) = (line for line in data.comments if line.startswith("origin"))
     origin = np.array(line.split()[1:], float)
@@ -132,7 +130,7 @@ def test_far_from_the_origin_positions_count_from_a_point_that_the_header_names(
 def test_gsply_reads_the_spz_as_the_ply(fitted_run, tmp_path):
     gsply = pytest.importorskip("gsply")
     for form, name in (("splat", "out.ply"), ("spz", "out.spz")):
-        export_run(fitted_run.folder, "--format", form, "--out", tmp_path / name)
+        export_run(fitted_run.folder, form, tmp_path / name)
     ply, spz = gsply.plyread(tmp_path / "out.ply"), gsply.read_spz(tmp_path / "out.spz")
     assert len(spz.means) == len(ply.means)
     flip = np.array([1, -1, -1])
@@ -157,30 +155,14 @@ def test_gsply_reads_the_spz_as_the_ply(fitted_run, tmp_path):
 
 def test_equal_exports_are_equal_files(fitted_run, tmp_path):
     for name in ("a.spz", "b.spz"):
-        export_run(fitted_run.folder, "--format", "spz", "--out", tmp_path / name)
+        export_run(fitted_run.folder, "spz", tmp_path / name)
     assert (tmp_path / "a.spz").read_bytes() == (tmp_path / "b.spz").read_bytes()
 
 
 def test_fitted_gaussians_are_not_thinned(fitted_run, tmp_path):
     count = len(fitted_run.appearance.gaussians)
     with pytest.raises(OptionError, match=f"the run's fit has {count} Gaussians"):
-        export_run(
-            fitted_run.folder,
-            "--format",
-            "splat",
-            "--out",
-            tmp_path / "out.ply",
-            "--max-points",
-            10,
-        )
-    export_run(
-        fitted_run.folder,
-        "--format",
-        "splat",
-        "--out",
-        tmp_path / "out.ply",
-        "--max-points",
-        count + 40,
-    )
+        export_run(fitted_run.folder, "splat", tmp_path / "out.ply", "--max-points", 10)
+    export_run(fitted_run.folder, "splat", tmp_path / "out.ply", "--max-points", count + 40)
     read = len(read_splats(tmp_path / "out.ply")["positions"])
     assert count < read <= count + 40
