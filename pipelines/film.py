@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from fractions import Fraction
@@ -12,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.appearance.appearance import Appearance, applied
+from gvtools.appearance.appearance import Appearance
 from gvtools.cameras import Cameras, concatenate
 from gvtools.completers.base import create, run_completer
 from gvtools.errors import OptionError
@@ -24,6 +23,7 @@ from gvtools.runs.memory_file import load_appearance, load_memory
 from gvtools.trajectories import PATHS, named_path
 from pipelines.reconstruction.rounds import CachedProjection, Clock, complete_targets
 from pipelines.reconstruction.settings import RunSettings
+from pipelines.rendering import render_view
 from viz.viewer.render import picture_of
 
 Picture = NDArray[np.uint8]
@@ -144,12 +144,8 @@ class FilmRenderer:
         return self._depth(guidance) if panel == "depth" else picture_of(guidance)
 
     def _projected(self, memory: SpatialMemory, camera: Cameras) -> Guidance:
-        start = time.perf_counter()
-        guidance = memory.project(camera)
-        if self.appearance is not None:
-            picture = self.appearance.picture(camera)
-            guidance = applied(picture, guidance, blend=self.appearance.blend)
-        self.projecting += time.perf_counter() - start
+        guidance, seconds = render_view(memory, camera, appearance=self.appearance)
+        self.projecting += seconds
         return guidance
 
     def _filled(self, guidance: Guidance) -> Picture:

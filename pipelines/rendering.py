@@ -30,7 +30,7 @@ from gvtools.scenes.scene import Frame
 def render_view(
     memory: SpatialMemory,
     camera: Cameras,
-    options: SplatOptions,
+    options: SplatOptions | None = None,
     *,
     appearance: Appearance | None = None,
 ) -> tuple[Guidance, float]:

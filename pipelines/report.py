@@ -121,7 +121,7 @@ def collect(
         ],
         measures=measures,
         sheets=sheets,
-        poses=report_poses(reports, scene, record["context"], found=measures.poses),
+        poses=report_poses(reports, scene, record["context"], probe=measures.poses),
     )
 
 
@@ -257,10 +257,10 @@ def _read(file: Path, warnings: list[str]) -> dict[str, Any] | None:
     if not file.is_file():
         return None
     try:
-        found = read_json(file)
-        if not isinstance(found, dict):
-            raise ValueError(f"a {type(found).__name__}")
-        return found
+        content = read_json(file)
+        if not isinstance(content, dict):
+            raise ValueError(f"a {type(content).__name__}")
+        return content
     except (OSError, ValueError) as error:
         warnings.append(f"{file.name} cannot be read ({error})")
         return None
@@ -287,7 +287,7 @@ def report_poses(
     scene: Scene | None,
     context: Sequence[str],
     *,
-    found: Mapping[str, Any] | None,
+    probe: Mapping[str, Any] | None,
 ) -> ReportedPoses:
     """Requested cameras of the rounds that are done, those of the context, and estimated ones.
 
@@ -302,7 +302,7 @@ def report_poses(
     note = "Lines from the marks: viewing directions. "
     if scene is None:
         note += "The context's cameras are missing, since the project cannot be read. "
-    known = _found_poses(found)
+    known = _estimated_poses(probe)
     if known:
         estimated = _inverted([known.get(view["name"]) for view in entries])
         note += (
@@ -313,13 +313,13 @@ def report_poses(
         note += "No poses were estimated; gvtools evaluate does it. "
     if not len(requested) + len(given):
         return ReportedPoses(None, note.strip(), ())
-    return ReportedPoses(Trajectories(given, requested, estimated), note.strip(), _errors(found))
+    return ReportedPoses(Trajectories(given, requested, estimated), note.strip(), _errors(probe))
 
 
-def _found_poses(found: Mapping[str, Any] | None) -> dict[str, Any]:
+def _estimated_poses(probe: Mapping[str, Any] | None) -> dict[str, Any]:
     """cam_from_world by name, of what the pose probe found; None where it found none."""
     known: dict[str, Any] = {}
-    for view in nested(found, "views") or ():
+    for view in nested(probe, "views") or ():
         if not isinstance(view, dict) or not isinstance(view.get("name"), str):
             continue
         pose = view.get("cam_from_world")
@@ -338,8 +338,8 @@ def _inverted(poses: Sequence[Any]) -> NDArray[np.float64]:
     return out
 
 
-def _errors(found: Mapping[str, Any] | None) -> list[tuple[str, float | None, float | None]]:
-    if found is None or not found.get("pictures"):
+def _errors(probe: Mapping[str, Any] | None) -> list[tuple[str, float | None, float | None]]:
+    if probe is None or not probe.get("pictures"):
         return []
     rows = (
         ("located, share", ("success_share",)),
@@ -348,8 +348,8 @@ def _errors(found: Mapping[str, Any] | None) -> list[tuple[str, float | None, fl
         ("RPE, rmse, scene units", ("rpe_none", "rmse")),
         ("rotation error, median, degrees", ("ate_none", "rotation_deg", "median")),
     )
-    true = found.get("true_pictures")
-    return [(label, nested(found, *keys), nested(true, *keys)) for label, keys in rows]
+    true = probe.get("true_pictures")
+    return [(label, nested(probe, *keys), nested(true, *keys)) for label, keys in rows]
 
 
 def chosen_targets(
@@ -404,8 +404,8 @@ def contact_sheets(
             return f"pictures of {name} (round {number}) cannot be shown: {error}"
 
     with ThreadPoolExecutor(READERS) as pool:
-        found = list(pool.map(row, places))
-    rows = tuple(one for one in found if isinstance(one, SheetRow))
+        shown = list(pool.map(row, places))
+    rows = tuple(one for one in shown if isinstance(one, SheetRow))
     folders = f"{path.resolve().name}/round_*"
     note = ""
     if total:
@@ -421,7 +421,7 @@ def contact_sheets(
         )
         if not any(truths.values()):
             note += " No true pictures are at hand, so there are no error maps."
-    return Sheets(rows, note, tuple(one for one in found if isinstance(one, str)))
+    return Sheets(rows, note, tuple(one for one in shown if isinstance(one, str)))
 
 
 def _pictures(

@@ -69,8 +69,8 @@ def _figure(what: str, folder: Path) -> Figure:
         from viz.plots.trajectories import draw_trajectories
 
         sources = open_sources(run)
-        found = read_measures(run).poses
-        poses = report_poses(rounds, sources.scene, run.context, found=found).cameras
+        probe = read_measures(run).poses
+        poses = report_poses(rounds, sources.scene, run.context, probe=probe).cameras
         if poses is None:
             raise ProjectError(f"{folder}: no cameras to draw ({sources.problem or 'no rounds'})")
         return draw_trajectories(poses, title=title)

@@ -112,9 +112,9 @@ def _sides(legs: NDArray[np.float64], scale: float, sides: NDArray[np.int64]) ->
 
 def _height(side: NDArray[np.int64], size: int) -> int:
     """Texels that rows of squares of these sides take, two triangles a square."""
-    found, count = np.unique(side, return_counts=True)
-    lines = np.ceil(np.ceil(count / 2) / (size // found))
-    return int((lines * found).sum())
+    sides, count = np.unique(side, return_counts=True)
+    lines = np.ceil(np.ceil(count / 2) / (size // sides))
+    return int((lines * sides).sum())
 
 
 def _placed(side: NDArray[np.int64], longest: NDArray[np.int64], size: int) -> NDArray[np.float64]:

@@ -1,1 +1,1 @@
-"""The viewers of runs: what they read, the web page that follows a run, pictures."""
+"""The viewers' sources: runs and exported files; the page that follows a run."""

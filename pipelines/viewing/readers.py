@@ -54,8 +54,8 @@ def load_mesh(path: Path) -> trimesh.Trimesh | trimesh.PointCloud:
         faces = np.asarray(loaded.faces)
         if faces.min() < 0 or faces.max() >= len(loaded.vertices):
             raise MemoryFileError(f"{path}: a triangle of vertices that are not there")
-    found: trimesh.Trimesh | trimesh.PointCloud = loaded
-    return found
+    geometry: trimesh.Trimesh | trimesh.PointCloud = loaded
+    return geometry
 
 
 def _beside(path: Path) -> Any:
@@ -112,10 +112,10 @@ def _check_glb(path: Path, data: bytes) -> None:
             for mesh in tree.get("meshes", ())
         ]
         nodes = tree.get("nodes", ())
-        drawn = sum(sizes[node["mesh"]] for node in nodes if "mesh" in node)
+        vertices = sum(sizes[node["mesh"]] for node in nodes if "mesh" in node)
         # Vertices that are drawn once take at least 6 bytes of the file; copies take none.
-        if (drawn - len(data) // 6) * VERTEX_BYTES > SPARE_BYTES:
-            raise ValueError(f"nodes draw {drawn} vertices")
+        if (vertices - len(data) // 6) * VERTEX_BYTES > SPARE_BYTES:
+            raise ValueError(f"nodes draw {vertices} vertices")
     except (AttributeError, IndexError, KeyError, TypeError, ValueError, struct.error) as error:
         raise MemoryFileError(
             f"{path}: no GLB of meshes or points ({error}); the file is damaged; save it again"
