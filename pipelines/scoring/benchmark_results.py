@@ -31,6 +31,13 @@ if TYPE_CHECKING:
 
 RESULTS, PAGE = "results.json", "index.html"
 MIB = 2**20
+# What a method knows and costs, beside the figures of the benchmark.
+COSTS = (
+    Column("Observed", "dB", digits=2),
+    Column("Coverage", digits=3),
+    Column("A run", "s", digits=1),
+    Column("Peak", "MiB", digits=0),
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,9 +136,7 @@ def comparison(benchmark: Benchmark, results: Sequence[MethodResult]) -> Table:
     columns = [Column("System"), Column("Origin"), _column(first)]
     columns += [Column(f"{first.label} {end}", digits=first.digits) for end in ("low", "high")]
     columns += [_column(figure) for figure in others]
-    columns += [Column("Observed", "dB", digits=2), Column("Coverage", digits=3),
-                Column("A run", "s", digits=1), Column("Peak", "MiB", digits=0),
-                Column("Scenes")]  # fmt: skip
+    columns += [*COSTS, Column("Scenes")]
     body = [_cells(row, benchmark, by_name.get(row.system)) for row in rows]
     notes = [
         f"{first.label} low and high: 95 % bootstrap interval of the mean over scenes. Observed: "
@@ -183,9 +188,7 @@ def scene_table(benchmark: Benchmark, by_views: Mapping[int, Sequence[MethodResu
     figures = list(benchmark.figures.values())
     columns = [Column("scene"), Column("views"), Column("method")]
     columns += [_column(figure) for figure in figures]
-    columns += [Column("Observed", "dB", digits=2), Column("Coverage", digits=3),
-                Column("A run", "s", digits=1), Column("Peak", "MiB", digits=0),
-                Column("targets"), Column("note")]  # fmt: skip
+    columns += [*COSTS, Column("targets"), Column("note")]
     rows: list[tuple[Value, ...]] = []
     for views, results in by_views.items():
         for result in results:
