@@ -15,7 +15,7 @@ from gvtools.errors import ShapeError
 from gvtools.kernels import compiled
 from gvtools.memory.store.local_frame import LocalFrame
 from gvtools.memory.store.views import PointSet
-from gvtools.memory.store.voxel_levels import VoxelLevels, level_of
+from gvtools.memory.store.voxel_index import VoxelLevels, level_of
 from gvtools.settings import Settings
 
 # Side of a cell of the free-space grid, pixels.

@@ -12,13 +12,7 @@ from gvtools.memory.splat.cpu import resolve
 
 
 def compile_kernels(backend: str = "cpu") -> None:
-    """Compile, or load from numba's cache, what lifting, fusing and projecting need.
-
-    A memory of a few points is lifted, fused, agreed with, completed and projected.
-
-    Args:
-        backend: of the projection, see SplatOptions.
-    """
+    """Compile, or load from numba's cache, what lifting, fusing and projecting need."""
     side = np.array([16])
     K = np.array([[[16.0, 0, 8], [0, 16, 8], [0, 0, 1]]])
     memory = SpatialMemory(0.1)

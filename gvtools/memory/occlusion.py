@@ -1,4 +1,6 @@
-"""Free space: points that would stand where an observed ray passed."""
+"""Tests of points against the space that observed rays saw to be free."""
+
+# mypy: no-check-untyped-defs
 
 from __future__ import annotations
 
@@ -61,20 +63,11 @@ def _mark(first, last, positions, K, cam_from_world, grids, tolerance, out):
 
 
 def in_free_space(
-    positions: NDArray[np.float32],
-    views: Sequence[FreeGrid],
-    *,
-    tolerance: float,
+    positions: NDArray[np.float32], views: Sequence[FreeGrid], *, tolerance: float
 ) -> NDArray[np.bool_]:
-    """Points that lie in front of what a view measured, by more than ``tolerance`` of its depth.
+    """(N,) points in front of what an observed view measured, by more than ``tolerance`` of depth.
 
-    Args:
-        positions: (N, 3) float32, scene units.
-        views: observed ones, their cam_from_world in the positions' frame.
-        tolerance: relative margin that depth noise is allowed.
-
-    Returns:
-        (N,) bool.
+    ``positions`` (N, 3) and the views' cam_from_world are in one frame.
     """
     out = np.zeros(len(positions), np.bool_)
     for first in range(0, len(views), VIEWS_PER_CALL):
@@ -91,17 +84,10 @@ def behind_free_space(
     views: Sequence[FreeGrid],
     tolerance: float,
 ) -> NDArray[np.float64]:
-    """Move points along their rays until no view saw past them.
+    """Move points along their rays until no view saw past them, see ``in_free_space``.
 
-    Args:
-        origin: (3,) the rays' common start.
-        rays: (N, 3) from ``origin`` to the point at depth 1.
-        depth: (N,) of the points, > 0, scene units.
-        views: see ``in_free_space``.
-        tolerance: see ``in_free_space``.
-
-    Returns:
-        (N,) the depth, at most ``FARTHEST`` times as large; 0 where all of that is free.
+    The rays (N, 3) go from ``origin`` (3,) to the points at depth 1. Returns the depth (N,), at
+    most FARTHEST times as large; 0 where all of that is free.
     """
     out = depth.copy()
     left = np.arange(len(depth))

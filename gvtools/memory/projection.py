@@ -57,13 +57,7 @@ def project(
     """Project the memory into cameras of one image size.
 
     What is nearer to the camera's plane than a voxel and than 1e-4 of the typical depth is not
-    drawn.
-
-    Args:
-        store: is projected.
-        cameras: of one image size.
-        options: None takes the defaults.
-        without: name of a view whose observations are left out, by a back end that blends.
+    drawn. A back end that blends leaves out what the view named ``without`` saw.
 
     Raises:
         ShapeError: the cameras have images of several sizes, or there is none, or one is unusable.
@@ -96,21 +90,16 @@ def project(
 
 @dataclass(frozen=True, eq=False)
 class Observed:
-    """What observed views show of a camera; nothing generated changes it.
-
-    Attributes:
-        rgb: see FrameBuffers, as the others of its images.
-        scale: typical depth, scene units; 0 where no observed view shows anything.
-        tiers: how many tiers of views there are.
-        size: of the next one.
-    """
+    """What observed views show of a camera; nothing generated changes it. See FrameBuffers."""
 
     rgb: NDArray[np.float32]
     depth: NDArray[np.float32]
     valid: NDArray[np.bool_]
     confidence: NDArray[np.float32]
     scanned: NDArray[np.bool_]
+    # Typical depth, scene units; 0 where no observed view shows anything.
     scale: float
+    # How many tiers of views there are, and the size of the next one.
     tiers: int
     size: int
 
@@ -118,17 +107,10 @@ class Observed:
 def project_again(
     store: Store, camera: Cameras, observed: Observed | None, *, options: SplatOptions
 ) -> tuple[Guidance, Observed]:
-    """``project`` into one camera, and what the observed views show there.
+    """``project`` into one camera, to the bit, and what the observed views show there.
 
-    Args:
-        store: is projected.
-        camera: a batch of one.
-        observed: from an earlier call; it is taken over. The caller knows that nothing observed
-            was fused or forgotten since. None: all is splatted.
-        options: of a back end that blends.
-
-    Returns:
-        The same guidance, to the bit, as ``project`` gives, and what the observed views show.
+    ``observed`` of an earlier call is taken over: the caller knows that nothing observed was fused
+    or forgotten since. None splats all.
     """
     check_usable(camera)
     projection = _Projection(store, camera, options, splatter=_splatter(store, options))
@@ -178,19 +160,13 @@ class _Projection:
         # In one order of memory, for which alone the kernels are compiled.
         self.K = np.ascontiguousarray(camera.K[0])
         cam_from_local = np.ascontiguousarray(store.frame.cam_from_local(camera.cam_from_world)[0])
+        single, flag = np.float32, np.bool_
         self.target = FrameBuffers(
-            camera,
-            cam_from_local,
-            np.empty((store.segments.count, 4), np.int32),
-            np.float32(0),
-            np.float32(1),
-            np.zeros((*shape, 3), np.float32),
-            np.zeros(shape, np.float32),
-            np.zeros(shape, np.bool_),
-            np.zeros(shape, np.float32),
-            np.zeros(shape, np.bool_),
-            np.zeros(shape, np.bool_),
-        )
+            camera, cam_from_local, np.empty((store.segments.count, 4), np.int32), single(0),
+            single(1), np.zeros((*shape, 3), single), np.zeros(shape, single),
+            np.zeros(shape, flag), np.zeros(shape, single), np.zeros(shape, flag),
+            np.zeros(shape, flag),
+        )  # fmt: skip
         self.scale, self.tiers, self.size = 0.0, 0, options.nearest_views
         self.tier = np.full(len(store.views), -1)
 
@@ -228,14 +204,9 @@ class _Projection:
         if self.store.views.generated.any() and self._find_segments(generated=True):
             self._splat_tiers()
         return Guidance(
-            self.camera,
-            t.rgb[None],
-            t.depth[None],
-            t.valid[None],
-            t.confidence[None],
-            t.generated[None],
-            t.scanned[None],
-        )
+            self.camera, t.rgb[None], t.depth[None], t.valid[None], t.confidence[None],
+            t.generated[None], t.scanned[None],
+        )  # fmt: skip
 
     def _set_scale(self, scale: float) -> None:
         self.scale = scale
@@ -324,10 +295,7 @@ class _Projection:
         few: bool,
         scanned: bool,
     ) -> None:
-        """Splat and write the pixels ``open_``, which may be ``few``; ``scanned`` is their source.
-
-        The weight counts from the nearest of the views ``members``.
-        """
+        """Splat and write the pixels ``open_``; weights count from the nearest of ``members``."""
         beyond = np.maximum(self.distance - self.distance[members].min(), 0)
         weight = np.exp(-self.options.view_weight * beyond).astype(np.float32)
         writable = open_ if few else None

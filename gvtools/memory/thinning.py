@@ -1,4 +1,4 @@
-"""One point for each voxel of a memory, and which observations it stands for."""
+"""Thinning of a memory to one point a voxel."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.memory.store.voxel_levels import levels_above
+from gvtools.memory.store.voxel_index import levels_above
 
 if TYPE_CHECKING:
     from gvtools.memory.store.store import Store
@@ -20,18 +20,14 @@ KEY_BITS = 20
 
 @dataclass(frozen=True, eq=False)
 class Thinned:
-    """P points out of N observations.
+    """P points out of N observations."""
 
-    Attributes:
-        rows: (P,) int64, the observation that is kept: the most confident of its voxel, a scan's
-            only where there is no other.
-        group: (N,) int64, for each observation the point that stands for it; -1 where it was left
-            out.
-        edge: voxel edge of the thinning, scene units.
-    """
-
+    # (P,) the observation that stands for its voxel: the most confident, a scan's only where there
+    # is no other.
     rows: NDArray[np.int64]
+    # (N,) for each observation the point that stands for it; -1 where it was left out.
     group: NDArray[np.int64]
+    # Of the thinning's voxels, scene units.
     edge: float
 
 
@@ -41,12 +37,7 @@ def thinned(
     """One point per voxel; voxels grow from the memory's own until at most ``max_points`` remain.
 
     Larger ones are counted from the points' least corner: around the origin eight of them would
-    stay apart however large they are.
-
-    Args:
-        store: with at least one observation.
-        max_points: at least 1; None keeps the memory's voxels.
-        among: (N,) the observations that count, at least one; None for all.
+    stay apart however large they are. ``among`` (N,) says which observations count, at least one.
     """
     chosen = np.arange(len(store)) if among is None else np.flatnonzero(among)
     positions = store.columns.positions[chosen].astype(np.float64)

@@ -23,7 +23,7 @@ from gvtools.appearance.turning import turned
 from gvtools.cameras import Cameras, concatenate
 from gvtools.errors import OptionError, ProjectError
 from gvtools.memory.store.local_frame import LocalFrame
-from gvtools.memory.store.voxel_levels import levels_above
+from gvtools.memory.store.voxel_index import levels_above
 from gvtools.memory.thinning import thinned
 from gvtools.runs.memory_file import load_appearance
 from gvtools.runs.target_files import completed_picture

@@ -11,8 +11,7 @@ from gvtools.memory.store.octree import (
     cell_keys,
     parent,
 )
-from gvtools.memory.store.voxel_index import voxel_keys
-from gvtools.memory.store.voxel_levels import VoxelLevels
+from gvtools.memory.store.voxel_index import VoxelLevels, voxel_keys
 
 VOXEL = 0.01
 

@@ -9,7 +9,7 @@ import pytest
 
 from gvtools.cameras import Cameras
 from gvtools.memory.back_projection import BackProjectionOptions, back_project
-from gvtools.memory.store.voxel_levels import VoxelLevels
+from gvtools.memory.store.voxel_index import VoxelLevels
 
 FOCAL, NEAR, FAR = 50.0, 1.0, 4.0
 # Keeps everything, steps too.

@@ -7,7 +7,7 @@ import pytest
 from memory_scenes import camera, plane_view, points, random_memory, saved_bytes
 
 from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory
-from gvtools.memory.store.voxel_levels import VoxelLevels
+from gvtools.memory.store.voxel_index import VoxelLevels
 from gvtools.memory.thinning import thinned
 from viz.viewer.colors import view_counts
 

@@ -1,10 +1,8 @@
 """Projection without blending: one pixel an observation, the nearest one wins.
 
-The plain choice, and the check of the others: no tiers, no footprints, so a memory coarser than
-the image shows holes, and generated content in front of observed content is seen. Each point lands
-in the pixel whose centre is nearest. Points come in voxel order, so consecutive points hit
-neighbouring pixels and the buffer stays in the cache. Open3D's projection does the same, many times
-slower.
+There are no tiers and no footprints, so a memory coarser than the image shows holes, and generated
+content in front of observed content is seen. Consecutive points hit neighbouring pixels, so the
+buffer stays in the cache. Open3D's projection does the same, many times slower.
 """
 
 from __future__ import annotations
@@ -32,16 +30,13 @@ _SPLIT = 1 << 16
 
 @dataclass(frozen=True, eq=False)
 class NearestImage:
-    """What one camera sees of a point cloud, one pixel a point.
+    """What one camera sees of a point cloud, one pixel a point."""
 
-    Attributes:
-        depth: (H, W) float32 z-depth, scene units; 0 where empty.
-        index: (H, W) int32, the winning point; -1 where empty. Equal depths go to the lower index.
-        colors: (H, W, 3), the winners' colours, 0 where empty; None when none were given.
-    """
-
+    # (H, W) z-depth, scene units, 0 where empty, and the winning point, -1 where empty. Equal
+    # depths go to the lower index.
     depth: NDArray[np.float32]
     index: NDArray[np.int32]
+    # (H, W, 3), the winners' colours, 0 where empty; None when none were given.
     colors: NDArray[Any] | None = None
 
 
@@ -137,15 +132,10 @@ def project_nearest(
     depth_min: float = 0.0,
     depth_max: float = np.inf,
 ) -> NearestImage:
-    """Project points into one camera, one pixel each, nearest depth wins.
+    """Project points (N, 3), N < 2³¹, into one camera, one pixel each; the nearest depth wins.
 
-    Args:
-        positions: (N, 3) float32, scene units, relative to ``origin``; N < 2³¹.
-        camera: a batch of one.
-        colors: (N, 3) of any type, to be looked up for the winners.
-        origin: (3,) world frame.
-        depth_min: points at this depth and before it are left out, scene units.
-        depth_max: points beyond are left out, scene units.
+    Positions are relative to ``origin`` in the world frame. Points at ``depth_min`` and before it,
+    and beyond ``depth_max``, are left out. ``colors`` (N, 3) are looked up for the winners.
     """
     height, width = int(camera.height[0]), int(camera.width[0])
     M = camera.cam_from_world[0].copy()
@@ -179,20 +169,10 @@ def project_open3d(
     origin: ArrayLike = (0.0, 0.0, 0.0),
     depth_max: float = FARTHEST,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """The same through Open3D's ``project_to_rgbd_image``.
+    """(depth, rgb) of the same through Open3D's ``project_to_rgbd_image``.
 
     Open3D multiplies depths by 1000 and cuts at 3 units unless told otherwise, and its pixel
     centres are integers; both are set here.
-
-    Args:
-        positions: (N, 3) float32, scene units, relative to ``origin``.
-        colors: (N, 3) float32.
-        camera: a batch of one.
-        origin: (3,) world frame.
-        depth_max: points beyond are left out, scene units.
-
-    Returns:
-        depth (H, W) float32, scene units, 0 where empty, and rgb (H, W, 3) float32.
     """
     import open3d as o3d
 
@@ -218,13 +198,7 @@ def project_open3d(
 def project_one_pixel(store: Store, cameras: Cameras, *, open3d: bool = False) -> Guidance:
     """Project the memory into cameras of one image size, one pixel an observation.
 
-    Args:
-        store: what is projected.
-        cameras: V cameras of one image size.
-        open3d: through Open3D's ``project_to_rgbd_image`` instead of our own kernel.
-
-    Returns:
-        The colour, confidence and origin of the nearest observation of each pixel.
+    ``open3d`` takes Open3D's projection instead of our own kernel.
     """
     shape = (len(cameras), int(cameras.height[0]), int(cameras.width[0]))
     depth = np.zeros(shape, np.float32)

@@ -31,14 +31,7 @@ _HEAD = struct.Struct("<II")
 def write_arrays(
     path: Path, meta: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]], *, flush: bool = True
 ) -> None:
-    """Write ``arrays`` and JSON-ready ``meta``; an older file stays until the new one is whole.
-
-    Args:
-        path: the file.
-        meta: JSON-ready.
-        arrays: by name.
-        flush: see replaced_when_written.
-    """
+    """Write ``arrays`` and JSON-ready ``meta``; an older file stays until the new one is whole."""
     table, at = {}, 0
     for name, array in arrays.items():
         table[name] = [array.dtype.str, list(array.shape), at, _crc(array)]
@@ -56,13 +49,7 @@ class ArrayFile:
     """A file of arrays, read; an array's checksum is compared when it is first asked for.
 
     The arrays are mapped copy-on-write: kernels take them as any other, and the file stays.
-
-    Args:
-        path: the file.
-
-    Attributes:
-        meta: what was written beside the arrays.
-        checksum: CRC-32 of the header.
+    ``meta`` was written beside them; ``checksum`` is the header's CRC-32.
     """
 
     def __init__(self, path: Path) -> None:

@@ -22,13 +22,9 @@ ORTHONORMAL = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class LocalFrame:
-    """world = origin + axes local.
+    """world = origin + axes local."""
 
-    Attributes:
-        origin: (3,) float64, world frame, scene units.
-        axes: (3, 3) float64, a rotation; its columns are the local axes in the world frame.
-    """
-
+    # (3,) world frame, scene units; (3, 3), the columns are the local axes in the world frame.
     origin: Float64
     axes: Float64
 
@@ -88,10 +84,5 @@ class LocalFrame:
 
     def seen_from(self, cameras: Cameras) -> Cameras:
         """The cameras with this frame in the place of the world's."""
-        return Cameras(
-            cameras.K,
-            self.cam_from_local(cameras.cam_from_world),
-            cameras.width,
-            cameras.height,
-            names=cameras.names,
-        )
+        pose = self.cam_from_local(cameras.cam_from_world)
+        return Cameras(cameras.K, pose, cameras.width, cameras.height, names=cameras.names)

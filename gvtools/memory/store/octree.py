@@ -13,9 +13,9 @@ from gvtools.memory.store.voxel_index import (
     COORDINATE_BITS,
     EMPTY_KEY,
     VoxelIndex,
+    VoxelLevels,
     voxel_keys,
 )
-from gvtools.memory.store.voxel_levels import VoxelLevels
 
 # Cells are the blocks of voxels of this level: 16 voxels, each 8 finest voxels wide.
 CELL_LEVEL = 3

@@ -17,8 +17,7 @@ from gvtools.memory.store.local_frame import LocalFrame
 from gvtools.memory.store.observations import Agreement, Observations
 from gvtools.memory.store.tile_set import TileSet
 from gvtools.memory.store.views import FreeGrid, ViewTable
-from gvtools.memory.store.voxel_index import MAX_VOXEL, check_grid
-from gvtools.memory.store.voxel_levels import VoxelLevels
+from gvtools.memory.store.voxel_index import MAX_VOXEL, VoxelLevels, check_grid
 from gvtools.settings import Settings
 
 if TYPE_CHECKING:

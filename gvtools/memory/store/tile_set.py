@@ -31,8 +31,7 @@ from gvtools.memory.store.octree import (
 from gvtools.memory.store.thinned_copies import copy_rows, empty_columns
 from gvtools.memory.store.tile import SPLAT_BYTES, Tile
 from gvtools.memory.store.views import ViewTable
-from gvtools.memory.store.voxel_index import group_by_block
-from gvtools.memory.store.voxel_levels import VoxelLevels
+from gvtools.memory.store.voxel_index import VoxelLevels, group_by_block
 
 # Level of the voxels whose blocks are as wide as a cell, see octree.
 BLOCK_LEVEL = 3

@@ -1,16 +1,20 @@
-"""Voxel index: a two-level hash of observations that never looks at the whole memory.
+"""Voxels and their index: levels of detail, and a two-level hash from voxels to observations.
 
 Space is cut into blocks of 16³ voxels of one edge; blocks of voxels twice, four times, ... as wide
 lie beside them. A hash of block coordinates and level gives a block number; each block owns a small
 open-addressing table from the voxel's place in the block (12 bits) to the head of a chain of
 observations. A frame touches some thousand blocks, so its cost follows the points that arrive, not
 the memory that is there, and the tables of one block lie together in the cache.
+
+Far surfaces are stored as coarsely as they were seen: edges double from level to level, so that a
+voxel of one level holds eight of the level before it.
 """
 
 # mypy: no-check-untyped-defs
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -36,6 +40,53 @@ VOXEL_RANGE = (1e-25, 1e25)
 ORIGIN_STEP = 1 / 16
 SIZE_CLASSES = 16
 SMALLEST_CLASS = 2
+# Footprints this much short of a level's belong to it: the ratios of depths are often whole
+# numbers, and rounding must not tell to which level a surface goes.
+SLACK = 2.0**-10
+
+
+@dataclass(frozen=True)
+class VoxelLevels:
+    """The levels of voxels for what was seen how finely."""
+
+    # Of the finest voxels, scene units.
+    edge: float
+    # Voxels are at most so many footprints of what they hold wide, or the finest there are; 0 for
+    # the finest alone.
+    voxels_per_footprint: float = 0.0
+
+    @property
+    def per_spacing(self) -> float:
+        """What spacings are multiplied with to tell their level, see ``level_of``."""
+        return self.voxels_per_footprint / self.edge * (1 + SLACK)
+
+    def of(self, spacing: NDArray[np.float32]) -> NDArray[np.uint8]:
+        """(N,) levels of points by their spacing (N,)."""
+        levels = np.empty(len(spacing), np.uint8)
+        _levels(spacing, self.per_spacing, levels)
+        return levels
+
+
+def levels_above(level: NDArray[np.uint8], edges: float) -> NDArray[np.int64]:
+    """Doublings by which voxels (N,) are wider than cells of ``edges`` finest edges, at least 0."""
+    return np.maximum(level.astype(np.int64) - int(np.floor(np.log2(max(edges, 1.0)))), 0)
+
+
+@compiled(inline="always")
+def level_of(spacing, per_spacing):
+    """The level of a spacing: 0 below twice the finest edge, 1 below four times, and so on."""
+    ratio = spacing * per_spacing
+    level = 0
+    while ratio >= 2 and level < MOST_LEVEL:
+        ratio *= 0.5
+        level += 1
+    return level
+
+
+@compiled()
+def _levels(spacing, per_spacing, levels):
+    for i in range(len(spacing)):
+        levels[i] = level_of(np.float64(spacing[i]), per_spacing)
 
 
 class IndexArrays(NamedTuple):
@@ -70,10 +121,7 @@ def block_key(bx, by, bz, level):
 
 @compiled(inline="always")
 def voxel_key(p, inverse_edge, level):
-    """(block key, place in the block) of a point (3,); EMPTY_KEY when it is out of reach.
-
-    ``inverse_edge`` is of the level's voxels.
-    """
+    """(block key, place in the block) of a point (3,); EMPTY_KEY when it is out of reach."""
     x = np.floor(np.float64(p[0]) * inverse_edge)
     y = np.floor(np.float64(p[1]) * inverse_edge)
     z = np.floor(np.float64(p[2]) * inverse_edge)
@@ -147,10 +195,7 @@ def _rehash(old_keys, old_ids, keys, ids):
 
 @compiled()
 def group_by_block(blocks, total):
-    """Counting sort of the points by block, blocks in the order of their first point.
-
-    Returns (touched blocks, start of each in the order, order).
-    """
+    """Points by block, in the order of first points: (touched blocks, start of each, order)."""
     counts = np.zeros(total, np.int32)
     for b in blocks:
         counts[b] += 1
@@ -369,10 +414,9 @@ def check_grid(voxel: float, origin: NDArray[np.float64]) -> None:
 
 
 def rounded_origin(middle: NDArray[np.float64], voxel: float) -> NDArray[np.float64]:
-    """``middle`` (3,) in whole scene units, or in the power of two that fine voxels need.
+    """``middle`` (3,) in whole scene units, which keep the decimals of the world frame as they are.
 
-    Whole numbers keep the decimals of the world frame as they are; the step is smaller where
-    float32 would lose a 64th of a voxel half a step away.
+    The step is smaller where float32 would lose a 64th of a voxel half a step away.
     """
     step = min(1.0, 2.0 ** np.floor(np.log2(voxel) + 18))
     return np.rint(middle / step) * step
