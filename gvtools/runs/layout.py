@@ -1,4 +1,4 @@
-"""Layout of the files of a run, and their names.
+"""Layout and names of the files of a run.
 
     run.json  rounds.jsonl  memory.npz (or memory.tiles/)  memory.ply  metrics.json  SHA256SUMS
     round_000/report.json  round_000/context_depth_VIEW.npz  round_000/appearance.npz

@@ -1,4 +1,4 @@
-"""What was seen coarsely is kept in wide voxels, and no voxel forgets what others hold."""
+"""Voxels as wide as the footprints of what they hold."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a run's folder accepts, and when a resumed run is the same run."""
+"""Ownership, resuming and identity of a run's folder."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Store of the memory: columns of observations, source views, the voxel index."""
+"""A memory's state: columns of observations, views, voxel index, and tiles in RAM or in files."""
