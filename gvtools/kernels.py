@@ -49,18 +49,13 @@ def _pool(process: int) -> ThreadPoolExecutor:
 
 
 class KernelSet(NamedTuple):
-    """Kernels that are compiled together.
+    """Kernels that are compiled together."""
 
-    Attributes:
-        name: as users are told of it.
-        compile: a module's function without arguments that calls each kernel once on small
-            arrays, since numba compiles at the first call; pickled for another process.
-        last: the last kernel that it calls; if this one is cached, so are the others.
-    """
-
-    name: str
+    name: str  # as users are told of it
+    # a module's function without arguments that calls each kernel once on small arrays, since
+    # numba compiles at the first call; pickled for another process
     compile: Callable[[], object]
-    last: Any
+    last: Any  # the last kernel that it calls; if this one is cached, so are the others
 
     @property
     def cached(self) -> bool:

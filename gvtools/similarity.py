@@ -26,28 +26,18 @@ class SimilarityFit:
 
     The translation is that of the given coordinates; where they are large, ``apply`` is more exact
     than the formula, since it works about the centroids.
-
-    Attributes:
-        status: "aligned", or "degenerate: ..." with the reason; then every number is NaN.
-        scale: target units per source unit; 1 when it was not fitted.
-        rotation: (3, 3) float64, determinant 1.
-        translation: (3,) float64, target units.
-        residuals: (N,) float64, distances after alignment, target units.
-        rmse: weighted root mean square of the residuals, target units.
-        source_center: (3,) float64, weighted centroid of the source.
-        target_center: (3,) float64, weighted centroid of the target.
-        mirrored: whether a reflection would leave less than half of the rmse: no rotation makes
-            one handedness of the other.
     """
 
-    status: str
-    scale: float
-    rotation: Float64
-    translation: Float64
-    residuals: Float64
-    rmse: float
-    source_center: Float64
-    target_center: Float64
+    status: str  # "aligned", or "degenerate: ..." with the reason; then every number is NaN
+    scale: float  # target units per source unit; 1 when it was not fitted
+    rotation: Float64  # (3, 3) float64, determinant 1
+    translation: Float64  # (3,) float64, target units
+    residuals: Float64  # (N,) float64, distances after alignment, target units
+    rmse: float  # weighted root mean square of the residuals, target units
+    source_center: Float64  # (3,) float64, weighted centroid of the source
+    target_center: Float64  # (3,) float64, weighted centroid of the target
+    # whether a reflection would leave less than half of the rmse: no rotation makes one
+    # handedness of the other
     mirrored: bool = False
 
     @property
@@ -218,23 +208,14 @@ def align_poses(poses: Float64, target: Float64) -> Float64:
 
 @dataclass(frozen=True)
 class ScaleFit:
-    """reference_depth ≈ scale · depth on the pixels that both know.
+    """reference_depth ≈ scale · depth on the pixels that both know."""
 
-    Attributes:
-        status: "aligned", or "unsupported: ..." with the reason; then ``scale`` is NaN.
-        scale: multiply the depth by it.
-        inliers: pixels whose ratio agrees with the scale.
-        inlier_share: inliers per support pixel, by weight.
-        residual: median relative deviation from the scale over the support (0.01 = 1 %).
-        support: pixels on which both depths are known.
-    """
-
-    status: str
-    scale: float
-    inliers: int
-    inlier_share: float
-    residual: float
-    support: int
+    status: str  # "aligned", or "unsupported: ..." with the reason; then ``scale`` is NaN
+    scale: float  # multiply the depth by it
+    inliers: int  # pixels whose ratio agrees with the scale
+    inlier_share: float  # inliers per support pixel, by weight
+    residual: float  # median relative deviation from the scale over the support (0.01 = 1 %)
+    support: int  # pixels on which both depths are known
 
     @property
     def ok(self) -> bool:

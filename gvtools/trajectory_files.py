@@ -27,17 +27,12 @@ _COUNTS = {"tum": 8, "kitti": 12, "euroc": 8}
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Poses in the order of a file or project.
+    """Poses in the order of a file or project."""
 
-    Attributes:
-        poses: (N, 4, 4) float64, camera (or body) to world, scene units.
-        names: N names; empty when poses are told apart by time or by order alone.
-        stamps: (N,) float64, seconds; None where there are no times.
-    """
-
-    poses: Float64
+    poses: Float64  # (N, 4, 4) float64, camera (or body) to world, scene units
+    # N names; empty when poses are told apart by time or by order alone
     names: tuple[str, ...] = ()
-    stamps: Float64 | None = None
+    stamps: Float64 | None = None  # (N,) float64, seconds; None where there are no times
 
     def __len__(self) -> int:
         return len(self.poses)

@@ -17,33 +17,23 @@ GENERATED = "generated"
 
 @dataclass(frozen=True)
 class Station:
-    """Where a scanner stood.
+    """Where a scanner stood."""
 
-    Attributes:
-        name: of the scan taken there.
-        center: x, y, z in the file's frame; None if the file does not say.
-    """
-
-    name: str
+    name: str  # of the scan taken there
+    # x, y, z in the file's frame; None if the file does not say
     center: tuple[float, float, float] | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Chunk:
-    """Some points of a file.
+    """Some points of a file."""
 
-    Attributes:
-        positions: (N, 3) float64, the file's frame and unit; may hold NaN.
-        colors: (N, 3) uint8, or uint16 if the file may mean 8 or 16 bits; None without colours.
-        intensity: (N,) float32, any unit; None without intensity.
-        station: index into the file's stations.
-        dropped: number of points that the file itself marks as unusable, by reason.
-    """
-
-    positions: NDArray[np.float64]
+    positions: NDArray[np.float64]  # (N, 3) float64, the file's frame and unit; may hold NaN
+    # (N, 3) uint8, or uint16 if the file may mean 8 or 16 bits; None without colours
     colors: NDArray[np.uint8] | NDArray[np.uint16] | None = None
-    intensity: NDArray[np.float32] | None = None
-    station: int = 0
+    intensity: NDArray[np.float32] | None = None  # (N,) float32, any unit; None without intensity
+    station: int = 0  # index into the file's stations
+    # number of points that the file itself marks as unusable, by reason
     dropped: dict[str, int] = field(default_factory=dict)
 
     def without(self, flags: NDArray[np.bool_], reason: str) -> Chunk:
@@ -62,47 +52,28 @@ class Chunk:
 
 @dataclass(frozen=True, eq=False)
 class ScanFile:
-    """A scan that was opened: its header is read and checked, its points are not.
+    """A scan that was opened: its header is read and checked, its points are not."""
 
-    Attributes:
-        path: the file.
-        count: number of points, including unusable ones.
-        stations: at least one.
-        chunks: all points, in the order of the file, read as they are asked for.
-    """
-
-    path: Path
-    count: int
-    stations: tuple[Station, ...]
-    chunks: Iterator[Chunk]
+    path: Path  # the file
+    count: int  # number of points, including unusable ones
+    stations: tuple[Station, ...]  # at least one
+    chunks: Iterator[Chunk]  # all points, in the order of the file, read as they are asked for
 
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """N points of a scan, in its own frame and unit.
+    """N points of a scan, in its own frame and unit."""
 
-    Attributes:
-        name: of the file.
-        origin: (3,) float64, subtracted from positions, so that georeferenced ones keep their
-            precision.
-        positions: (N, 3) float64, relative to ``origin``.
-        colors: (N, 3) uint8.
-        station: (N,) int32, indices into ``stations``.
-        stations: where they were scanned from.
-        colored_by: source of the colours: "colour", "intensity" (grey) or "nothing" (one grey).
-        count: number of points in the file.
-        dropped: number of points of the file that are left out, by reason.
-    """
-
-    name: str
+    name: str  # of the file
+    # (3,) float64, subtracted from positions, so that georeferenced ones keep their precision
     origin: NDArray[np.float64]
-    positions: NDArray[np.float64]
-    colors: NDArray[np.uint8]
-    station: NDArray[np.int32]
-    stations: tuple[Station, ...]
-    colored_by: str
-    count: int
-    dropped: dict[str, int]
+    positions: NDArray[np.float64]  # (N, 3) float64, relative to ``origin``
+    colors: NDArray[np.uint8]  # (N, 3) uint8
+    station: NDArray[np.int32]  # (N,) int32, indices into ``stations``
+    stations: tuple[Station, ...]  # where they were scanned from
+    colored_by: str  # source of the colours: "colour", "intensity" (grey) or "nothing" (one grey)
+    count: int  # number of points in the file
+    dropped: dict[str, int]  # number of points of the file that are left out, by reason
 
     def __len__(self) -> int:
         return len(self.positions)

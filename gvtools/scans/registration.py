@@ -81,25 +81,18 @@ RIVAL, APART = 0.85, 3.0
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """A similarity, and how well it is supported.
+    """A similarity, and how well it is supported."""
 
-    Attributes:
-        world_from_scan: (4, 4) float64, scale times rotation, and translation, for the file's
-            coordinates.
-        how: "given", "as it is" (an estimate that left the scan where it was) or "estimated".
-        fitness: share of the photographs' points that have a point of the scan within
-            ``tolerance``; None for a given placement, like the next ones.
-        scan_fitness: share of the scan's points that have one of the photographs'.
-        rmse: of the distances within ``tolerance``, scene units.
-        tolerance: scene units.
-    """
-
+    # (4, 4) float64, scale times rotation, and translation, for the file's coordinates
     world_from_scan: NDArray[np.float64]
-    how: str
+    how: str  # "given", "as it is" (an estimate that left the scan where it was) or "estimated"
+    # share of the photographs' points that have a point of the scan within ``tolerance``;
+    # None for a given placement, like the next ones
     fitness: float | None = None
+    # share of the scan's points that have one of the photographs'
     scan_fitness: float | None = None
-    rmse: float | None = None
-    tolerance: float | None = None
+    rmse: float | None = None  # of the distances within ``tolerance``, scene units
+    tolerance: float | None = None  # scene units
 
     @property
     def scale(self) -> float:
@@ -400,14 +393,10 @@ class _Task:
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Points of a surface.
+    """Points of a surface."""
 
-    Attributes:
-        positions: (N, 3) float64.
-        seen_from: (N, 3) float64, centre of a camera or scanner that saw each; None if unknown.
-    """
-
-    positions: Float64
+    positions: Float64  # (N, 3) float64
+    # (N, 3) float64, centre of a camera or scanner that saw each; None if unknown
     seen_from: Float64 | None = None
 
 

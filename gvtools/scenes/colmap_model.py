@@ -51,16 +51,11 @@ REASONS = {
 
 @dataclass(frozen=True)
 class ModelFiles:
-    """A model on disk.
+    """A model on disk."""
 
-    Attributes:
-        folder: where its files are.
-        suffix: ".bin" or ".txt".
-        others: further models of the workspace that are not read, with their image counts.
-    """
-
-    folder: Path
-    suffix: str
+    folder: Path  # where its files are
+    suffix: str  # ".bin" or ".txt"
+    # further models of the workspace that are not read, with their image counts
     others: tuple[tuple[str, int], ...] = ()
 
 
@@ -255,38 +250,24 @@ def text_names(folder: Path) -> dict[int, str]:
 
 @dataclass(frozen=True, eq=False)
 class RegisteredImage:
-    """One image of a model.
+    """One image of a model."""
 
-    Attributes:
-        image_id: the model's id.
-        name: path relative to the image folder.
-        camera_id: the model's id of its camera.
-        cam_from_world: (4, 4) float64, rigid.
-    """
-
-    image_id: int
-    name: str
-    camera_id: int
-    cam_from_world: NDArray[np.float64]
+    image_id: int  # the model's id
+    name: str  # path relative to the image folder
+    camera_id: int  # the model's id of its camera
+    cam_from_world: NDArray[np.float64]  # (4, 4) float64, rigid
 
 
 @dataclass(frozen=True, eq=False)
 class ColmapModel:
-    """A model whose every record was found sound.
+    """A model whose every record was found sound."""
 
-    Attributes:
-        files: where it was read.
-        images: registered images, in natural order of their names.
-        views: for each camera that a registered image uses, its ways to a pinhole camera.
-        reconstruction: pycolmap's own object.
-        findings: what was met.
-    """
-
-    files: ModelFiles
-    images: tuple[RegisteredImage, ...]
+    files: ModelFiles  # where it was read
+    images: tuple[RegisteredImage, ...]  # registered images, in natural order of their names
+    # for each camera that a registered image uses, its ways to a pinhole camera
     views: dict[int, tuple[Undistortion, ...]]
-    reconstruction: pycolmap.Reconstruction
-    findings: tuple[Finding, ...]
+    reconstruction: pycolmap.Reconstruction  # pycolmap's own object
+    findings: tuple[Finding, ...]  # what was met
 
     @property
     def lenses(self) -> dict[int, Undistortion]:

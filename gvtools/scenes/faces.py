@@ -103,14 +103,10 @@ def face_rotation(face: str) -> Float64:
 
 @dataclass(frozen=True, eq=False)
 class Face(Undistortion):
-    """The mapping of one recorded camera to one of its faces.
+    """The mapping of one recorded camera to one of its faces."""
 
-    Attributes:
-        face: "front", "right", "back", "left", "up" or "down".
-        limit: the greatest angle from the optical axis that the picture shows, radians.
-    """
-
-    face: str = "front"
+    face: str = "front"  # "front", "right", "back", "left", "up" or "down"
+    # the greatest angle from the optical axis that the picture shows, radians
     limit: float = math.pi
     rotation: Float64 = field(default_factory=lambda: np.eye(3))
 

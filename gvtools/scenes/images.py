@@ -33,19 +33,12 @@ UNREADABLE = (
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """What a picture's header says, without decoding its pixels.
+    """What a picture's header says, without decoding its pixels."""
 
-    Attributes:
-        width: pixels, as stored.
-        height: pixels, as stored.
-        mode: Pillow's name of the pixel layout ("RGB", "L", "RGBA", "I;16", ...).
-        orientation: EXIF orientation of a JPEG, 1 when absent.
-    """
-
-    width: int
-    height: int
-    mode: str
-    orientation: int = 1
+    width: int  # pixels, as stored
+    height: int  # pixels, as stored
+    mode: str  # Pillow's name of the pixel layout ("RGB", "L", "RGBA", "I;16", ...)
+    orientation: int = 1  # EXIF orientation of a JPEG, 1 when absent
 
     @property
     def has_alpha(self) -> bool:

@@ -20,62 +20,36 @@ REPROJECTION = 4.0
 
 @dataclass(frozen=True)
 class DepthSummary:
-    """Depth of the views that were opened.
+    """Depth of the views that were opened."""
 
-    Attributes:
-        views: of the scene's views, how many have a depth map.
-        coverage: share of valid pixels over the opened views with depth.
-        minimum: scene units.
-        median: scene units; the middle of the views' own medians.
-        maximum: scene units.
-    """
-
-    views: int
-    coverage: float | None
-    minimum: float | None
-    median: float | None
-    maximum: float | None
+    views: int  # of the scene's views, how many have a depth map
+    coverage: float | None  # share of valid pixels over the opened views with depth
+    minimum: float | None  # scene units
+    median: float | None  # scene units; the middle of the views' own medians
+    maximum: float | None  # scene units
 
 
 @dataclass(frozen=True)
 class SceneReport:
-    """What ``gvtools check`` prints.
+    """What ``gvtools check`` prints."""
 
-    Attributes:
-        root: the project's folder.
-        kind: "colmap", "rgbd" or "transforms".
-        ok: a run can read it: at least one view, and no error among the findings.
-        views: how many.
-        views_opened: how many had their pixels decoded.
-        sizes: "WIDTHxHEIGHT" with the number of views of that size.
-        focal_px: smallest and largest focal length of the views' pinhole cameras.
-        depth: None when no view has depth.
-        masked: share of pixels that masks take out, over the opened views.
-        sparse_points: how many.
-        observations: their track elements.
-        reprojection_px: mean distance between detection and projection in the views' cameras.
-        metric: scene units are metres.
-        path_length: from camera to camera in order, scene units.
-        extent: largest side of the box around the camera centres, scene units.
-        findings: the reader's and this report's own.
-    """
-
-    root: str
-    kind: str
-    ok: bool
-    views: int
-    views_opened: int
-    sizes: dict[str, int]
-    focal_px: tuple[float, float]
-    depth: DepthSummary | None
-    masked: float
-    sparse_points: int
-    observations: int
+    root: str  # the project's folder
+    kind: str  # "colmap", "rgbd" or "transforms"
+    ok: bool  # a run can read it: at least one view, and no error among the findings
+    views: int  # how many
+    views_opened: int  # how many had their pixels decoded
+    sizes: dict[str, int]  # "WIDTHxHEIGHT" with the number of views of that size
+    focal_px: tuple[float, float]  # smallest and largest focal length of the views' pinhole cameras
+    depth: DepthSummary | None  # None when no view has depth
+    masked: float  # share of pixels that masks take out, over the opened views
+    sparse_points: int  # how many
+    observations: int  # their track elements
+    # mean distance between detection and projection in the views' cameras
     reprojection_px: float | None
-    metric: bool
-    path_length: float
-    extent: float
-    findings: tuple[Finding, ...]
+    metric: bool  # scene units are metres
+    path_length: float  # from camera to camera in order, scene units
+    extent: float  # largest side of the box around the camera centres, scene units
+    findings: tuple[Finding, ...]  # the reader's and this report's own
 
     def to_dict(self) -> dict[str, Any]:
         """The report as JSON-ready values; a figure that is not known is None."""

@@ -60,24 +60,16 @@ class Thumbnail(NamedTuple):
 
 @dataclass(frozen=True)
 class Contradiction:
-    """Two views whose poses cannot both be right.
+    """Two views whose poses cannot both be right."""
 
-    Attributes:
-        names: of the two.
-        distance: between the camera centres, scene units.
-        degrees: between their orientations.
-        disagreement: share of the comparable area in which the pictures differ; None where the
-            pictures could not be compared.
-        shared_points: sparse points of both views; None without enough points.
-        points: of those that could be shared, the smaller number of the two views.
-    """
-
-    names: tuple[str, str]
-    distance: float
-    degrees: float
+    names: tuple[str, str]  # of the two
+    distance: float  # between the camera centres, scene units
+    degrees: float  # between their orientations
+    # share of the comparable area in which the pictures differ; None where the pictures could
+    # not be compared
     disagreement: float | None
-    shared_points: int | None
-    points: int | None
+    shared_points: int | None  # sparse points of both views; None without enough points
+    points: int | None  # of those that could be shared, the smaller number of the two views
 
     def __str__(self) -> str:
         if self.disagreement is not None and self.disagreement > DISAGREEING:
@@ -89,14 +81,10 @@ class Contradiction:
 
 @dataclass(frozen=True, eq=False)
 class _Tracks:
-    """Sparse points by the views that detected them.
+    """Sparse points by the views that detected them."""
 
-    Attributes:
-        points: all.
-        of_view: for each view the points of its track elements, repeats included.
-    """
-
-    points: SparsePoints
+    points: SparsePoints  # all
+    # for each view the points of its track elements, repeats included
     of_view: list[NDArray[np.int32]]
 
     @staticmethod

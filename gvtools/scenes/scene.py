@@ -18,56 +18,37 @@ from gvtools.untrusted import number_key
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """The pixels of one view, already in its pinhole camera (undistorted, registered).
+    """The pixels of one view, already in its pinhole camera (undistorted, registered)."""
 
-    Attributes:
-        rgb: (H, W, 3) uint8.
-        depth: (H, W) float32 z-depth, scene units, 0 = none; None when the view has no depth.
-        mask: (H, W) bool, True = use; None means all.
-    """
-
-    rgb: NDArray[np.uint8]
+    rgb: NDArray[np.uint8]  # (H, W, 3) uint8
+    # (H, W) float32 z-depth, scene units, 0 = none; None when the view has no depth
     depth: NDArray[np.float32] | None = None
-    mask: NDArray[np.bool_] | None = None
+    mask: NDArray[np.bool_] | None = None  # (H, W) bool, True = use; None means all
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One posed picture; ``load`` reads its pixels when they are needed.
+    """One posed picture; ``load`` reads its pixels when they are needed."""
 
-    Attributes:
-        name: unique within the scene: the image's path relative to the image folder.
-        camera: a batch of one.
-        load: reads the pixels; raises ProjectError when a file is unreadable or of another size.
-        has_depth: whether ``load`` gives depth.
-        files: what ``load`` reads, for fingerprints.
-    """
-
-    name: str
-    camera: Cameras
+    name: str  # unique within the scene: the image's path relative to the image folder
+    camera: Cameras  # a batch of one
+    # reads the pixels; raises ProjectError when a file is unreadable or of another size
     load: Callable[[], Frame]
-    has_depth: bool = False
-    files: tuple[Path, ...] = ()
+    has_depth: bool = False  # whether ``load`` gives depth
+    files: tuple[Path, ...] = ()  # what ``load`` reads, for fingerprints
 
 
 @dataclass(frozen=True, eq=False)
 class SparsePoints:
-    """Triangulated points with their tracks.
+    """Triangulated points with their tracks."""
 
-    Attributes:
-        positions: (N, 3) float64, world frame, scene units.
-        colors: (N, 3) uint8.
-        errors: (N,) float32, mean reprojection error, pixels of the recorded (distorted) image.
-        point_index: (M,) int32, for each track element its point.
-        view_index: (M,) int32, and its view in the scene.
-        xy: (M, 2) float64, where it was detected, pixels of the view's pinhole camera.
-    """
-
-    positions: NDArray[np.float64]
-    colors: NDArray[np.uint8]
+    positions: NDArray[np.float64]  # (N, 3) float64, world frame, scene units
+    colors: NDArray[np.uint8]  # (N, 3) uint8
+    # (N,) float32, mean reprojection error, pixels of the recorded (distorted) image
     errors: NDArray[np.float32]
-    point_index: NDArray[np.int32]
-    view_index: NDArray[np.int32]
+    point_index: NDArray[np.int32]  # (M,) int32, for each track element its point
+    view_index: NDArray[np.int32]  # (M,) int32, and its view in the scene
+    # (M, 2) float64, where it was detected, pixels of the view's pinhole camera
     xy: NDArray[np.float64]
 
     def rows_of_views(self, count: int) -> list[NDArray[np.int64]]:
@@ -91,38 +72,25 @@ class Finding:
 
 @dataclass(frozen=True)
 class Origin:
-    """What opens a scene of a data set again.
+    """What opens a scene of a data set again."""
 
-    Attributes:
-        address: "spec:NAME:SCENE", the same for every way in which a user may write it.
-        root: the folder of the data set's download.
-    """
-
-    address: str
-    root: Path
+    address: str  # "spec:NAME:SCENE", the same for every way in which a user may write it
+    root: Path  # the folder of the data set's download
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Views in natural order of their names, what is known beside them, and what was met reading.
+    """Views in natural order of their names, what lies beside them, and what was met reading."""
 
-    Attributes:
-        root: the project's folder.
-        kind: "colmap", "rgbd", "transforms", "data set" (a data set's native layout), or the app
-            that exported it from a phone ("Polycam").
-        views: in natural name order.
-        points: sparse points, where the project has them.
-        findings: everything dropped, converted, repaired or noteworthy.
-        metric: True when scene units are metres.
-        origin: of a scene that was opened as part of a data set; None: its folder opens it.
-    """
-
-    root: Path
+    root: Path  # the project's folder
+    # "colmap", "rgbd", "transforms", "data set" (a data set's native layout), or the app that
+    # exported it from a phone ("Polycam")
     kind: str
-    views: tuple[View, ...]
-    points: SparsePoints | None = None
-    findings: tuple[Finding, ...] = ()
-    metric: bool = False
+    views: tuple[View, ...]  # in natural name order
+    points: SparsePoints | None = None  # sparse points, where the project has them
+    findings: tuple[Finding, ...] = ()  # everything dropped, converted, repaired or noteworthy
+    metric: bool = False  # True when scene units are metres
+    # of a scene that was opened as part of a data set; None: its folder opens it
     origin: Origin | None = None
     _index: dict[str, int] = field(init=False, repr=False)
 

@@ -41,17 +41,11 @@ class LensParameters(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Undistortion:
-    """The mapping of one recorded camera.
+    """The mapping of one recorded camera."""
 
-    Attributes:
-        source: the recorded camera.
-        target: the pinhole camera.
-        untouched: True when both are the same, so that nothing is resampled.
-    """
-
-    source: pycolmap.Camera
-    target: pycolmap.Camera
-    untouched: bool
+    source: pycolmap.Camera  # the recorded camera
+    target: pycolmap.Camera  # the pinhole camera
+    untouched: bool  # True when both are the same, so that nothing is resampled
 
     @property
     def K(self) -> NDArray[np.float64]:

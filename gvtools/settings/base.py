@@ -77,19 +77,12 @@ class Settings(BaseModel):
 
 @dataclass(frozen=True)
 class Entry:
-    """One field of a section.
+    """One field of a section."""
 
-    Attributes:
-        kind: its type.
-        limits: its range, from end in words to number.
-        doc: its documentation without the unit.
-        unit: "" where it has none, or where the documentation says it in words.
-    """
-
-    kind: Any
-    limits: Mapping[str, float]
-    doc: str
-    unit: str = ""
+    kind: Any  # its type
+    limits: Mapping[str, float]  # its range, from end in words to number
+    doc: str  # its documentation without the unit
+    unit: str = ""  # "" where it has none, or where the documentation says it in words
 
     @property
     def section(self) -> type[Any] | None:
