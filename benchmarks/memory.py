@@ -19,7 +19,7 @@ from gvtools.completers.geoverse.config import named
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.options import OptimizerOptions
-from pipelines.bench.memory import alone, pass_peaks, predicted, step_peaks
+from pipelines.bench.memory import alone, fake_tensors, pass_peaks, step_peaks
 from pipelines.bench.random_model import random_views
 
 CASES = ("pass", "denoiser", "denoiser, recompute")
@@ -40,7 +40,7 @@ def peak(case: str, config: str, size: int) -> int:
 
 def predicted_peak(case: str, config: str, size: int) -> int:
     """The same, without numbers."""
-    with predicted():
+    with fake_tensors():
         return peak(case, config, size)
 
 

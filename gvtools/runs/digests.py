@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import platform
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,8 @@ from gvtools.runs.layout import MEMORY, RECORD
 from gvtools.untrusted import named_file, read_text, regular
 
 SUMS = "SHA256SUMS"
+# Of a large file, so many bytes at either end tell it from others.
+END_BYTES = 2**22
 
 
 def _sha256(parts: Iterable[bytes]) -> str:
@@ -55,6 +57,23 @@ def file_digest(path: Path) -> str:
     """A digest of a file's bytes."""
     with regular(path).open("rb") as file:
         return _sha256(iter(lambda: file.read(1 << 20), b""))
+
+
+def folder_digest(folder: Path, *, without: str) -> str:
+    """16 digits over each file's relative path, size and both ends, but for one folder in it."""
+
+    def parts() -> Iterator[bytes]:
+        for path in sorted(folder.rglob("*")):
+            if not path.is_file() or folder / without in path.parents:
+                continue
+            size = path.stat().st_size
+            yield f"{path.relative_to(folder).as_posix()} {size} ".encode()
+            with path.open("rb") as file:
+                yield file.read(END_BYTES)
+                file.seek(max(0, size - END_BYTES))
+                yield file.read(END_BYTES)
+
+    return _sha256(parts())[:16]
 
 
 def versions() -> dict[str, str]:

@@ -112,7 +112,7 @@ class ProceduralViews:
 
     def sample(self, index: int, attempt: int = 0) -> TrainingSample:
         """The sample of a number, 0 or more; it is drawn at the first attempt and any later one."""
-        given = self.given(index)
+        given = self.inputs(index)
         return make_sample(
             given.clip,
             given.clip,
@@ -122,7 +122,7 @@ class ProceduralViews:
             fill=self.fill,
         )
 
-    def given(self, index: int) -> SampleInputs:
+    def inputs(self, index: int) -> SampleInputs:
         """What the sample of a number is made of."""
         clip = self.clip(index)
         rng = self._rng(index, FAULTS)

@@ -172,11 +172,11 @@ class Replicated:
         """A norm over all parameters."""
         return float(norm)
 
-    def gathered(self, state: Any) -> Any:
+    def gather(self, state: Any) -> Any:
         """Nested dictionaries and lists with whole tensors; for the first process alone."""
         return state
 
-    def placed(self, whole: Tensor, like: Tensor) -> Tensor:
+    def place(self, whole: Tensor, like: Tensor) -> Tensor:
         """What a process holds of a whole tensor, as it does of ``like``."""
         return whole
 

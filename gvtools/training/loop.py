@@ -101,10 +101,10 @@ class Trainer:
             return False
         with torch.no_grad():
             for name, parameter in self.parameters:
-                parameter.copy_(self.distributed.placed(state.model[name], parameter))
+                parameter.copy_(self.distributed.place(state.model[name], parameter))
         self.optimizer.load_state_dict(self._placed_moments(state.optimizer))
         shadow = {
-            name: self.distributed.placed(state.ema["shadow"][name], value)
+            name: self.distributed.place(state.ema["shadow"][name], value)
             for name, value in self.ema.shadow.items()
         }
         self.ema.load_state_dict({**state.ema, "shadow": shadow})
@@ -116,7 +116,7 @@ class Trainer:
         parameters = [p for group in self.optimizer.param_groups for p in group["params"]]
         moments = {
             index: {
-                name: value if name == "step" else self.distributed.placed(value, parameters[index])
+                name: value if name == "step" else self.distributed.place(value, parameters[index])
                 for name, value in entry.items()
             }
             for index, entry in state["state"].items()
@@ -127,7 +127,7 @@ class Trainer:
         """Write the state, from the first process; called by all of them."""
         self._merged_notes()
         model, optimizer, ema = (
-            self.distributed.gathered(part)
+            self.distributed.gather(part)
             for part in (
                 {name: parameter.detach() for name, parameter in self.parameters},
                 self.optimizer.state_dict(),

@@ -100,7 +100,9 @@ class Mixture:
         weights = np.array([source.weight for source in self.sources], np.float64)
         return weights / weights.sum()
 
-    def drawn(self, start: int, count: int, *, without: Collection[int] = ()) -> NDArray[np.int64]:
+    def choose_sources(
+        self, start: int, count: int, *, without: Collection[int] = ()
+    ) -> NDArray[np.int64]:
         """(count,) index of the source of each of the samples from ``start`` on.
 
         ``start``: number of the first sample, 0 or more. ``without``: indices of sources that are
@@ -121,7 +123,7 @@ class Mixture:
         failed: list[int] = []
         problem = ""
         while len(failed) < np.count_nonzero(self.shares):
-            number = int(self.drawn(index, 1, without=failed)[0])
+            number = int(self.choose_sources(index, 1, without=failed)[0])
             source = self.sources[number]
             for attempt in range(TRIES):
                 try:

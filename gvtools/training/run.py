@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -27,6 +26,7 @@ from gvtools.files import write_text
 from gvtools.networks.compute import name_of, training_type
 from gvtools.networks.config_json import to_json
 from gvtools.procedural.textures import photograph_names
+from gvtools.runs.digests import folder_digest
 from gvtools.training.batch import TrainingBatch
 from gvtools.training.data import TrainingSamples
 from gvtools.training.distributed import Processes, Replicated, models_of
@@ -53,8 +53,6 @@ AFTER_DENOISER = ("reflow", "heads", "refiner")
 STAGE_OF: dict[str, type[Stage]] = {
     kind.name: kind for kind in (EncoderStage, DenoiserStage, ReflowStage, HeadsStage, RefinerStage)
 }
-# A weights file is fingerprinted by its name, its size and this many bytes at either end.
-FINGERPRINT_BYTES = 2**22
 
 
 class StageRun:
@@ -293,7 +291,10 @@ class StageRun:
             # The samples depend on which photographs are installed.
             "photographs": list(photograph_names("train")),
             "options": options,
-            "start": None if self._source is None else fingerprint(self._source),
+            "start": (
+                # The video prior is left out: no stage trains it.
+                None if self._source is None else folder_digest(self._source, without=VIDEO_FOLDER)
+            ),
             "data": data,
         }
 
@@ -351,22 +352,3 @@ def _last_record(folder: Path) -> dict[str, float]:
     """The stage's last record."""
     records = read_log(folder)
     return records[-1] if records else {}
-
-
-def fingerprint(folder: Path) -> str:
-    """16 hex digits of SHA-256 over each file's relative path, size and both ends.
-
-    The video prior is left out: no stage trains it.
-    """
-    digest = hashlib.sha256()
-    video = folder / VIDEO_FOLDER
-    for path in sorted(folder.rglob("*")):
-        if not path.is_file() or video in path.parents:
-            continue
-        size = path.stat().st_size
-        digest.update(f"{path.relative_to(folder).as_posix()} {size} ".encode())
-        with path.open("rb") as file:
-            digest.update(file.read(FINGERPRINT_BYTES))
-            file.seek(max(0, size - FINGERPRINT_BYTES))
-            digest.update(file.read(FINGERPRINT_BYTES))
-    return digest.hexdigest()[:16]

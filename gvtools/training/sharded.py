@@ -70,21 +70,21 @@ class Sharded(Replicated):
         return float(norm.full_tensor() if isinstance(norm, DTensor) else norm)
 
     @torch.no_grad()
-    def gathered(self, state: Any) -> Any:
+    def gather(self, state: Any) -> Any:
         """Nested dictionaries and lists with whole tensors on the CPU.
 
         All processes have to call it; only the first one gets tensors.
         """
         if isinstance(state, dict):
-            return {name: self.gathered(value) for name, value in state.items()}
+            return {name: self.gather(value) for name, value in state.items()}
         if isinstance(state, (list, tuple)):
-            return type(state)(self.gathered(value) for value in state)
+            return type(state)(self.gather(value) for value in state)
         if not isinstance(state, Tensor):
             return state
         whole = state.full_tensor() if isinstance(state, DTensor) else state
         return whole.detach().cpu() if self.processes.first else None
 
-    def placed(self, whole: Tensor, like: Tensor) -> Tensor:
+    def place(self, whole: Tensor, like: Tensor) -> Tensor:
         """What a process holds of a whole tensor, as it does of ``like``."""
         if not isinstance(like, DTensor):
             return whole
@@ -102,7 +102,7 @@ class Sharded(Replicated):
 
     def whole_model(self, model: GeoVerse) -> GeoVerse | None:
         """A copy with whole tensors on the CPU; all processes have to call it."""
-        tensors = self.gathered(model.state_dict())
+        tensors = self.gather(model.state_dict())
         if not self.processes.first:
             return None
         copy = empty_model(model.config, where="the model in training")

@@ -137,7 +137,7 @@ class LiveBytes(TorchDispatchMode):
 
 
 @contextmanager
-def predicted() -> Iterator[None]:
+def fake_tensors() -> Iterator[None]:
     """Within the block tensors have no numbers; models and views have to be made in it.
 
     For a process that does nothing else (``alone``): torch 2.13 has crashed where a process went on
@@ -307,7 +307,7 @@ def memory_figures(options: CompleteOptions) -> dict[str, Any]:
 def _inference(options: CompleteOptions, config: GeoVerseConfig) -> list[dict[str, Any]]:
     """A row for each stage of a pass."""
     dtype = options.compute_type
-    with predicted():
+    with fake_tensors():
         model = _model(config)
         model.hold_in(dtype)
         steps = (options.steps, options.cascade_steps)
@@ -333,7 +333,7 @@ def _training(
 ) -> dict[str, Any]:
     """A step of one sample; the video prior stays on the card."""
     dtype = _trained_type(options)
-    with predicted():
+    with fake_tensors():
         model = _model(config)
         views = _views(options, config)
         batch = TrainingBatch(views, torch.rand_like(views.images), 1 + views.depth)

@@ -94,7 +94,7 @@ def cloud(
     return points
 
 
-def concatenated(
+def concatenate(
     memory: o3d.t.geometry.PointCloud, frame: o3d.t.geometry.PointCloud, voxel: float
 ) -> o3d.t.geometry.PointCloud:
     """The memory with a frame's points, one point a voxel again."""

@@ -140,7 +140,7 @@ def compare_fusing(memory: SpatialMemory, frames: list[Frame], *, repeat: int) -
         memory.observe(rgb, depth, camera, round=number)
 
     def concatenate(turn: int) -> None:
-        open3d_peers.concatenated(old, clouds[turn], voxel)
+        open3d_peers.concatenate(old, clouds[turn], voxel)
 
     def integrate(turn: int) -> None:
         volume.integrate(*pictures[turn], frames[turn][2])

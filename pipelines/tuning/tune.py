@@ -31,7 +31,7 @@ from gvtools.completers.geoverse.weights import (
 )
 from gvtools.errors import CheckpointError, ProjectError
 from gvtools.files import folder_replaced_when_written, make_folder, write_json
-from gvtools.runs.digests import array_digest
+from gvtools.runs.digests import array_digest, folder_digest
 from gvtools.scenes.scene import Scene
 from gvtools.training.distributed import Processes, Replicated
 from gvtools.training.loader import batches
@@ -43,7 +43,6 @@ from gvtools.training.options import (
     TrainingSettings,
     shipped_or_read,
 )
-from gvtools.training.run import fingerprint
 from gvtools.training.stages import DenoiserStage
 from gvtools.untrusted import read_json
 from pipelines.tuning.hold_outs import HeldOutView, SplitContext, split_context
@@ -163,7 +162,8 @@ def inputs_of(split: SplitContext, weights: Path, *, options: TuneOptions, seed:
     for view in split.views:
         camera = view.observed.cameras
         arrays += [view.observed.depth, camera.K, camera.cam_from_world]
-    said = json.dumps([split.judged.describe(), options.to_dict(), fingerprint(weights), seed])
+    model = folder_digest(weights, without=VIDEO_FOLDER)
+    said = json.dumps([split.judged.describe(), options.to_dict(), model, seed])
     return array_digest([*arrays, np.frombuffer(said.encode(), np.uint8)])
 
 

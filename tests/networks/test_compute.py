@@ -199,7 +199,7 @@ def test_nothing_runs_twice_without_gradients():
     model = micro.model()
     set_recompute(model, True)
     assert {type(m).__name__ for m in model.modules() if isinstance(m, Recomputing)} == {
-        "Denoiser", "RGBHead", "Backbone", "GeometryHead"
+        "Denoiser", "RGBHead", "DepthAnythingBackbone", "GeometryHead"
     }  # fmt: skip
     ran = []
     model.level1.blocks[0].register_forward_hook(lambda *_: ran.append(1))

@@ -92,14 +92,14 @@ def test_a_million_draws_have_the_shares_of_the_papers_table(record_property):
     largest = []
     for seed in range(3):
         data = Mixture(mixture(weights).sources, seed)
-        counts = np.bincount(data.drawn(0, MILLION), minlength=len(weights))
+        counts = np.bincount(data.choose_sources(0, MILLION), minlength=len(weights))
         largest.append(float(sigmas(counts, root / root.sum()).max()))
     record_property("largest_sigma", max(largest))
     assert max(largest) < 3
 
 
 def test_neighbouring_draws_do_not_know_of_each_other():
-    drawn = mixture({"a": 1, "b": 2, "c": 5, "d": 1}).drawn(0, MILLION)
+    drawn = mixture({"a": 1, "b": 2, "c": 5, "d": 1}).choose_sources(0, MILLION)
     for apart in (1, 4, 512):
         pairs = np.bincount(drawn[:-apart] * 4 + drawn[apart:], minlength=16).reshape(4, 4)
         assert chi2_contingency(pairs).pvalue > 1e-3
@@ -107,7 +107,7 @@ def test_neighbouring_draws_do_not_know_of_each_other():
 
 def test_a_million_draws_mix_geometry_two_to_one_in_every_source():
     own = OwnOrEstimated(Numbered(), Numbered(), 2 / 3).wants_own(0, MILLION)
-    drawn = mixture({"a": 1, "b": 3}).drawn(0, MILLION)
+    drawn = mixture({"a": 1, "b": 3}).choose_sources(0, MILLION)
     for source in (0, 1):
         chosen = own[drawn == source]
         assert sigmas(np.array([chosen.sum(), (~chosen).sum()]), np.array([2, 1]) / 3).max() < 3
@@ -117,14 +117,14 @@ def test_a_million_draws_mix_geometry_two_to_one_in_every_source():
 
 def test_a_draw_is_the_same_alone_and_among_others():
     data = mixture({"a": 1, "b": 2, "none": 0, "c": 4})
-    whole = data.drawn(0, 300)
+    whole = data.choose_sources(0, 300)
     assert set(whole.tolist()) == {0, 1, 3}
-    assert [int(data.drawn(n, 1)[0]) for n in range(300)] == whole.tolist()
+    assert [int(data.choose_sources(n, 1)[0]) for n in range(300)] == whole.tolist()
     for number in (0, 7, 123):
         (note,) = data.sample(number).notes
         assert note == f"drawn/{data.sources[whole[number]].name}"
     other = Mixture(data.sources, seed=1)
-    assert not np.array_equal(other.drawn(0, 300), whole)
+    assert not np.array_equal(other.choose_sources(0, 300), whole)
     far = 10**12 + 1022
     assert stratified_at(far, 3, stream=[4])[2] == stratified_at(far + 2, 1, stream=[4])[0]
 
@@ -147,7 +147,7 @@ def test_an_invalid_sample_is_drawn_again_from_its_source_and_counted():
         return (OVERLAP, UNREADABLE)[index % 2] if (index + attempt) % 4 < 2 else None
 
     data = mixture({"good": 1, "flawed": 1}, flawed=half)
-    drawn = data.drawn(0, 400)
+    drawn = data.choose_sources(0, 400)
     notes = Counter(note for index in range(400) for note in data.sample(index).notes)
     wanted = Counter(f"drawn/{data.sources[n].name}" for n in drawn)
     # What is invalid costs a source nothing of its share.
@@ -169,7 +169,7 @@ def test_a_source_without_any_valid_sample_leaves_its_place_to_others():
         return UNREADABLE
 
     data = mixture({"good": 1, "broken": 3, "fine": 2}, broken=never)
-    broken = np.flatnonzero(data.drawn(0, 600) == 1).tolist()
+    broken = np.flatnonzero(data.choose_sources(0, 600) == 1).tolist()
     places: Counter[str] = Counter()
     for index in broken:
         notes = data.sample(index).notes

@@ -13,7 +13,7 @@ import torch
 
 from benchmarks.memory import CASES, peak, predicted_peak
 from gvtools.errors import OptionError
-from pipelines.bench.memory import LiveBytes, StagePeaks, alone, card_line, predicted
+from pipelines.bench.memory import LiveBytes, StagePeaks, alone, card_line, fake_tensors
 from pipelines.commands import bench
 from pipelines.console import Console
 
@@ -56,7 +56,7 @@ def test_weights_are_counted_elsewhere():
 
 
 def test_nothing_is_allocated_for_what_is_predicted():
-    with predicted(), LiveBytes() as live:
+    with fake_tensors(), LiveBytes() as live:
         made = torch.zeros(2**40)
         made = made * 2
         assert live.live == 4 * 2**40
