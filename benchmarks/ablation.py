@@ -57,7 +57,10 @@ PARTS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "fitting": ({"refine.steps": 0}, {}),
     "several fits": ({}, {"gvtools.appearance.fits.MOST_FITS": 1}),
     "exposures": ({"refine.exposure": False}, {}),
-    "exposures of new cameras": ({}, {"gvtools.appearance.exposures.Exposures.shrinkage": 0.0}),
+    "exposures of new cameras": (
+        {},
+        {"gvtools.appearance.camera_corrections.Exposures.shrinkage": 0.0},
+    ),
     "smoothness of surfaces": ({}, {"gvtools.appearance.fit.SMOOTH": 0.0}),
     "dropout of Gaussians": ({}, {"gvtools.appearance.fit.LEFT_OUT": 0.0}),
     "fading of opacities": ({}, {"gvtools.appearance.fit.FADING": 0.0}),

@@ -20,7 +20,7 @@ ROOT = Path(gvtools.__file__).parent
 DOCTESTED = (
     "gvtools",
     "gvtools.appearance.blending",
-    "gvtools.appearance.exposures",
+    "gvtools.appearance.camera_corrections",
     "gvtools.appearance.fit_options",
     "gvtools.appearance.gaussians",
     "gvtools.appearance.splat.splat",

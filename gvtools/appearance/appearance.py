@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.appearance.blending import Blend, blended
-from gvtools.appearance.exposures import Exposures
+from gvtools.appearance.camera_corrections import Exposures
 from gvtools.appearance.free_space import floaters, free_depth
 from gvtools.appearance.gaussians import UNREADABLE, Gaussians
 from gvtools.appearance.picture import Picture, mean_picture

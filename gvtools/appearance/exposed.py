@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.appearance.exposures import Exposures
+from gvtools.appearance.camera_corrections import Exposures
 from gvtools.appearance.gaussians import Gaussians
 from gvtools.appearance.splat.project_kernels import LOG_SCALE, SH
 from gvtools.appearance.turning import harmonics

@@ -16,15 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.appearance import kernels
-from gvtools.appearance.camera_corrections import CameraCorrections
+from gvtools.appearance.camera_corrections import CameraCorrections, Exposures
 from gvtools.appearance.depth_loss import add_depth
-from gvtools.appearance.exposures import Exposures
 from gvtools.appearance.fit_options import FitOptions, converged_steps, most_gaussians
 from gvtools.appearance.free_space import floaters, free_depth
 from gvtools.appearance.gaussians import Gaussians
-from gvtools.appearance.growth import Population, pixel_width
 from gvtools.appearance.picture import Picture
-from gvtools.appearance.sample import Sample
+from gvtools.appearance.population import Population, Sample, pixel_width
 from gvtools.appearance.smooth_depth import add_bending
 from gvtools.appearance.splat.project_kernels import LOG_SCALE, LOGIT, QUATERNION, SH, VALUES
 from gvtools.appearance.splat.splat import Lens, Splat

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from gvtools.appearance.appearance import Appearance
 from gvtools.appearance.blending import Blend
-from gvtools.appearance.exposures import Exposures
+from gvtools.appearance.camera_corrections import Exposures
 from gvtools.appearance.fit_options import FitOptions
 from gvtools.appearance.gaussians import Gaussians
 from gvtools.appearance.splat.project_kernels import HARMONICS, LOG_SCALE, SH

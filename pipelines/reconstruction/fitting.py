@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from gvtools.appearance.appearance import Appearance
 from gvtools.appearance.blending import Blend, best_blend
-from gvtools.appearance.exposures import Exposures
+from gvtools.appearance.camera_corrections import Exposures
 from gvtools.appearance.fit import CONTINUED, Fit
 from gvtools.appearance.fit_options import FitOptions, converged_steps
 from gvtools.appearance.fits import LEAST_SHARE, MOST_FITS, run_fits, with_chosen_backdrop

@@ -7,7 +7,7 @@ import pytest
 from splat_scene import HEIGHT, WIDTH, K, pose, rough_gaussians
 
 from gvtools.appearance.appearance import Appearance
-from gvtools.appearance.exposures import Exposures
+from gvtools.appearance.camera_corrections import Exposures
 from gvtools.cameras import Cameras
 from gvtools.errors import MemoryFileError
 

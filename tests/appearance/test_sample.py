@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from splat_scene import rough_gaussians
 
-from gvtools.appearance.sample import MOST_OPAQUE, NEGLIGIBLE, Sample
+from gvtools.appearance.population import MOST_OPAQUE, NEGLIGIBLE, Sample
 from gvtools.appearance.splat.project_kernels import LOGIT, VALUES
 
 

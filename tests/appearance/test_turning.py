@@ -9,8 +9,8 @@ from reference_gaussians import harmonics as reference
 from scipy.spatial.transform import Rotation
 from splat_scene import HEIGHT, NEAR, WIDTH, K, pose, rough_gaussians, walk
 
+from gvtools.appearance.camera_corrections import Exposures
 from gvtools.appearance.exposed import exposed
-from gvtools.appearance.exposures import Exposures
 from gvtools.appearance.gaussians import Gaussians
 from gvtools.appearance.splat.project_kernels import LOGIT, SH
 from gvtools.appearance.splat.splat import Lens, Splat

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from tiny_scan import write_scan
 
 from gvtools.appearance.appearance import Appearance
-from gvtools.appearance.exposures import Exposures
+from gvtools.appearance.camera_corrections import Exposures
 from gvtools.appearance.gaussians import Gaussians
 from gvtools.appearance.splat.project_kernels import HARMONICS, LOG_SCALE, SH
 from gvtools.appearance.turning import turned

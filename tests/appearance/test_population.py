@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gvtools.appearance.gaussians import Gaussians
-from gvtools.appearance.growth import FAINTEST, SHRINK, Population
+from gvtools.appearance.population import FAINTEST, SHRINK, Population
 from gvtools.appearance.splat.project_kernels import LOG_SCALE, LOGIT, QUATERNION, SH
 
 WIDE = 2.0
