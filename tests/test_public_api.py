@@ -19,7 +19,7 @@ ROOT = Path(gvtools.__file__).parent
 # Modules whose docstrings hold examples.
 DOCTESTED = (
     "gvtools",
-    "gvtools.appearance.blending",
+    "gvtools.appearance.picture",
     "gvtools.appearance.camera_corrections",
     "gvtools.appearance.fit_options",
     "gvtools.appearance.gaussians",

@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.appearance.blending import Blend, blended
 from gvtools.appearance.camera_corrections import Exposures
 from gvtools.appearance.free_space import floaters, free_depth
 from gvtools.appearance.gaussians import UNREADABLE, Gaussians
-from gvtools.appearance.picture import Picture, mean_picture
+from gvtools.appearance.picture import Blend, Picture, blended, mean_picture
 from gvtools.appearance.splat.median_depth import median_depth
 from gvtools.appearance.splat.splat import Lens, Splat
 from gvtools.cameras import Cameras

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.appearance.appearance import Appearance
-from gvtools.appearance.blending import Blend
 from gvtools.appearance.camera_corrections import Exposures
 from gvtools.appearance.fit_options import FitOptions
 from gvtools.appearance.gaussians import Gaussians
+from gvtools.appearance.picture import Blend
 from gvtools.appearance.splat.project_kernels import HARMONICS, LOG_SCALE, SH
 from gvtools.appearance.turning import turned
 from gvtools.memory.store.local_frame import LocalFrame

@@ -22,13 +22,12 @@ from numba import get_num_threads
 from numpy.typing import NDArray
 
 from gvtools.appearance.appearance import Appearance
-from gvtools.appearance.blending import Blend, best_blend
 from gvtools.appearance.camera_corrections import Exposures
 from gvtools.appearance.fit import CONTINUED, Fit
 from gvtools.appearance.fit_options import FitOptions, converged_steps
 from gvtools.appearance.fits import LEAST_SHARE, MOST_FITS, run_fits, with_chosen_backdrop
 from gvtools.appearance.gaussians import Gaussians
-from gvtools.appearance.picture import Picture, mean_picture
+from gvtools.appearance.picture import Blend, Picture, best_blend, mean_picture
 from gvtools.appearance.splat.gsplat_splatter import GsplatSplat, splatter_on
 from gvtools.appearance.splat.project_kernels import LOG_SCALE
 from gvtools.appearance.start import from_depth, from_points, pixels_with_depth

@@ -10,8 +10,8 @@ import pytest
 from splat_scene import HEIGHT, WALL, WIDTH, K, pose, rough_gaussians
 
 from gvtools.appearance.appearance import Appearance, applied
-from gvtools.appearance.blending import Blend, blended
 from gvtools.appearance.gaussians import Gaussians
+from gvtools.appearance.picture import Blend, blended
 from gvtools.appearance.splat.project_kernels import LOGIT
 from gvtools.cameras import Cameras
 from gvtools.depth.fitted_depth import LEAST_CONFIDENCE, OPAQUE, FittedDepth

@@ -9,9 +9,8 @@ import pytest
 
 from gvtools import kernels as compiled
 from gvtools.appearance.appearance import Appearance
-from gvtools.appearance.blending import Blend
 from gvtools.appearance.gaussians import Gaussians
-from gvtools.appearance.picture import Picture
+from gvtools.appearance.picture import Blend, Picture
 from gvtools.appearance.splat.project_kernels import VALUES
 from gvtools.cameras import Cameras
 from gvtools.guidance import Guidance

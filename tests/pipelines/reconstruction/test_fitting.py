@@ -14,10 +14,9 @@ from run_files import Killed, kill_after_round_0, results, untimed
 from tiny_scan import write_colmap_scan, write_scan
 
 from gvtools.appearance.appearance import Appearance, applied
-from gvtools.appearance.blending import Blend
 from gvtools.appearance.fit import Fit
 from gvtools.appearance.gaussians import Gaussians
-from gvtools.appearance.picture import Picture
+from gvtools.appearance.picture import Blend, Picture
 from gvtools.appearance.splat.project_kernels import VALUES
 from gvtools.appearance.start import from_points
 from gvtools.depth.foundation import FoundationDepth
