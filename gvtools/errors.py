@@ -40,11 +40,6 @@ class ProjectError(GvError):
 class UnposedError(ProjectError):
     """An input holds pictures and no cameras of them, which ``gvtools capture`` finds.
 
-    Args:
-        path: of the input.
-        found: what it holds, for the message.
-        advice: what to do.
-
     Attributes:
         found: as given.
     """

@@ -22,7 +22,6 @@ def replaced_when_written(path: Path, *, suffix: str = "", flush: bool = True) -
     """Gives a temporary name beside ``path``; on success it is flushed and takes that name.
 
     Args:
-        path: the file.
         suffix: that the temporary name ends with, for writers that tell the format by it.
         flush: False leaves it to the system when the bytes reach the disk, for files that need not
             outlast the process.

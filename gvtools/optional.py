@@ -16,10 +16,7 @@ def require(
     """A module of an optional package.
 
     Args:
-        module: as it is imported.
-        extra: of gvtools, that installs it.
         purpose: what it is needed for, for the message.
-        instead: what else a user may do.
         error: raised where it is absent.
 
     >>> require("lasso", extra="scan", purpose="reading knots", instead="or untie them")

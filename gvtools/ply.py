@@ -147,11 +147,9 @@ def write_ply(
     """Write a structured array as the vertices of a little-endian binary PLY.
 
     Args:
-        path: the PLY.
         vertices: (N,) the first of them.
         more: further ones, written as they come.
         count: of all; None for N.
-        comments: of the header.
     """
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {c}" for c in comments)]
     lines.append(f"element vertex {len(vertices) if count is None else count}")

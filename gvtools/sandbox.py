@@ -46,8 +46,6 @@ def read_apart(reader: str, path: Path, **options: Any) -> Iterator[Item]:
 
     Args:
         reader: "module:function".
-        path: the file.
-        options: of the function, JSON-ready.
     """
     command = [sys.executable, "-m", __name__, reader, str(regular(path).absolute())]
     paths = os.pathsep.join(entry or os.getcwd() for entry in sys.path)

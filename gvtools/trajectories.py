@@ -230,9 +230,6 @@ def named_path(
     """One of PATHS; an orbit of parallel views goes around what they look at.
 
     Args:
-        name: of PATHS.
-        cameras: that the path goes by.
-        count: number of cameras.
         depth: one of these cameras and the median depth that it sees, scene units; asked for only
             where the views have no common focus. None where nothing tells it.
     """

@@ -109,10 +109,6 @@ def read_json(path: Path) -> Any:
 def parse_yaml(text: str, *, most: int = MOST_CHARACTERS) -> Any:
     r"""The value of a YAML text: plain data, with no more values than a long text holds.
 
-    Args:
-        text: of a file.
-        most: characters that it may have.
-
     >>> parse_yaml("a: &x [1, two]\nb: *x")
     {'a': [1, 'two'], 'b': [1, 'two']}
     >>> parse_yaml("a: &x [*x]")
@@ -161,7 +157,6 @@ def named_file(folder: Path, name: str | Path, *, where: str, follow_links: bool
 
     Args:
         folder: that the name is relative to, and may not leave.
-        name: as the file has it.
         where: the file and the place in it, for the message.
         follow_links: whether links to places outside are followed, as those of a download that is
             kept elsewhere; the name itself still may not.
@@ -203,7 +198,6 @@ def unpack_gzip(data: bytes, most: int) -> bytes:
     """What a gzip stream holds.
 
     Args:
-        data: one stream.
         most: bytes that it may unpack to.
 
     >>> import gzip
@@ -233,7 +227,6 @@ class LimitedReader:
     """A stream of which no more than a number of bytes can be read.
 
     Args:
-        stream: unpacks what it reads.
         most: bytes.
     """
 
@@ -253,7 +246,6 @@ def load_arrays(source: Path | bytes, *names: str) -> dict[str, NDArray[Any]]:
     """Arrays of an ``.npz`` file, without pickle.
 
     Args:
-        source: the file, or what it holds.
         names: of the arrays; none for all that are there.
     """
     with archive(source) as opened:
@@ -305,11 +297,7 @@ def read_array(stream: IO[bytes], size: int) -> NDArray[Any]:
 
 
 def open_picture(source: Path | bytes) -> Image.Image:
-    """A picture, open but not decoded, whose pixels take no more memory than its file explains.
-
-    Args:
-        source: a file, or what one holds.
-    """
+    """A picture, open but not decoded, whose pixels take no more memory than its file explains."""
     from PIL import Image
 
     size = len(source) if isinstance(source, bytes) else regular(source).stat().st_size

@@ -40,9 +40,7 @@ def nearest_views(
     distance of ``unit``.
 
     Args:
-        cameras: V cameras to choose from.
         targets: at least one camera.
-        count: how many to choose at most.
         unit: distance, scene units; None takes the extent of all camera centres.
     """
     centers, target_centers = cameras.centers, targets.centers
@@ -82,10 +80,7 @@ def covisible_views(
     part gains little. Cameras that add nothing follow in the order of ``nearest_views``.
 
     Args:
-        cameras: V cameras to choose from.
-        targets: T cameras of one picture size.
         target_depth: (T, H, W) z-depth, scene units; 0 and what is not finite do not count.
-        count: how many to choose at most.
         depths: for each camera its own z-depth (H, W), scene units, 0 = none; None without any.
     """
     points, directions = _surface_samples(targets, target_depth)

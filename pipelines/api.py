@@ -14,23 +14,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class RunFigures:
-    """What ``evaluate`` measured; a figure that could not be computed is None.
+    """What ``evaluate`` measured; a figure that could not be computed is None."""
 
-    Attributes:
-        coverage: mean share of a target's pixels that memory knew before completion.
-        psnr: mean over the targets, dB, all pixels; ``details`` has it for observed and for
-            generated pixels alone, by view and by round, with intervals.
-        ssim: likewise, in [-1, 1].
-        lpips: likewise; None without the network's weights.
-        views: number of targets.
-        details: everything that ``gvtools evaluate`` writes to evaluation.json, by part.
-    """
-
-    coverage: float | None
+    coverage: float | None  # mean share of a target's pixels that memory knew before completion
+    # Mean over the targets, dB, all pixels; ``details`` has it for observed and for generated
+    # pixels alone, by view and by round, with intervals.
     psnr: float | None
-    ssim: float | None
-    lpips: float | None
-    views: int
+    ssim: float | None  # likewise, in [-1, 1]
+    lpips: float | None  # likewise; None without the network's weights
+    views: int  # number of targets
+    # Everything that ``gvtools evaluate`` writes to evaluation.json, by part.
     details: Mapping[str, Any]
 
 

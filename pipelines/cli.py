@@ -55,7 +55,6 @@ def build_parser(
     """The parser of all commands, given as name and module.
 
     Args:
-        modules: the commands.
         only: name of the one whose options are added, which may take a second; None adds all.
     """
     parser = _Parser(

@@ -55,7 +55,6 @@ def film_cameras(memory: SpatialMemory, path: str, *, width: int | None = None) 
     Args:
         memory: ``orbit`` and the like are computed from its observed views; the first of these
             gives intrinsics and size to paths that have none.
-        path: one of FORMS.
         width: of the frames, pixels; None keeps the cameras' width.
     """
     views = [view.camera for view in memory.views.photographed]

@@ -23,25 +23,18 @@ from gvtools.untrusted import load_arrays
 
 @dataclass(frozen=True, eq=False)
 class Appearance:
-    """What a scene looks like, beside the memory that knows what was observed.
+    """What a scene looks like, beside the memory that knows what was observed."""
 
-    Attributes:
-        gaussians: in their frame.
-        exposures: of the photographs, which tell those of other cameras; None takes all as equal.
-        others: of further fits to the same photographs, in the same frame; pictures are averaged.
-        near: nothing nearer is drawn, scene units.
-        blend: how much of the memory's colours is taken.
-        surface: (N, 3) points on surfaces, in the Gaussians' frame; what floats before them is not
-            shown, see free_space. None shows all.
-        splatter: draws the Gaussians.
-    """
-
-    gaussians: Gaussians
-    near: float
-    blend: Blend = field(default_factory=Blend)
-    splatter: type[Splat] = Splat
+    gaussians: Gaussians  # in their frame
+    near: float  # nothing nearer is drawn, scene units
+    blend: Blend = field(default_factory=Blend)  # how much of the memory's colours is taken
+    splatter: type[Splat] = Splat  # draws the Gaussians
+    # Of further fits to the same photographs, in the same frame; pictures are averaged.
     others: tuple[Gaussians, ...] = ()
+    # Of the photographs, which tell those of other cameras; None takes all as equal.
     exposures: Exposures | None = None
+    # (N, 3) points on surfaces, in the Gaussians' frame; what floats before them is not shown,
+    # see free_space. None shows all.
     surface: NDArray[np.float32] | None = None
 
     @classmethod

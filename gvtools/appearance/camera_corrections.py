@@ -145,11 +145,6 @@ class Exposures:
     exposures. How far that holds in a scene is found by predicting each photograph's exposure from
     the others'.
 
-    Attributes:
-        poses: (V, 4, 4) cam_from_local, in the Gaussians' own frame.
-        log_gains: (V, 3) natural logarithms of the factors of red, green and blue, with mean zero.
-        depth: typical depth, scene units.
-
     >>> poses = np.tile(np.eye(4), (9, 1, 1))
     >>> poses[:, 0, 3] = places = np.linspace(0, 1, 9)
     >>> rising = Exposures(poses, np.outer(places - 0.5, [0.2, 0.2, 0.2]), depth=1.0)
@@ -158,9 +153,10 @@ class Exposures:
     True
     """
 
-    poses: NDArray[np.float64]
+    poses: NDArray[np.float64]  # (V, 4, 4) cam_from_local, in the Gaussians' own frame
+    # (V, 3) natural logarithms of the factors of red, green and blue, with mean zero.
     log_gains: NDArray[np.float64]
-    depth: float
+    depth: float  # typical depth, scene units
 
     @cached_property
     def shrinkage(self) -> float:

@@ -29,8 +29,6 @@ def add_depth(
         image: (5, H, W), see ``Splat``; its last two channels get a gradient.
         view: the photograph with its recorded depth, else with an estimate; without either nothing
             is added.
-        gradient: is added to.
-        weight: of recorded depth.
     """
     depth = view.estimate if view.depth is None else view.depth
     if depth is None:

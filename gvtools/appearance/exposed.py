@@ -28,7 +28,6 @@ def exposed(gaussians: Gaussians, exposures: Exposures, cameras: Cameras) -> Gau
     its centre lies in.
 
     Args:
-        gaussians: are not changed.
         exposures: in the Gaussians' frame.
         cameras: V cameras, in the world frame, such as the photographs'.
     """

@@ -115,13 +115,11 @@ class Fit:
         Args:
             start: Gaussians to begin with; left as they are.
             views: at least one.
-            options: see FitOptions.
             seed: of the order of photographs and of where Gaussians are added.
             begin: progress at which the fit begins, above 0 where ``start`` was fitted to the same
                 photographs before; there are no validation photographs then.
             surface: (N, 3) points on surfaces: nothing may float before them, see free_space. None
                 allows Gaussians everywhere.
-            splatter: draws the Gaussians.
             backdrop: put another colour behind the Gaussians in each step, without recorded depth:
                 only opaque surfaces match photographs then, while over black a photograph's dark
                 parts could be fitted by stopping less light.
@@ -183,7 +181,6 @@ class Fit:
 
         Args:
             number: of the fit; random choices differ with it.
-            options: of the new fit.
             backdrop: None for this one's.
         """
         poses = self.cameras.poses()

@@ -69,7 +69,6 @@ def converged_steps(views: int, *, recorded: bool) -> int:
     """After how many steps a fit has converged: more gain next to nothing.
 
     Args:
-        views: how many photographs there are.
         recorded: whether all of them have recorded depth.
     """
     return max(

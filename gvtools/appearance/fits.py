@@ -60,7 +60,6 @@ def run_fits(
     alone.
 
     Args:
-        first: has not been run.
         clock: returns seconds.
         report: is called now and then with the fit at work and the share of the whole time, or
             steps, that is over.

@@ -29,7 +29,6 @@ def free_depth(points: NDArray[np.float32], lens: Lens) -> NDArray[np.float32] |
 
     Args:
         points: (N, 3) on surfaces, in the frame of the lens.
-        lens: the camera.
 
     Returns:
         None if the picture has no point.
@@ -73,7 +72,6 @@ def floaters(
 
     Args:
         values: (N, VALUES), see project_kernels.
-        lens: the camera.
         free: see ``free_depth``.
         rows: (M,) of ``values``; None for all.
     """

@@ -36,7 +36,6 @@ def blur(picture, out, work):
     """Blur one channel (H, W) by the window.
 
     Args:
-        picture: is blurred.
         out: (H, W), written.
         work: (at least W + 12,) is overwritten.
     """
@@ -68,12 +67,10 @@ def loss_gradient(first, last, picture, target, weight, share, d_picture):
     """Gradient of (1 - share) mean |picture - target| + share (1 - SSIM), by channels.
 
     Args:
-        first: channels to do.
         last: one past the last of them.
         picture: (C, H, W) float32.
         target: (C, H, W) float32, what it should be.
         weight: (H, W) of the pixels, 0 to 1.
-        share: of SSIM.
         d_picture: (C, H, W), written.
     """
     one, two = np.float32(1), np.float32(2)

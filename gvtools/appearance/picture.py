@@ -31,21 +31,16 @@ class Picture:
     """What one camera sees.
 
     Colours are over black: darker where Gaussians stop less than all light.
-
-    Attributes:
-        rgb: (H, W, 3) float32 from 0 to 1.
-        alpha: (H, W) float32, the share of light that they stop.
     """
 
-    rgb: NDArray[np.float32]
-    alpha: NDArray[np.float32]
+    rgb: NDArray[np.float32]  # (H, W, 3) float32 from 0 to 1
+    alpha: NDArray[np.float32]  # (H, W) float32, the share of light that they stop
 
     @classmethod
     def of(cls, splat: Splat, *, gain: NDArray[np.float32] | None = None) -> Picture:
         """The picture of Gaussians that were splatted.
 
         Args:
-            splat: of one camera.
             gain: (3,) what its red, green and blue are multiplied by; None leaves them.
         """
         alpha = splat.image[4]
@@ -79,15 +74,11 @@ def mean_picture(pictures: Sequence[Picture]) -> Picture:
 
 @dataclass(frozen=True)
 class Blend:
-    """How much of the memory's colours is taken.
+    """How much of the memory's colours is taken."""
 
-    Attributes:
-        share: weight of the memory's colours where both agree after the blur, 0 to 1.
-        tolerance: difference of the blurred colours (0 to 1) at which the weight has fallen to
-            37 % (1/e) of that.
-    """
-
-    share: float = 0.5
+    share: float = 0.5  # weight of the memory's colours where both agree after the blur, 0 to 1
+    # Difference of the blurred colours (0 to 1) at which the weight has fallen to 37 % (1/e) of
+    # that.
     tolerance: float = 0.2
 
 
@@ -123,7 +114,6 @@ def best_blend(
     Args:
         samples: for each photograph (H, W, 3) colours of the Gaussians and of the memory, both made
             without it, (H, W) the pixels that both know, and (H, W, 3) the photograph; 0 to 1.
-        least_tolerance: smaller tolerances are not tried.
     """
     tolerances = [tolerance for tolerance in TOLERANCES if tolerance >= least_tolerance]
     choices = list(product(SHARES, tolerances))

@@ -74,7 +74,6 @@ class Population:
             most: number of Gaussians that there may be afterwards.
             wide: standard deviation in pixels from which a Gaussian is split into two smaller ones;
                 a smaller Gaussian is cloned, and the next steps move the two apart.
-            rng: chooses the places of the halves.
         """
         pull = self.pull / np.maximum(self.pulls, 1)
         rows = np.flatnonzero(pull > threshold)
@@ -140,7 +139,6 @@ class Sample:
         Args:
             values: (N, VALUES).
             left_out: share of the rows that is left out, 0 to below 1.
-            rng: draws them.
         """
         self.values, self._rows = values, None
         if left_out < NEGLIGIBLE:

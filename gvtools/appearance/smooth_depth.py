@@ -34,8 +34,6 @@ def add_bending(
     Args:
         image: (5, H, W), see ``Splat``; its last two channels get a gradient.
         target: (3, H, W) the photograph, 0 to 1.
-        gradient: is added to.
-        weight: of the loss.
     """
     some = image[3:, ::4, ::4]
     solid = some[1] > LEAST_ALPHA
@@ -52,13 +50,9 @@ def bending_gradient(image, target, median, weight, inverse, pull, gradient):
     """See ``add_bending``.
 
     Args:
-        image: see above.
-        target: see above.
         median: depth, scene units.
-        weight: see above.
         inverse: (H, W), overwritten.
         pull: (H, W), overwritten.
-        gradient: see above.
     """
     zero, one, two, soft = np.float32(0), np.float32(1), np.float32(2), np.float32(1 / SOFT)
     edge = np.float32(EDGE / 3)

@@ -34,7 +34,6 @@ def from_points(
     Args:
         positions: (N, 3) in ``frame``, scene units, at least two different ones.
         colors: (N, 3) uint8.
-        frame: of the Gaussians.
         most: limit of their number; None: about STARTING_GAUSSIANS.
     """
     every = max(1, len(positions) // STARTING_GAUSSIANS)
@@ -52,8 +51,6 @@ def from_depth(
 
     Args:
         views: those without depth are skipped.
-        frame: of the Gaussians.
-        seed: of the choice of pixels.
         most: as for ``from_points``.
     """
     count = STARTING_GAUSSIANS if most is None else min(most, STARTING_GAUSSIANS)
@@ -72,8 +69,6 @@ def pixels_with_depth(
 
     Args:
         views: those without depth are skipped; the others contribute equal shares of ``count``.
-        seed: of the choice of pixels.
-        count: about how many in all.
 
     Returns:
         (N, 3) float64 positions in the local frame, and (N, 3) uint8 colours.

@@ -52,25 +52,18 @@ Say = Callable[[str], object]
 
 @dataclass(frozen=True, eq=False)
 class Mapped:
-    """What mapping found.
+    """What mapping found."""
 
-    Attributes:
-        model: the one with the most registered pictures; its scale is arbitrary.
-        how: "global" or "incremental" mapping.
-        others: names of the pictures of each further model, the largest model first.
-        matching: how pairs were chosen, in words.
-        pairs: number of verified matches of each pair of pictures, by their names.
-        explained: share of the matches of pairs in one model that became points, 0 to 1.
-        flat: every pair is explained by a plane, so that intrinsics hang by little.
-    """
-
+    # The one with the most registered pictures; its scale is arbitrary.
     model: pycolmap.Reconstruction
-    how: str
+    how: str  # "global" or "incremental" mapping
+    # Names of the pictures of each further model, the largest model first.
     others: tuple[tuple[str, ...], ...]
-    matching: str
+    matching: str  # how pairs were chosen, in words
+    # Number of verified matches of each pair of pictures, by their names.
     pairs: Mapping[tuple[str, str], int]
-    explained: float
-    flat: bool = False
+    explained: float  # share of the matches of pairs in one model that became points, 0 to 1
+    flat: bool = False  # every pair is explained by a plane, so that intrinsics hang by little
 
 
 def find_cameras(
@@ -89,7 +82,6 @@ def find_cameras(
     """Find intrinsics and poses of pictures.
 
     Args:
-        images: the folder of the pictures.
         cameras: names of the pictures that each camera took; they share its intrinsics.
         work: a folder without files yet, for COLMAP's database and models.
         source: the user's folder for messages, if ``images`` holds copies.
@@ -101,7 +93,6 @@ def find_cameras(
         rigs: faces of panoramas, whose names ``cameras`` holds face by face; their intrinsics and
             relative rotations are fixed.
         fisheye: initial parameters of OPENCV_FISHEYE as COLMAP writes them; "" for other lenses.
-        say: is called with a line of text at each step.
     """
     import pycolmap
 
@@ -242,7 +233,6 @@ def explained(model: pycolmap.Reconstruction, pairs: Mapping[tuple[str, str], in
     """Share of the verified matches of all pairs that became points of the model.
 
     Args:
-        model: with points and their tracks.
         pairs: number of verified matches of each pair of pictures.
     """
     names = {image.image_id: image.name for image in model.images.values()}

@@ -18,9 +18,7 @@ def complete_masks(photographs: Sequence[Photograph], masks: Path, *, out: Path)
     """Write a mask for every picture: COLMAP finds nothing in a picture without one.
 
     Args:
-        photographs: the pictures.
         masks: folder of ``a.jpg.png`` for ``a.jpg``, black where nothing is to be matched.
-        out: a folder for the masks.
 
     Returns:
         What was met: pictures without a mask are used whole.

@@ -42,15 +42,10 @@ FISHEYE_DEGREES = 180.0
 
 @dataclass(frozen=True, eq=False)
 class FaceRig:
-    """The faces of panoramas of one size.
+    """The faces of panoramas of one size."""
 
-    Attributes:
-        faces: how each face is sampled from a panorama.
-        panoramas: names of the panoramas.
-    """
-
-    faces: tuple[Face, ...]
-    panoramas: tuple[str, ...]
+    faces: tuple[Face, ...]  # how each face is sampled from a panorama
+    panoramas: tuple[str, ...]  # names of the panoramas
 
     def prefix(self, face: Face) -> str:
         """Folder of a face's files during mapping, as COLMAP's rigs need it; see rename_faces."""
@@ -150,7 +145,6 @@ def write_faces(
     """Cut panoramas into faces.
 
     Args:
-        photographs: panoramas.
         images: folder for the faces, see ``FaceRig.names``.
         masks: folder of ``NAME.png`` of the panoramas; None for none.
         face_masks: folder for ``NAME.png`` of the faces.

@@ -53,24 +53,15 @@ SOFT = 10.0
 
 @dataclass(frozen=True)
 class Photograph:
-    """One readable picture.
+    """One readable picture."""
 
-    Attributes:
-        path: where it is.
-        name: relative to the folder, with "/".
-        size: width and height when upright, pixels.
-        camera: pictures of equal text were taken by one camera at one focal length.
-        turned: whether its pixels are stored on their side.
-        sharpness: variance of the Laplacian at JUDGED_HEIGHT, grey levels squared.
-        location: latitude and longitude in degrees, height in metres; None without GPS.
-    """
-
-    path: Path
-    name: str
-    size: tuple[int, int]
-    camera: str
-    turned: bool
-    sharpness: float
+    path: Path  # where it is
+    name: str  # relative to the folder, with "/"
+    size: tuple[int, int]  # width and height when upright, pixels
+    camera: str  # pictures of equal text were taken by one camera at one focal length
+    turned: bool  # whether its pixels are stored on their side
+    sharpness: float  # variance of the Laplacian at JUDGED_HEIGHT, grey levels squared
+    # Latitude and longitude in degrees, height in metres; None without GPS.
     location: tuple[float, float, float] | None = None
 
 

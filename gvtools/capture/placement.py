@@ -30,16 +30,11 @@ SEED = 1
 
 @dataclass(frozen=True)
 class Placement:
-    """How a model was placed.
+    """How a model was placed."""
 
-    Attributes:
-        metric: whether its units are metres.
-        by: "GPS", "distance" (scale only) or "cameras" (mean up direction only).
-        origin: latitude, longitude [degrees] and height [m] of its origin; None without GPS.
-    """
-
-    metric: bool
-    by: str
+    metric: bool  # whether its units are metres
+    by: str  # "GPS", "distance" (scale only) or "cameras" (mean up direction only)
+    # Latitude, longitude [degrees] and height [m] of its origin; None without GPS.
     origin: tuple[float, float, float] | None = None
 
 
@@ -52,7 +47,6 @@ def place(
     """Move, rotate and scale a model in place.
 
     Args:
-        model: is changed.
         locations: latitude and longitude [degrees] and height [m] of pictures by name.
         distance: two pictures and the distance of the places where they were taken, metres.
     """

@@ -46,47 +46,31 @@ Say = Callable[[str], object]
 
 @dataclass(frozen=True, kw_only=True)
 class CaptureReport:
-    """What a capture found.
+    """What a capture found."""
 
-    Attributes:
-        source: absolute path of the input.
-        pictures: number of readable, different pictures.
-        registered: names of those with a camera, in natural order.
-        left_out: reason for each other picture, by name.
-        reprojection_px: mean reprojection error of the triangulated points, pixels.
-        points: number of triangulated points.
-        track_length: mean number of pictures that a point is seen in.
-        explained: share of the verified matches that became points, 0 to 1; low for a wrong model.
-        mapping: "global" or "incremental".
-        features: "sift", "aliked" or "disk".
-        matching: how pairs were chosen, in words.
-        other_models: number of pictures of each further model, not connected to this one.
-        overlap: pairs of pictures, and the number of their verified matches.
-        cameras: model, size and parameters of each camera, as COLMAP has them.
-        metric: whether units are metres.
-        placed_by: "GPS", "distance" or "cameras", see ``placement``.
-        origin: latitude and longitude [degrees] and height [m] of the origin; None without GPS.
-        findings: notes and warnings.
-    """
-
-    source: str
-    pictures: int
-    registered: tuple[str, ...]
-    left_out: dict[str, str]
-    reprojection_px: float
-    points: int
-    track_length: float
+    source: str  # absolute path of the input
+    pictures: int  # number of readable, different pictures
+    registered: tuple[str, ...]  # names of those with a camera, in natural order
+    left_out: dict[str, str]  # reason for each other picture, by name
+    reprojection_px: float  # mean reprojection error of the triangulated points, pixels
+    points: int  # number of triangulated points
+    track_length: float  # mean number of pictures that a point is seen in
+    # Share of the verified matches that became points, 0 to 1; low for a wrong model.
     explained: float
-    mapping: str
-    features: str
-    matching: str
+    mapping: str  # "global" or "incremental"
+    features: str  # "sift", "aliked" or "disk"
+    matching: str  # how pairs were chosen, in words
+    # Number of pictures of each further model, not connected to this one.
     other_models: tuple[int, ...]
+    # Pairs of pictures, and the number of their verified matches.
     overlap: tuple[tuple[str, str, int], ...]
+    # Model, size and parameters of each camera, as COLMAP has them.
     cameras: tuple[dict[str, Any], ...]
-    metric: bool
-    placed_by: str
+    metric: bool  # whether units are metres
+    placed_by: str  # "GPS", "distance" or "cameras", see ``placement``
+    # Latitude and longitude [degrees] and height [m] of the origin; None without GPS.
     origin: tuple[float, float, float] | None
-    findings: tuple[Finding, ...] = field(default=())
+    findings: tuple[Finding, ...] = field(default=())  # notes and warnings
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-ready."""
@@ -108,7 +92,6 @@ def capture_photographs(
     """Find the cameras of a folder's photographs, or of a video's frames, and write a project.
 
     Args:
-        source: the folder or the video.
         out: the project's folder; absent or empty.
         frames: how many frames of a video to take; None goes by its motion, see ``video``.
         masks: folder of ``NAME.png``, black where no features are to be found; not for videos.
@@ -116,7 +99,6 @@ def capture_photographs(
         learned: finds and matches features; None takes COLMAP's SIFT.
         lens: "perspective", "equirectangular" (panoramas, which are cut into faces), "fisheye", or
             "auto": recognised from the pictures.
-        say: is called with a line of text at each step.
         draw: adds pictures to the project's folder before it gets its name.
     """
     is_video = source.is_file()

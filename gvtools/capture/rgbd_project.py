@@ -53,46 +53,29 @@ Say = Callable[[str], object]
 
 @dataclass(frozen=True, kw_only=True)
 class RgbdCaptureReport:
-    """What the capture of an RGB-D recording found.
+    """What the capture of an RGB-D recording found."""
 
-    Attributes:
-        source: absolute path of the input.
-        pictures: frames with depth that were tried.
-        registered: names of those with a pose, in order of time.
-        left_out: file of the recording and reason of each other one.
-        sources: file of the recording that each registered frame's picture is.
-        matching: how pairs were chosen.
-        overlap: pairs of frames, and the share of each first one's depth that the second sees.
-        other_parts: frames of further connected parts, the largest first.
-        keyframes: names of the frames that loops were looked for among.
-        loops: pairs of keyframes that close loops.
-        drift: median and greatest residual of loops on the chain of neighbours: millimetres and
-            degrees; None where no loop says it.
-        residuals: the same after optimisation.
-        path_m: length of the path, metres.
-        cameras: model and parameters of the camera.
-        metric: True.
-        placed_by: "first frame": the world's frame is that of the first frame's camera.
-        findings: what was met.
-    """
-
-    source: str
-    pictures: int
-    registered: tuple[str, ...]
-    left_out: dict[str, str]
-    sources: dict[str, str]
-    matching: str
+    source: str  # absolute path of the input
+    pictures: int  # frames with depth that were tried
+    registered: tuple[str, ...]  # names of those with a pose, in order of time
+    left_out: dict[str, str]  # file of the recording and reason of each other one
+    sources: dict[str, str]  # file of the recording that each registered frame's picture is
+    matching: str  # how pairs were chosen
+    # Pairs of frames, and the share of each first one's depth that the second sees.
     overlap: tuple[tuple[str, str, float], ...]
-    other_parts: tuple[int, ...]
-    keyframes: tuple[str, ...]
-    loops: tuple[tuple[str, str], ...]
+    other_parts: tuple[int, ...]  # frames of further connected parts, the largest first
+    keyframes: tuple[str, ...]  # names of the frames that loops were looked for among
+    loops: tuple[tuple[str, str], ...]  # pairs of keyframes that close loops
+    # Median and greatest residual of loops on the chain of neighbours: millimetres and degrees;
+    # None where no loop says it.
     drift: dict[str, float] | None
-    residuals: dict[str, float] | None
-    path_m: float
-    cameras: tuple[dict[str, Any], ...]
-    metric: bool = True
+    residuals: dict[str, float] | None  # the same after optimisation
+    path_m: float  # length of the path, metres
+    cameras: tuple[dict[str, Any], ...]  # model and parameters of the camera
+    metric: bool = True  # True
+    # "first frame": the world's frame is that of the first frame's camera.
     placed_by: str = "first frame"
-    findings: tuple[Finding, ...] = ()
+    findings: tuple[Finding, ...] = ()  # what was met
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-ready."""
@@ -113,7 +96,6 @@ def capture_rgbd(
         source: a folder of colour and depth, see ``gvtools.scenes.rgbd``, or a ``.bag``.
         out: the project's folder; must not hold anything yet.
         options: what the folder does not tell by itself.
-        say: told of each step.
         draw: adds pictures to the project's folder before it takes its name.
     """
     with replaced_folder(out) as work:
@@ -279,7 +261,6 @@ def points_from_above(scene: Scene, keyframes: Sequence[str]) -> tuple[Cameras, 
     """Cameras and a sparse cloud of a captured project, turned so that z is up, for its picture.
 
     Args:
-        scene: the project.
         keyframes: names of views that give points; of many, DRAWN are taken.
 
     Returns:

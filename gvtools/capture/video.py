@@ -32,19 +32,13 @@ CORNERS = 200
 
 @dataclass(frozen=True)
 class Picked:
-    """What was taken from a video.
+    """What was taken from a video."""
 
-    Attributes:
-        frames: numbers of the frames taken, from 0.
-        total: how many frames it has.
-        motion: of the whole video, in widths of the picture.
-        lost: how many frames the file announces beyond those that can be read; 0 where they are
-            fewer than LOST of all.
-    """
-
-    frames: tuple[int, ...]
-    total: int
-    motion: float
+    frames: tuple[int, ...]  # numbers of the frames taken, from 0
+    total: int  # how many frames it has
+    motion: float  # of the whole video, in widths of the picture
+    # How many frames the file announces beyond those that can be read; 0 where they are fewer
+    # than LOST of all.
     lost: int = 0
 
 
@@ -57,10 +51,7 @@ def pick_frames(
     taken.
 
     Args:
-        path: of the video.
-        folder: is made.
         count: how many frames to take; None takes one a STEP of motion, MOST at most.
-        progress: called with the number of frames read, now and then.
     """
     if count is not None and count < 2:
         raise OptionError(f"--frames {count}; expected 2 or more")

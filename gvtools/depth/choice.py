@@ -1,4 +1,4 @@
-"""Which depth source a run takes: the best that the scene and the machine allow, and why."""
+"""Choice of a depth source: the best that the scene and the machine allow, and why."""
 
 from __future__ import annotations
 
@@ -21,17 +21,12 @@ ROUGH_SIDE, ROUGH_LEVELS = 160, 2
 
 @dataclass(frozen=True, eq=False)
 class ChosenSource:
-    """A source and why it was taken.
+    """A source and why it was taken."""
 
-    Attributes:
-        source: gives the depth.
-        reason: in words, for the user.
-        ignored: options of the plane sweep, ``stereo.NAME=VALUE``, that were given and that the
-            source does not look at.
-    """
-
-    source: DepthSource
-    reason: str
+    source: DepthSource  # gives the depth
+    reason: str  # in words, for the user
+    # Options of the plane sweep, ``stereo.NAME=VALUE``, that were given and that the source does
+    # not look at.
     ignored: tuple[str, ...] = ()
 
 
@@ -50,11 +45,8 @@ def choose_source(
     stereo. Nothing but ``views`` is looked at.
 
     Args:
-        scene: the project.
-        views: names of the context views.
         choice: one of CHOICES; ``sensor`` wants RGB-D, ``colmap`` COLMAP's stereo maps, on disk or
             computed now, ``plane-sweep`` photographs alone, ``da3`` a foundation model's weights.
-        stereo: options of the plane sweep.
         foundation: options of Depth Anything 3; ``da3`` needs its ``weights``.
     """
     chosen = _chosen(
@@ -67,7 +59,6 @@ def rough_source(scene: Scene, source: DepthSource) -> DepthSource:
     """A cheap source of depth for what needs no more than typical distances.
 
     Args:
-        scene: the project.
         source: the run's. Where it takes its time, a plane sweep of small pictures with the poses
             as they are is given instead.
     """

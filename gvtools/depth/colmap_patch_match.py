@@ -36,7 +36,6 @@ class ColmapPatchMatch:
 
     Args:
         scene: with sparse points, from which COLMAP takes depth ranges and sources.
-        views: names; no other view is looked at.
 
     Attributes:
         name: "colmap-patch-match".

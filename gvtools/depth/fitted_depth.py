@@ -55,7 +55,6 @@ class FittedDepth:
     where the Gaussians do not look like the photograph.
 
     Args:
-        appearance: the Gaussians.
         swept: depth that was found without them; None for none.
     """
 

@@ -50,13 +50,7 @@ class FoundationDepth:
     def __init__(
         self, scene: Scene, *, views: Sequence[str], options: FoundationOptions | None = None
     ) -> None:
-        """Prepare; nothing is computed yet.
-
-        Args:
-            scene: the project.
-            views: names of the views to compute.
-            options: see FoundationOptions.
-        """
+        """Prepare; nothing is computed yet."""
         self.options = options or FoundationOptions()
         self.views = tuple(dict.fromkeys(views))
         self._scene = scene

@@ -34,11 +34,9 @@ def depth_from_memory(
     gain per channel that all pixels share; the darker the photograph, the less may be off.
 
     Args:
-        memory: is projected.
         camera: of the photograph, a batch of one.
         rgb: (H, W, 3) uint8, the photograph.
         least: the share of the pixels that have to match.
-        options: of the projection.
 
     Returns:
         Depth and confidence of the matching pixels, source MEMORY; None where they are too few.

@@ -29,7 +29,6 @@ def scale_to_points(scene: Scene, name: str, depth: NDArray[np.float32]) -> Scal
 
     Args:
         scene: the project; its points are in its own unit.
-        name: of the view.
         depth: (H, W) z-depth, scene units, 0 = none.
 
     Returns:
@@ -47,8 +46,6 @@ def depth_of_points(
     """The depth map's value at each sparse point of a view, and the point's own depth.
 
     Args:
-        scene: the project, with sparse points.
-        name: of the view.
         depth: (h, w) z-depth, of the view's size or another one, 0 = none.
 
     Returns:
@@ -76,19 +73,12 @@ def disagrees(fit: ScaleFit | None) -> bool:
 
 @dataclass(frozen=True)
 class FoundationScale:
-    """How the network's unit became the scene's.
+    """How the network's unit became the scene's."""
 
-    Attributes:
-        status: "aligned", or "unsupported: ..." with the reason.
-        support: "points" or "cameras".
-        scale: scene units per unit of the network (after the known cameras' own unit).
-        count: points, or centres.
-    """
-
-    status: str
-    support: str
-    scale: float
-    count: int
+    status: str  # "aligned", or "unsupported: ..." with the reason
+    support: str  # "points" or "cameras"
+    scale: float  # scene units per unit of the network (after the known cameras' own unit)
+    count: int  # points, or centres
 
     @property
     def ok(self) -> bool:
@@ -98,21 +88,15 @@ class FoundationScale:
 
 @dataclass(frozen=True, eq=False)
 class Pass:
-    """One forward pass of the network.
+    """One forward pass of the network."""
 
-    Attributes:
-        depth: (h, w) z-depth by view, at the network's size, in its unit.
-        confidence: (h, w) in [0, 1) by view.
-        centres: (V, 3) predicted camera centres, frame of the first view, its unit.
-        names: of the V views.
-        unit: scene units a unit of the known cameras that the network saw; 1 without them.
-    """
-
+    # (h, w) z-depth by view, at the network's size, in its unit.
     depth: dict[str, NDArray[np.float32]]
-    confidence: dict[str, NDArray[np.float32]]
+    confidence: dict[str, NDArray[np.float32]]  # (h, w) in [0, 1) by view
+    # (V, 3) predicted camera centres, frame of the first view, its unit.
     centres: NDArray[np.float64]
-    names: tuple[str, ...]
-    unit: float
+    names: tuple[str, ...]  # of the V views
+    unit: float  # scene units a unit of the known cameras that the network saw; 1 without them
 
 
 def fit_scale(scene: Scene, passes: Sequence[Pass]) -> FoundationScale:

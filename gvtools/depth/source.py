@@ -22,21 +22,14 @@ CHECKING_VIEWS = 8
 
 @dataclass(frozen=True, eq=False)
 class DepthMap:
-    """Depth of one view.
+    """Depth of one view."""
 
-    Attributes:
-        depth: (H, W) float32 z-depth, scene units, 0 = none.
-        confidence: (H, W) float32 in (0, 1].
-        source: name of the source.
-        contradicted: how many pixels' depth was dropped because other views look through it.
-        guessed: (H, W) pixels whose depth nothing confirms, which the memory takes as generated;
-            None for none; not kept in files.
-    """
-
-    depth: NDArray[np.float32]
-    confidence: NDArray[np.float32]
-    source: str
-    contradicted: int = 0
+    depth: NDArray[np.float32]  # (H, W) float32 z-depth, scene units, 0 = none
+    confidence: NDArray[np.float32]  # (H, W) float32 in (0, 1]
+    source: str  # name of the source
+    contradicted: int = 0  # how many pixels' depth was dropped because other views look through it
+    # (H, W) pixels whose depth nothing confirms, which the memory takes as generated; None for
+    # none; not kept in files.
     guessed: NDArray[np.bool_] | None = None
 
 
@@ -116,7 +109,6 @@ class MixedDepth:
     """Recorded depth where a view has it, another source's elsewhere.
 
     Args:
-        recorded: comes first.
         computed: for the views that the first does not cover.
     """
 

@@ -81,7 +81,6 @@ def match_pictures(
     """Match pictures with views.
 
     Args:
-        pictures: names, folders included.
         views: names of the views that are to be judged.
         rule: "name", "order", or "auto": by name where any name matches, by order where none does
             and there are as many pictures as views.

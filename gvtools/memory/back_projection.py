@@ -66,11 +66,9 @@ def back_project(
     Args:
         rgb: (H, W, 3) uint8.
         depth: (H, W) z-depth, scene units; 0, NaN and inf mean none.
-        camera: of the same image size.
         frame: ``memory.frame``; None for the world's.
         confidence: (H, W) float32 > 0.
         mask: (H, W), True = use.
-        options: see BackProjectionOptions.
         levels: ``memory.levels``, for ``pixel_binning``.
         pixel_binning: merge 2 x 2 pixels into one point, their mean, if together they are at most
             this many voxel edges wide (of the voxel that they fall into) and the surface is not

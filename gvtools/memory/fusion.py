@@ -21,30 +21,19 @@ from gvtools.memory.store.voxel_index import EMPTY_KEY, group_by_block, voxel_ke
 
 @dataclass(frozen=True)
 class FuseReport:
-    """What became of the points of one ``fuse``: added, merged or rejected.
+    """What became of the points of one ``fuse``: added, merged or rejected."""
 
-    Attributes:
-        points: points that arrived.
-        added: new observations stored.
-        merged: points averaged into an observation (of this or an earlier view).
-        rejected_observed: generated points in voxels that hold observed content.
-        rejected_free: generated points in space that an observed ray saw to be free.
-        out_of_reach: points farther from the origin than voxel keys go, and points without a finite
-            position or a positive, finite confidence and spacing.
-        voxels: voxels that were empty before.
-        agreed: observations of earlier rounds whose confidence rose.
-        dropped: pixels that gave no point, by reason.
-    """
-
-    points: int = 0
-    added: int = 0
-    merged: int = 0
-    rejected_observed: int = 0
-    rejected_free: int = 0
+    points: int = 0  # points that arrived
+    added: int = 0  # new observations stored
+    merged: int = 0  # points averaged into an observation (of this or an earlier view)
+    rejected_observed: int = 0  # generated points in voxels that hold observed content
+    rejected_free: int = 0  # generated points in space that an observed ray saw to be free
+    # Points farther from the origin than voxel keys go, and points without a finite position or a
+    # positive, finite confidence and spacing.
     out_of_reach: int = 0
-    voxels: int = 0
-    agreed: int = 0
-    dropped: dict[str, int] = field(default_factory=dict)
+    voxels: int = 0  # voxels that were empty before
+    agreed: int = 0  # observations of earlier rounds whose confidence rose
+    dropped: dict[str, int] = field(default_factory=dict)  # pixels that gave no point, by reason
 
     @property
     def rejected(self) -> int:

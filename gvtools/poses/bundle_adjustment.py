@@ -176,9 +176,7 @@ def tracks_of(scene: Scene, names: Sequence[str], frame: LocalFrame) -> Tracks |
     """The tracks of a project's sparse points in some views; None where these are too few.
 
     Args:
-        scene: the project.
         names: of the views, which the tracks number in this order.
-        frame: that positions are given in.
     """
     points = scene.points
     if points is None or not len(points.view_index):

@@ -37,12 +37,8 @@ def extract_sift(
 
     Args:
         database: where they go.
-        images: folder of the pictures.
-        names: in it.
         masks: folder of masks, black where no feature may be.
-        reader: COLMAP's options of cameras.
         side: longer side that pictures are reduced to before, pixels.
-        features: at most so many of a picture.
         first_octave: -1 doubles pictures before; 0 takes a quarter of the time.
         one_camera: whether all of them have one camera, and so one size.
     """

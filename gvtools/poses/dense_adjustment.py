@@ -93,7 +93,6 @@ def adjusted(
     each pose is held to where it was.
 
     Args:
-        cameras: of the scene.
         equations: for each reference view its row, its sources' rows and what was measured.
         rotation: expected error of a pose, radians.
         translation: likewise, scene units.

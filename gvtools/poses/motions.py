@@ -68,8 +68,6 @@ def mean_near(
         poses: (V, 4, 4) of the cameras, in the same frame.
         values: (V, C) what belongs to each camera.
         depth: typical depth, scene units.
-        but: cameras that do not count.
-        count: how many cameras count.
         reach: how fast weights fall with distance (in shares of the depth) and angle [rad], see
             ``NEAR_SHIFT``.
     """

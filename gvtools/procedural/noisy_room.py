@@ -152,7 +152,6 @@ def write_noisy_room(
 
     Args:
         folder: absent, empty, or written by the same call before.
-        seed: 0 or more.
         views: of context and targets together, at least 4.
         width: of the pictures, pixels.
         height: of the pictures, pixels.

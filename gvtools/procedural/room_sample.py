@@ -58,7 +58,6 @@ def write_room(
 
     Args:
         folder: the workspace; absent, empty, or written by the same call before.
-        seed: 0 or more.
         views: of context and targets together, at least 4.
         width: of the images, pixels.
         height: of the images, pixels.

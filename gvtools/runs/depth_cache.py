@@ -26,8 +26,6 @@ class DepthCache:
     """The depth of a run's context: recorded, kept by round 0, or asked of the source.
 
     Args:
-        scene: the project.
-        names: of the context views.
         source: where depth comes from.
         folder: of round 0; what is not recorded is written there, and read again later.
         unfinished: round 0 is being written; a damaged file in its folder is then replaced.

@@ -57,19 +57,13 @@ class RunTarget:
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A run as its folder holds it; memory and project are read when they are first used.
+    """A run as its folder holds it; memory and project are read when they are first used."""
 
-    Attributes:
-        path: its folder.
-        record: what run.json holds.
-        rounds: reports of the complete rounds, the context's (round 0) first; perhaps none.
-        project: where its project lies now; None: where it lay.
-    """
-
-    path: Path
-    record: Mapping[str, Any]
+    path: Path  # its folder
+    record: Mapping[str, Any]  # what run.json holds
+    # Reports of the complete rounds, the context's (round 0) first; perhaps none.
     rounds: tuple[Mapping[str, Any], ...]
-    project: Path | None = None
+    project: Path | None = None  # where its project lies now; None: where it lay
 
     @cached_property
     def settings(self) -> Mapping[str, Any]:

@@ -32,10 +32,7 @@ def fuse_scan(
     size of its splat.
 
     Args:
-        memory: is added to.
         scan: in its own frame.
-        placement: of the scan in the memory's world.
-        round: that its points belong to.
     """
     # Relative to both origins: georeferenced coordinates are too large for float32.
     turn = placement.world_from_scan[:3, :3]

@@ -38,7 +38,6 @@ def open_lidar(path: Path, *, generated: bool = False) -> ScanFile:
     """A LAS, LAZ or E57, its header read.
 
     Args:
-        path: the file.
         generated: whether points of a LAS are kept that a completer made.
     """
     suffix = path.suffix.lower()

@@ -170,7 +170,6 @@ def register(
         photographed: in the world, scene units.
         least: smallest fitness that is accepted, 0 to 1.
         metric: whether the world's unit is the metre: METRIC scales are then tried first.
-        seed: of random sampling.
     """
     for name, surface in (("scan", scan), ("photographs", photographed)):
         if len(surface.positions) < FEWEST:

@@ -33,9 +33,6 @@ def number_table(path: Path, columns: int, *, skip: int = 0, required: bool = Fa
     """(N, columns) float64 of a text file with one row a line.
 
     Args:
-        path: the file.
-        columns: that each row has.
-        skip: lines above the rows.
         required: whether an absent file or one without rows is refused; else it has no rows.
     """
     try:

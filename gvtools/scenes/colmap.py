@@ -52,7 +52,6 @@ def read_colmap(
     of the recorded camera, which in a dense workspace is the undistorted one already.
 
     Args:
-        root: the workspace or the model folder.
         images: the image folder, where it is not beside the model.
         masks: the mask folder, where it is not beside the images.
         model: number of the model, where there are several; None takes the largest.

@@ -68,7 +68,6 @@ def find_model(root: Path, *, number: int | None = None) -> Path | None:
     """The model folder of a workspace, or ``root`` when it is one; None when there is none.
 
     Args:
-        root: the workspace.
         number: of the model, where the workspace holds several (``sparse/0``, ``sparse/1``, ...);
             None takes the one with most images, the first of equals.
     """
@@ -279,7 +278,6 @@ def load_model(folder: Path, *, faces: bool = False) -> ColmapModel:
     """The model in ``folder``, binary or text, classic or with rigs and frames.
 
     Args:
-        folder: holds its files.
         faces: cameras that see too much for one pinhole camera become several views, see
             ``faces``; without, each camera is one.
     """
@@ -389,7 +387,6 @@ def sparse_points(
     """The model's points with their tracks in the views' pinhole pixels.
 
     Args:
-        model: a loaded model.
         views_of_image: for the model's image ids, the indices of their views, in the order of
             the camera's ``views``.
 

@@ -251,7 +251,6 @@ def perspective_views(
     of the faces that they show, cut to the part that they show. All others stay one view.
 
     Args:
-        model: one of COLMAP's camera models.
         params: its parameters, in COLMAP's order; pixels, first pixel centre (0.5, 0.5).
         size: width and height of the recorded picture, pixels.
         what: where the camera was read, for the message.
@@ -276,7 +275,6 @@ def panorama_faces(camera: pycolmap.Camera, *, degrees: float = 90.0) -> tuple[F
     """The six faces of an equirectangular camera, as fine in their middle as it is at its equator.
 
     Args:
-        camera: of the model EQUIRECTANGULAR.
         degrees: field of view of each face; more than 90 lets neighbours overlap.
     """
     across = math.tan(math.radians(degrees / 2))

@@ -73,7 +73,6 @@ def inspect(scene: Scene, *, probes: int | None = None) -> SceneReport:
     Files that cannot be read become error findings; nothing is raised for them.
 
     Args:
-        scene: as it was read.
         probes: how many views have their pixels decoded, evenly spread; None: all.
     """
     findings = list(scene.findings)

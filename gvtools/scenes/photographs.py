@@ -129,13 +129,8 @@ def posed_scene(
     """The scene of the frames that can be used.
 
     Args:
-        root: the scene's folder or file.
-        frames: that the layout names.
         poses: which way ``PosedFrame.pose`` maps.
         metric: whether the units of poses and depth are metres.
-        kind: of the scene.
-        strict: see the module's text.
-        findings: what the reader met.
         home: the folder that no file of a frame may lie outside of; None: ``root``.
         unposed: reason for which frames without a pose are left out.
     """

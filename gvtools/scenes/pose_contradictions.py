@@ -136,7 +136,6 @@ def contradiction_findings(
     """One warning when nearly equal cameras see different things, else nothing.
 
     Args:
-        scene: whose poses are doubted.
         thumbnails: by the view's number; of the views whose pictures could be read.
         depths: median z-depth of views that have any, scene units.
     """
@@ -183,9 +182,7 @@ def disagreement(a: Thumbnail, b: Thumbnail, cameras: Cameras) -> float | None:
     """Share of the area with contrast in which two pictures differ.
 
     Args:
-        a: the first picture.
         b: the second, which is carried onto the first by the homography of the rotation.
-        cameras: of the two, at any size.
 
     Returns:
         None where less than ``COMPARABLE`` of the picture lies in both and has contrast in both.

@@ -25,7 +25,6 @@ def reduced(scene: Scene, max_side: int | None) -> Scene:
     no depth lies between two surfaces. Cameras and detections of sparse points follow.
 
     Args:
-        scene: left as it is.
         max_side: pixels; None keeps every size.
     """
     check_max_side(max_side)
@@ -68,7 +67,6 @@ def resized(scene: Scene, width: int, height: int) -> Scene:
     pixel. Cameras and detections of sparse points follow.
 
     Args:
-        scene: left as it is.
         width: pixels.
         height: pixels.
     """

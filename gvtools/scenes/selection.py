@@ -35,7 +35,6 @@ def select(names: Sequence[str], spec: str) -> tuple[str, ...]:
 
     Args:
         names: a scene's view names, in its order.
-        spec: see the module's text.
     """
     pictures: dict[str, list[int]] = {}
     for i, name in enumerate(names):

@@ -158,9 +158,6 @@ def read_transforms_cameras(path: Path) -> Cameras:
 
     Distorted cameras become the pinhole cameras that ``read_transforms`` gives them.
 
-    Args:
-        path: the file.
-
     Returns:
         One camera a perspective view of a frame, in the order of names that ``read_transforms``
         has.
@@ -192,7 +189,6 @@ def write_transforms(
     """Write cameras as a ``transforms.json`` that nerfstudio, instant-ngp and this project read.
 
     Args:
-        path: the file.
         cameras: V cameras; K without skew.
         image_paths: V pictures, absolute or relative to the file's folder.
         generated: names of the cameras whose pictures a completer made.
@@ -385,7 +381,6 @@ def frame_keys(frame: Mapping[str, Any], shared: Mapping[str, Any], *, what: str
     """A frame's keys, checked.
 
     Args:
-        frame: its own.
         shared: the file's, of which those of the camera stand in for absent ones of the frame.
         what: where they were read, for the message.
     """

@@ -161,7 +161,6 @@ def undistortion(
     Pinhole models without distortion are passed untouched.
 
     Args:
-        model: one of COLMAP's camera models.
         params: its parameters, in COLMAP's order; pixels, first pixel centre (0.5, 0.5).
         size: width and height of the recorded picture, pixels.
         what: where the camera was read, for the message.
@@ -211,7 +210,6 @@ def camera_of(
     """A camera of COLMAP from its model's name and parameters, checked.
 
     Args:
-        model: one of COLMAP's camera models.
         params: its parameters, in COLMAP's order.
         size: width and height, pixels.
         what: where the camera was read, for the message.

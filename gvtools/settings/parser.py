@@ -36,8 +36,6 @@ def with_file(settings: S, path: Path, *, presets: Mapping[str, str] | None = No
     """``settings`` with those of a JSON file over those of presets.
 
     Args:
-        settings: to start from.
-        path: the file.
         presets: names of presets by field, in place of those that the file may name.
     """
     try:

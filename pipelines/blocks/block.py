@@ -167,7 +167,6 @@ def cut_cells(centers: Float64, count: int) -> dict[str, BlockCell]:
 
     Args:
         centers: (V, 3), world frame, scene units.
-        count: how many cells.
 
     >>> places = np.array([[0, 0, 0], [1, 0, 0], [5, 0, 0], [5, 1, 0]], float)
     >>> {name: cell.holds(places).tolist() for name, cell in cut_cells(places, 2).items()}

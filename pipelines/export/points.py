@@ -158,8 +158,6 @@ def write_glb_scene(
     Args:
         geometry: makes trimesh's geometry of positions (N, 3) around the node's origin.
         positions: (N, 3) world frame, scene units.
-        path: the file.
-        node: its name.
         extras: what the node says beside its origin and frame.
     """
     import trimesh

@@ -68,7 +68,6 @@ def draw_pareto(
         front: those that no other beats in both time and PSNR, fastest first.
         chosen: the recommended one; None where none is within the budget.
         budget: seconds; None for no limit.
-        title: of the scene.
     """
     from matplotlib.ticker import LogLocator
 

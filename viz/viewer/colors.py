@@ -70,8 +70,6 @@ def point_colors(
     """Colours of observations; an observation's is the same whichever others are asked for.
 
     Args:
-        memory: of the observations.
-        mode: one of MODES.
         rows: (P,) the observations; None for all.
         true_depth: the recorded depth (H, W) of a view by its name, or None; for "depth-error".
         counts: the memory's view_counts, for "views"; None: they are counted.

@@ -120,7 +120,6 @@ def pinhole(pose: Float64, size: tuple[int, int], field_of_view: float, *, name:
         pose: (4, 4) cam_from_world.
         size: width and height, pixels.
         field_of_view: vertical, radians.
-        name: of the view.
     """
     width, height = size
     focal = height / (2 * np.tan(field_of_view / 2))

@@ -49,12 +49,9 @@ class WebViewer:
     scale fit its units.
 
     Args:
-        run: as it is now.
-        host: address to listen at.
         port: the first one tried; where it is taken, the next free one is used.
         budget: points drawn at most; a larger run is thinned evenly in space.
         round: to begin with; None for the last.
-        mode: colours to begin with, of MODES.
     """
 
     def __init__(

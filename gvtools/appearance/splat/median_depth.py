@@ -1,4 +1,4 @@
-"""Where the surfaces are that Gaussians show."""
+"""Median depth of splatted Gaussians."""
 
 from __future__ import annotations
 
@@ -55,11 +55,8 @@ def median_tiles(first, last, tiles, tiles_x, offsets, lists, projected, depth):
     Args:
         first: of the rows of ``tiles``.
         last: one past the last of them.
-        tiles: numbers of tiles.
-        tiles_x: tiles side by side.
         offsets: of the tiles' lists in ``lists``.
         lists: (pairs, 3) Gaussians of the tiles, nearest first.
-        projected: see project_kernels.
         depth: (H, W), written where there is a surface.
     """
     height, width = depth.shape

@@ -126,11 +126,9 @@ def project_gaussians(first, last, values, terms, camera, width, height, near, o
     """Project Gaussians.
 
     Args:
-        first: their numbers.
         last: one past the last of them.
         values: (N, VALUES), see above.
         terms: how many harmonics count, 1, 4 or 9.
-        camera: see the module.
         width: of the picture [px].
         height: of the picture [px].
         near: what is nearer is left out, scene units.
@@ -206,19 +204,13 @@ def backward_gaussians(
     """Gradients of the parameters of Gaussians that were splatted.
 
     Args:
-        first: numbers of the parts to do.
         last: one past the last of them.
         bounds: places in ``seen`` at which parts begin and end.
         seen: numbers of the Gaussians that were splatted.
         starts: rows of ``sums`` of each of them, one a tile: ``starts[j]`` to ``starts[j + 1]``.
         sums: (pairs, SUMS), see above.
-        values: as for
-        terms: as for
-        camera: as for
-        width: as for
         height: as for
             ``project_gaussians``.
-        projected: what it wrote.
         d_values: (len(seen), VALUES + 2) gradients of the parameters, and by the centre in the
             picture [1/px], written; harmonics from ``terms`` on get none.
         d_camera: (parts, 12) gradient by rotation and translation that each part adds, written.

@@ -70,7 +70,6 @@ class Splat:
 
         Args:
             values: (N, VALUES) float32 or float64, see project_kernels; kept, not copied.
-            lens: of the same type.
             degree: of the spherical harmonics that count, 0 to 2.
             faint: gradients leave out blocks of 8 x 2 pixels that got less light than this, summed
                 over the block, from a Gaussian.
@@ -170,7 +169,6 @@ def splat(
         values: (N, VALUES) on the CPU, float32 or float64; see ``Splat``.
         cam_from_world: (4, 4) pose.
         K: (3, 3) intrinsics without skew [px].
-        size: width and height.
         near: what is nearer is not drawn, scene units.
         degree: of the spherical harmonics that count.
 

@@ -82,9 +82,6 @@ def count_tiles(first, last, bounds, seen, depth_part, projected, tiles_x, tiles
         bounds: part p holds the places ``bounds[p]`` to ``bounds[p + 1]``.
         seen: numbers of the Gaussians that reach the picture.
         depth_part: the part that each falls into when they are ordered by depth.
-        projected: see project_kernels.
-        tiles_x: how many tiles are side by side.
-        tiles_y: how many rows of tiles there are.
         pairs: (len(seen),), written.
         counts: (parts of ``seen``, parts by depth, tiles), added to.
     """
@@ -110,7 +107,6 @@ def fill_tiles(
     """Write the tiles' lists: each Gaussian's number and the row of its gradient sums.
 
     Args:
-        first: parts by depth to do.
         last: one past the last of them.
         bounds: part p holds the places ``bounds[p]`` to ``bounds[p + 1]`` of ``nearest``.
         nearest: places in ``seen``, nearest Gaussian first.
@@ -147,13 +143,10 @@ def blend_tiles(first, last, tiles, tiles_x, offsets, lists, blocks, projected, 
     Args:
         first: of the rows of ``tiles``.
         last: one past the last of them.
-        tiles: numbers of tiles.
-        tiles_x: tiles side by side.
         offsets: of the tiles' lists in ``lists``.
         lists: (pairs, 3) Gaussians of the tiles, nearest first; the last column is written: how
             many blocks of the tile each touches.
         blocks: (pairs,) int64 the numbers of those blocks, four bits each, written.
-        projected: see project_kernels.
         image: (5, H, W) red, green, blue, depth (weighted sums) and alpha, written.
         used: (tiles,) how many of its Gaussians a tile looked at, written.
         faint: the gradient leaves out blocks whose 16 pixels got less light than this from a

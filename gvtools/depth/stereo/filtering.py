@@ -276,17 +276,11 @@ def _unlike(rgb, y, x, ny, nx):
 
 @dataclass(frozen=True, eq=False)
 class Agreement:
-    """How a view's depth stands to that of other views.
+    """How a view's depth stands to that of other views."""
 
-    Attributes:
-        views: (H, W) int64, how many others confirm each pixel.
-        spread: (H, W) float32, mean relative difference to those that do; 0 without any.
-        inverse_depth: (H, W) float32, mean of the view's own and the confirming views'.
-    """
-
-    views: torch.Tensor
-    spread: torch.Tensor
-    inverse_depth: torch.Tensor
+    views: torch.Tensor  # (H, W) int64, how many others confirm each pixel
+    spread: torch.Tensor  # (H, W) float32, mean relative difference to those that do; 0 without any
+    inverse_depth: torch.Tensor  # (H, W) float32, mean of the view's own and the confirming views'
 
 
 def agreement(

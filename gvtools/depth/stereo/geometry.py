@@ -48,14 +48,10 @@ class Warps:
     The reference pixel p = (u, v, 1) at inverse depth w lies at ``matrix @ p + w * offset`` in a
     source (homogeneous pixels; the first pixel's centre is (0.5, 0.5)). On a plane of space w is
     affine in u and v, so this is the plane's homography.
-
-    Attributes:
-        matrix: (S, 3, 3) float64, K_s R K_r⁻¹.
-        offset: (S, 3) float64, K_s t, pixels x scene units.
     """
 
-    matrix: Float64
-    offset: Float64
+    matrix: Float64  # (S, 3, 3) float64, K_s R K_r⁻¹
+    offset: Float64  # (S, 3) float64, K_s t, pixels x scene units
 
     def project(self, xy: Float64, inverse_depth: Float64) -> tuple[Float64, Float64]:
         """Where reference pixels lie in the sources.
@@ -100,7 +96,6 @@ def disparity_rate(
 
     Args:
         reference: a batch of one.
-        sources: S cameras.
         near: depth, scene units.
         far: depth, scene units, may be infinite.
 
@@ -128,36 +123,22 @@ def disparity_rate(
 
 @dataclass(frozen=True)
 class DepthRange:
-    """Depths of one view, scene units.
+    """Depths of one view, scene units."""
 
-    Attributes:
-        near: where the search begins.
-        far: where it ends.
-        lower: lower quartile of the depths, or what stands for it.
-        upper: upper quartile.
-        origin: "points", "axes", "baseline" or "pictures": what it was derived from.
-    """
-
-    near: float
-    far: float
-    lower: float
-    upper: float
-    origin: str
+    near: float  # where the search begins
+    far: float  # where it ends
+    lower: float  # lower quartile of the depths, or what stands for it
+    upper: float  # upper quartile
+    origin: str  # "points", "axes", "baseline" or "pictures": what it was derived from
 
 
 @dataclass(frozen=True, eq=False)
 class SeenPoints:
-    """Sparse points of one view.
+    """Sparse points of one view."""
 
-    Attributes:
-        positions: (N, 3) float64, world frame, scene units.
-        index: (N,) rows of the scene's points.
-        points: all of the scene's points.
-    """
-
-    positions: Float64
-    index: NDArray[np.int64]
-    points: SparsePoints
+    positions: Float64  # (N, 3) float64, world frame, scene units
+    index: NDArray[np.int64]  # (N,) rows of the scene's points
+    points: SparsePoints  # all of the scene's points
 
     def seen_by(self, views: list[int]) -> NDArray[np.bool_]:
         """(len(views), N) whether each of the scene's views has each point in its tracks."""
@@ -211,7 +192,6 @@ def range_of_depths(depths: Float64, *, origin: str, margin: float = MARGIN) -> 
 
     Args:
         depths: (N,) scene units, outliers among them.
-        origin: see DepthRange.
         margin: factor by which the range reaches beyond the percentiles.
     """
     low, lower, upper, high = np.percentile(depths, [LOW, 25, 75, HIGH])
@@ -269,11 +249,7 @@ def choose_sources(
     those at the reference's own place are none.
 
     Args:
-        scene: the project.
-        name: the reference view.
         candidates: views that may be looked at; the reference itself is left out.
-        count: how many at most.
-        depths: the reference's depth range.
     """
     others = tuple(candidate for candidate in candidates if candidate != name)
     if not others:
@@ -339,15 +315,10 @@ def _frustum_points(camera: Cameras, depths: DepthRange) -> Float64:
 
 @dataclass(frozen=True, eq=False)
 class Hypotheses:
-    """Planes parallel to the reference's image, evenly spaced in inverse depth.
+    """Planes parallel to the reference's image, evenly spaced in inverse depth."""
 
-    Attributes:
-        inverse_depths: (D,) float32, ascending, 1 / scene units.
-        step: their spacing.
-    """
-
-    inverse_depths: torch.Tensor
-    step: float
+    inverse_depths: torch.Tensor  # (D,) float32, ascending, 1 / scene units
+    step: float  # their spacing
 
 
 def plane_hypotheses(
@@ -357,8 +328,6 @@ def plane_hypotheses(
 
     Args:
         reference: the level's camera, a batch of one.
-        sources: the level's source cameras.
-        depths: what is searched.
         planes: how many; None for one per pixel of disparity in the source that moves most,
             between 8 and 256.
     """
@@ -375,7 +344,6 @@ def best_plane(volume: torch.Tensor, hypotheses: Hypotheses) -> tuple[torch.Tens
 
     Args:
         volume: (H, W, D) float32 costs.
-        hypotheses: the D planes.
 
     Returns:
         (H, W) float32 inverse depth, and (H, W) int64 which plane was cheapest.

@@ -41,25 +41,15 @@ CLIPPED = 0.02
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """One level of the pyramid of a reference view and its sources.
+    """One level of the pyramid of a reference view and its sources."""
 
-    Attributes:
-        reference: (H, W) float32 luminance in [0, 1].
-        sources: (S, H', W') float32, padded to the largest source.
-        sizes: (S, 2) int32, width and height of each source, pixels.
-        matrix: (S, 3, 3) float32, see gvtools.depth.stereo.geometry.Warps.
-        offset: (S, 3) float32.
-        taps: (T, 2) int32, dx and dy of the compared pixels of a window.
-        weights: (H, W, T) float32, how much each counts; they sum to 1 at each pixel.
-    """
-
-    reference: torch.Tensor
-    sources: torch.Tensor
-    sizes: torch.Tensor
-    matrix: torch.Tensor
-    offset: torch.Tensor
-    taps: torch.Tensor
-    weights: torch.Tensor
+    reference: torch.Tensor  # (H, W) float32 luminance in [0, 1]
+    sources: torch.Tensor  # (S, H', W') float32, padded to the largest source
+    sizes: torch.Tensor  # (S, 2) int32, width and height of each source, pixels
+    matrix: torch.Tensor  # (S, 3, 3) float32, see gvtools.depth.stereo.geometry.Warps
+    offset: torch.Tensor  # (S, 3) float32
+    taps: torch.Tensor  # (T, 2) int32, dx and dy of the compared pixels of a window
+    weights: torch.Tensor  # (H, W, T) float32, how much each counts; they sum to 1 at each pixel
 
 
 class Matcher(ABC):
@@ -80,7 +70,6 @@ class Matcher(ABC):
         raised by the noise's, so that windows without texture match nothing.
 
         Args:
-            level: the pictures.
             inverse_depths: (D,) float32.
 
         Returns:
@@ -115,15 +104,10 @@ class Matcher(ABC):
 
 @dataclass(frozen=True, eq=False)
 class Pyramid:
-    """One view's picture on every level, finest first.
+    """One view's picture on every level, finest first."""
 
-    Attributes:
-        images: (H, W) float32 luminance in [0, 1], one for each level.
-        cameras: the view's camera for each level, batches of one.
-    """
-
-    images: tuple[torch.Tensor, ...]
-    cameras: tuple[Cameras, ...]
+    images: tuple[torch.Tensor, ...]  # (H, W) float32 luminance in [0, 1], one for each level
+    cameras: tuple[Cameras, ...]  # the view's camera for each level, batches of one
 
 
 def working_size(width: int, height: int, max_side: int) -> tuple[int, int]:
@@ -140,7 +124,6 @@ def build_pyramid(
     Args:
         rgb: (H, W, 3).
         camera: a batch of one.
-        max_side: see StereoOptions.
         levels: see StereoOptions; fewer where the picture would fall below 16 pixels.
     """
     colors = torch.from_numpy(rgb).permute(2, 0, 1).float() / 255
@@ -211,7 +194,6 @@ def level_of(
     """One level of a reference view and its sources, ready to be matched.
 
     Args:
-        reference: the view that gets depth.
         sources: at least one.
         index: 0 is the finest.
         window: side of the compared window, pixels.

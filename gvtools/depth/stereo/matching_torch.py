@@ -162,21 +162,14 @@ def window_mean(images: torch.Tensor, window: int) -> torch.Tensor:
 
 @dataclass(frozen=True, eq=False)
 class ResidualFlow:
-    """Residual motion in the S sources of a level.
+    """Residual motion in the S sources of a level."""
 
-    Attributes:
-        x: (S, H, W) float32, where the warp puts each reference pixel, pixels of the source.
-        y: (S, H, W).
-        dx: (S, H, W) float32 motion by which the source's picture is off, pixels.
-        dy: (S, H, W).
-        weight: (S, H, W) float32 in [0, 1], 0 where the motion is not determined.
-    """
-
+    # (S, H, W) float32, where the warp puts each reference pixel, pixels of the source.
     x: torch.Tensor
-    y: torch.Tensor
-    dx: torch.Tensor
-    dy: torch.Tensor
-    weight: torch.Tensor
+    y: torch.Tensor  # (S, H, W)
+    dx: torch.Tensor  # (S, H, W) float32 motion by which the source's picture is off, pixels
+    dy: torch.Tensor  # (S, H, W)
+    weight: torch.Tensor  # (S, H, W) float32 in [0, 1], 0 where the motion is not determined
 
 
 def residual_flow(
@@ -189,10 +182,8 @@ def residual_flow(
     in both directions, where the window leaves the source, or where the motion is long.
 
     Args:
-        level: the pictures.
         inverse_depth: (H, W).
         noise: standard deviation of the pictures' noise.
-        iterations: of Gauss and Newton.
     """
     height, width = level.reference.shape
     v, u = pixel_centers(height, width, level.reference.device)

@@ -69,8 +69,6 @@ class PlaneSweepStereo:
         """Prepare; nothing is computed yet.
 
         Args:
-            scene: the project.
-            options: see StereoOptions.
             views: names of the views usable as sources; no other picture is read.
         """
         self.options = options or StereoOptions()

@@ -118,11 +118,7 @@ def refined(
 
     Args:
         planes: (3, H, W) to begin with.
-        level: the pictures.
-        matcher: the back end.
         step: inverse depth that moves one pixel in the source that moves most.
-        bounds: least and largest inverse depth.
-        iterations: rounds.
 
     Returns:
         (3, H, W) planes and (H, W) their costs.
@@ -176,38 +172,23 @@ def _between(
 
 @dataclass(frozen=True, eq=False)
 class CoarseDepth:
-    """What the coarsest level tells.
+    """What the coarsest level tells."""
 
-    Attributes:
-        level: its pictures.
-        hypotheses: the planes that were tried.
-        inverse_depth: (H, W) float32, 1 / scene units.
-        cost: (H, W) float32 photometric cost there.
-    """
-
-    level: Level
-    hypotheses: Hypotheses
-    inverse_depth: torch.Tensor
-    cost: torch.Tensor
+    level: Level  # its pictures
+    hypotheses: Hypotheses  # the planes that were tried
+    inverse_depth: torch.Tensor  # (H, W) float32, 1 / scene units
+    cost: torch.Tensor  # (H, W) float32 photometric cost there
 
 
 @dataclass(frozen=True, eq=False)
 class RawDepth:
-    """Depth of one view on the finest level; every pixel has some.
+    """Depth of one view on the finest level; every pixel has some."""
 
-    Attributes:
-        inverse_depth: (H, W) float32, 1 / scene units.
-        cost: (H, W) float32 photometric cost.
-        textured: (H, W) bool, where there is detail to match; see ``textured``.
-        camera: of the finest level, a batch of one.
-        sources: names of the views that it was matched with.
-    """
-
-    inverse_depth: torch.Tensor
-    cost: torch.Tensor
-    textured: torch.Tensor
-    camera: Cameras
-    sources: tuple[str, ...]
+    inverse_depth: torch.Tensor  # (H, W) float32, 1 / scene units
+    cost: torch.Tensor  # (H, W) float32 photometric cost
+    textured: torch.Tensor  # (H, W) bool, where there is detail to match; see ``textured``
+    camera: Cameras  # of the finest level, a batch of one
+    sources: tuple[str, ...]  # names of the views that it was matched with
 
 
 def coarse_depth(
@@ -278,8 +259,6 @@ def enough_disparity(reference: Cameras, sources: Cameras, depths: DepthRange) -
 
     Args:
         reference: the finest level's camera, a batch of one.
-        sources: S cameras.
-        depths: of the reference.
     """
     rate = disparity_rate(reference, sources, depths.near, far=np.inf)
     return rate / depths.near >= LEAST_DISPARITY
@@ -294,10 +273,8 @@ def only_turned(
     every pixel at least as well as the depth that was found.
 
     Args:
-        level: the pictures.
         cost: (H, W) float32 photometric cost of the depth that was found.
         textured: (H, W) bool.
-        matcher: back end.
     """
     turned = matcher.sweep(level, torch.zeros(1, device=cost.device))[..., 0]
     matched = textured & (torch.minimum(cost, turned) < MATCHED)

@@ -47,11 +47,8 @@ def export_memory_ply(
     float would lose a tenth of a voxel.
 
     Args:
-        memory: what to write.
-        path: the PLY.
         max_points: thin to at most so many points: one per voxel (the most confident), of voxels
             as much larger than the memory's as it takes; None keeps every observation.
-        observed: leave out what a completer made.
 
     Returns:
         Points written, and the voxel edge they were thinned to (0 when all were kept).

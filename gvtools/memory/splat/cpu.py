@@ -136,11 +136,8 @@ def splat_segments(
 
     Args:
         chosen: (n,) int64 rows of ``segments``.
-        segments: see SegmentRects.
         columns: the observations, see SplatColumns.
         view_weight: (views,) float32.
-        lens: the camera.
-        rules: see SplatRules.
         limit: (H x W,) float32, see SplatRequest.
         reachable: (H x W,) bool, the pixels within REACHABLE pixels of one to be written; empty
             when most of the image is open.

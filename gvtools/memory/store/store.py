@@ -84,7 +84,6 @@ class Store:
             keeps millimetres in a georeferenced scene.
         axes: (3, 3) rotation whose columns are the voxel grid's axes in the world frame; None for
             the world's own. See LocalFrame.
-        options: see MemoryOptions.
         device: where the tensors live, "cpu" or "cuda:0". What runs on the CPU (fusing, forgetting,
             the cpu and one-pixel back ends) needs them there, see ``to``; elsewhere the torch back
             end projects them and Open3D uses them.

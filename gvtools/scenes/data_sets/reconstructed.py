@@ -404,7 +404,6 @@ def read_raw_depth(path: Path, *, size: tuple[int, int], lens: Undistortion | No
     """(H, W) float32 z-depth, metres, of 4-byte floats without head; 0 for infinity.
 
     Args:
-        path: the file.
         size: width and height of the original picture, pixels.
         lens: from the original camera to that of the picture at hand; None for the original.
     """

@@ -56,11 +56,9 @@ def numbered_frames(
     """Frames with a number each.
 
     Args:
-        images: the folder of pictures.
         cameras: of the frames that have one.
         names: of pictures, such as "rgb_{:05d}.jpg".
         depth: where a frame's depth map should be.
-        read: how it is read.
         lens_of: makes a lens of fx, fy, cx, cy for a picture's size.
         numbers: of the frames, where not all pictures of the folder are of the scene.
     """
@@ -247,7 +245,6 @@ def spring_depth(path: Path, *, focal: float, sky: Path | None) -> Depth:
     """(H, W) float32 z-depth, metres, 0 = none, of a disparity map of (2 H, 2 W).
 
     Args:
-        path: the map.
         focal: horizontal focal length, pixels of the frame.
         sky: the map of the sky, of (2 H, 2 W) or (H, W); None where there is none.
     """
