@@ -30,7 +30,7 @@ find_python() {
 
 # The stamp also records where the tree lies, since an environment does not survive a move.
 wanted() {
-    { pwd -P; cksum constraints.txt setup.cfg pyproject.toml tools/environment.sh; }
+    { pwd -P; cksum constraints.txt setup.cfg pyproject.toml packaging/environment.sh; }
 }
 
 works() {

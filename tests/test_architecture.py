@@ -23,6 +23,16 @@ def test_no_modules_import_each_other_in_a_circle():
     TopologicalSorter(imports).prepare()
 
 
+def test_modules_open_with_the_name_of_the_thing():
+    riddles = []
+    for package in PACKAGES:
+        for path in sorted((ROOT / package).rglob("*.py")):
+            text = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
+            if re.match(r"(What|Which|Where|How|Whether)\b", text):
+                riddles.append(str(path.relative_to(ROOT)))
+    assert riddles == []
+
+
 # The device chooses the class of splatters.
 CALLED_AS = {"Splat": "splatter"}
 WAYS = re.split(r"\n## ", (ROOT / "docs/architecture.md").read_text(encoding="utf-8"))
