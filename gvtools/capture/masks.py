@@ -7,14 +7,16 @@ from pathlib import Path
 
 from PIL import Image
 
-from gvtools.capture.photographs import Photograph
+from gvtools.capture.photographs import CapturedPhotograph
 from gvtools.errors import ProjectError
 from gvtools.scenes.images import read_mask
 from gvtools.scenes.matching import named
 from gvtools.scenes.scene import Finding
 
 
-def complete_masks(photographs: Sequence[Photograph], masks: Path, *, out: Path) -> list[Finding]:
+def complete_masks(
+    photographs: Sequence[CapturedPhotograph], masks: Path, *, out: Path
+) -> list[Finding]:
     """Write a mask for every picture: COLMAP finds nothing in a picture without one.
 
     Args:

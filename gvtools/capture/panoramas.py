@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from gvtools.capture.photographs import JPEG_QUALITY, Photograph
+from gvtools.capture.photographs import JPEG_QUALITY, CapturedPhotograph
 from gvtools.errors import OptionError
 from gvtools.scenes.faces import PANORAMA, Face, face_name, panorama_faces
 from gvtools.scenes.images import read_image, read_mask
@@ -73,7 +73,7 @@ class FaceRig:
         return pycolmap.RigConfig(cameras=cameras)
 
 
-def lens_of(photographs: Sequence[Photograph], lens: str) -> str:
+def lens_of(photographs: Sequence[CapturedPhotograph], lens: str) -> str:
     """The kind of lens, one of LENSES but "auto"; recognised from the pictures if ``lens`` is."""
     if lens == "equirectangular":
         wrong = [item.name for item in photographs if item.size[0] != 2 * item.size[1]]
@@ -95,7 +95,7 @@ def lens_of(photographs: Sequence[Photograph], lens: str) -> str:
     return "fisheye" if all(_is_fisheye(item) for item in photographs) else "perspective"
 
 
-def _is_panorama(item: Photograph) -> bool:
+def _is_panorama(item: CapturedPhotograph) -> bool:
     width, height = item.size
     if width != 2 * height:
         return False
@@ -111,7 +111,7 @@ def _is_panorama(item: Photograph) -> bool:
     return bool(across <= MEETS * (inside + 1) and poles <= inside + 1)
 
 
-def _is_fisheye(item: Photograph) -> bool:
+def _is_fisheye(item: CapturedPhotograph) -> bool:
     grey = _grey(item)
     y, x = np.mgrid[: grey.shape[0], : grey.shape[1]] + 0.5
     radius = np.hypot(x - grey.shape[1] / 2, y - grey.shape[0] / 2) / (max(grey.shape) / 2)
@@ -119,7 +119,7 @@ def _is_fisheye(item: Photograph) -> bool:
     return bool(len(dark) and dark.max() <= DARK and grey[radius < 0.5].mean() > 2 * DARK)
 
 
-def _grey(item: Photograph, side: int = 512) -> NDArray[np.float64]:
+def _grey(item: CapturedPhotograph, side: int = 512) -> NDArray[np.float64]:
     with Image.open(item.path) as opened:
         image = opened.convert("L")
         factor = min(1.0, side / max(image.size))
@@ -127,7 +127,7 @@ def _grey(item: Photograph, side: int = 512) -> NDArray[np.float64]:
         return np.asarray(image.resize(size, Image.Resampling.BOX), np.float64)
 
 
-def fisheye_params(photographs: Sequence[Photograph]) -> str:
+def fisheye_params(photographs: Sequence[CapturedPhotograph]) -> str:
     """Initial parameters of OPENCV_FISHEYE for mapping, as COLMAP writes them.
 
     The circle of FISHEYE_DEGREES is taken to touch the long sides of a picture with dark corners,
@@ -140,7 +140,7 @@ def fisheye_params(photographs: Sequence[Photograph]) -> str:
 
 
 def write_faces(
-    photographs: Sequence[Photograph], images: Path, *, masks: Path | None, face_masks: Path
+    photographs: Sequence[CapturedPhotograph], images: Path, *, masks: Path | None, face_masks: Path
 ) -> list[FaceRig]:
     """Cut panoramas into faces.
 
@@ -151,7 +151,7 @@ def write_faces(
     """
     import pycolmap
 
-    sizes: dict[tuple[int, int], list[Photograph]] = {}
+    sizes: dict[tuple[int, int], list[CapturedPhotograph]] = {}
     for item in photographs:
         sizes.setdefault(item.size, []).append(item)
     rigs = []

@@ -52,7 +52,7 @@ SOFT = 10.0
 
 
 @dataclass(frozen=True)
-class Photograph:
+class CapturedPhotograph:
     """One readable picture."""
 
     path: Path  # where it is
@@ -65,7 +65,7 @@ class Photograph:
     location: tuple[float, float, float] | None = None
 
 
-def find_photographs(folder: Path) -> tuple[list[Photograph], list[Finding]]:
+def find_photographs(folder: Path) -> tuple[list[CapturedPhotograph], list[Finding]]:
     """The readable, different pictures below a folder in natural order, and what was met."""
     paths = [
         path
@@ -78,7 +78,7 @@ def find_photographs(folder: Path) -> tuple[list[Photograph], list[Finding]]:
         if path.suffix.lower() in FOREIGN and not path.name.startswith(".")
     ]
     paths.sort(key=lambda path: natural_key(path.relative_to(folder).as_posix()))
-    found: list[Photograph] = []
+    found: list[CapturedPhotograph] = []
     damaged: list[str] = []
     copies: list[str] = []
     digests: set[bytes] = set()
@@ -115,7 +115,7 @@ def find_photographs(folder: Path) -> tuple[list[Photograph], list[Finding]]:
     return found, [*findings, *_oddities(found)]
 
 
-def _look_at(path: Path, name: str) -> Photograph:
+def _look_at(path: Path, name: str) -> CapturedPhotograph:
     with open_picture(path) as image:
         exif = image.getexif()
         more, gps = exif.get_ifd(EXIF_FOLDER), exif.get_ifd(GPS_FOLDER)
@@ -128,7 +128,7 @@ def _look_at(path: Path, name: str) -> Photograph:
     small = grey.resize(
         (max(1, round(grey.width * height / grey.height)), height), Image.Resampling.BOX
     )
-    return Photograph(
+    return CapturedPhotograph(
         path, name, upright.size, camera, turned, sharpness(np.asarray(small)), _location(gps)
     )
 
@@ -155,7 +155,7 @@ def _location(gps: dict[int, object]) -> tuple[float, float, float] | None:
     return (degrees[0], degrees[1], height) if np.isfinite([*degrees, height]).all() else None
 
 
-def _oddities(found: Sequence[Photograph]) -> list[Finding]:
+def _oddities(found: Sequence[CapturedPhotograph]) -> list[Finding]:
     """What may keep pictures from being registered, or explains a model."""
     findings = []
     middle = float(np.median([item.sharpness for item in found]))
@@ -190,7 +190,7 @@ def _oddities(found: Sequence[Photograph]) -> list[Finding]:
     return findings
 
 
-def copy_upright(photographs: Iterable[Photograph], folder: Path) -> None:
+def copy_upright(photographs: Iterable[CapturedPhotograph], folder: Path) -> None:
     """Copy pictures to ``folder`` under their names; those on their side are turned.
 
     A picture that is turned is coded again: JPEG at quality JPEG_QUALITY, others without loss.

@@ -29,7 +29,7 @@ SEED = 1
 
 
 @dataclass(frozen=True)
-class Placement:
+class WorldPlacement:
     """How a model was placed."""
 
     metric: bool  # whether its units are metres
@@ -43,7 +43,7 @@ def place(
     *,
     locations: Mapping[str, tuple[float, float, float]],
     distance: tuple[str, str, float] | None = None,
-) -> tuple[Placement, list[Finding]]:
+) -> tuple[WorldPlacement, list[Finding]]:
     """Move, rotate and scale a model in place.
 
     Args:
@@ -53,13 +53,13 @@ def place(
     import pycolmap
 
     placed = {name: value for name, value in locations.items() if _found(model, name) is not None}
-    placement: Placement | None = None
+    placement: WorldPlacement | None = None
     findings: list[Finding] = []
     if len(placed) >= LEAST_PLACED:
         placement, findings = _by_gps(model, placed)
     if placement is None:
         _level(model)
-        placement = Placement(metric=False, by="cameras")
+        placement = WorldPlacement(metric=False, by="cameras")
     if distance is not None:
         first, second, metres = distance
         ends = []
@@ -75,7 +75,7 @@ def place(
             raise OptionError(f"--distance: {first!r} and {second!r} were taken at one place")
         identity = pycolmap.Rotation3d(np.array([0.0, 0.0, 0.0, 1.0]))
         model.transform(pycolmap.Sim3d(metres / apart, identity, np.zeros(3)))
-        placement = Placement(True, "distance", placement.origin)
+        placement = WorldPlacement(True, "distance", placement.origin)
     return placement, findings
 
 
@@ -87,7 +87,7 @@ def _found(model: pycolmap.Reconstruction, name: str) -> NDArray[np.float64] | N
 
 def _by_gps(
     model: pycolmap.Reconstruction, placed: Mapping[str, tuple[float, float, float]]
-) -> tuple[Placement | None, list[Finding]]:
+) -> tuple[WorldPlacement | None, list[Finding]]:
     import pycolmap
 
     names, values = list(placed), np.array(list(placed.values()))
@@ -116,7 +116,7 @@ def _by_gps(
     errors = [float(np.linalg.norm(at[name] - row)) for name, row in zip(names, east, strict=True)]
     error = float(np.median(errors))
     text = f"placed by GPS of {len(names)} pictures, which it differs from by {error:.2f} m"
-    return Placement(True, "GPS", (float(origin[0]), float(origin[1]), float(origin[2]))), [
+    return WorldPlacement(True, "GPS", (float(origin[0]), float(origin[1]), float(origin[2]))), [
         Finding("info", text)
     ]
 

@@ -24,8 +24,8 @@ from gvtools.capture.panoramas import (
     rename_faces,
     write_faces,
 )
-from gvtools.capture.photographs import Photograph, copy_upright, find_photographs
-from gvtools.capture.placement import Placement, place
+from gvtools.capture.photographs import CapturedPhotograph, copy_upright, find_photographs
+from gvtools.capture.placement import WorldPlacement, place
 from gvtools.errors import OptionError, ProjectError
 from gvtools.files import write_json
 from gvtools.runs.folder_lock import folder_lock
@@ -152,7 +152,7 @@ def capture_photographs(
 
 
 def _map(
-    photographs: Sequence[Photograph],
+    photographs: Sequence[CapturedPhotograph],
     work: Path,
     *,
     source: Path,
@@ -233,8 +233,8 @@ def _made(folder: Path) -> Path:
     return folder
 
 
-def _by_camera(photographs: Sequence[Photograph], *, one: bool) -> list[list[str]]:
-    """Names of the pictures of each camera, see ``Photograph.camera``."""
+def _by_camera(photographs: Sequence[CapturedPhotograph], *, one: bool) -> list[list[str]]:
+    """Names of the pictures of each camera, see ``CapturedPhotograph.camera``."""
     groups: dict[str, list[str]] = {}
     for item in photographs:
         groups.setdefault("" if one else item.camera, []).append(item.name)
@@ -243,10 +243,10 @@ def _by_camera(photographs: Sequence[Photograph], *, one: bool) -> list[list[str
 
 def _report(
     source: Path,
-    photographs: Sequence[Photograph],
+    photographs: Sequence[CapturedPhotograph],
     *,
     mapped: Mapped,
-    placement: Placement,
+    placement: WorldPlacement,
     features: str,
     findings: Sequence[Finding],
 ) -> CaptureReport:

@@ -240,7 +240,8 @@ class _Task:
             KDTree(self.target.positions),
         )
         self._targets = {
-            level: Features(self.target, level * self.cell, outward=False) for level in LEVELS
+            level: SurfaceFeatures(self.target, level * self.cell, outward=False)
+            for level in LEVELS
         }
         self._left = BUDGET
 
@@ -298,7 +299,7 @@ class _Task:
         if self._left <= 0:
             return None
         source, target = (
-            Features(self.scan, level * self.cell / scale, outward=outward),
+            SurfaceFeatures(self.scan, level * self.cell / scale, outward=outward),
             self._targets[level],
         )
         if not source.usable:
@@ -422,7 +423,7 @@ def unevenness(surface: Surface) -> float:
     return float(np.median(variances[:, 0] / np.maximum(variances.sum(axis=1), 1e-300)))
 
 
-class Features:
+class SurfaceFeatures:
     """A surface's points, one for each cube of edge ``cell``, with FPFH features.
 
     ``outward`` turns normals away from where points were seen, or from the origin.
@@ -455,7 +456,7 @@ class Features:
             cloud, Param(FEATURES * cell, NEIGHBOURS)
         )
 
-    def matches(self, other: Features) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def matches(self, other: SurfaceFeatures) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Rows of points whose features are each other's nearest."""
         import open3d as o3d
 

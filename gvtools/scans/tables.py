@@ -38,7 +38,7 @@ MOST_RATIO, MOST_BYTES = 88, 1 << 31
 
 
 @dataclass(frozen=True)
-class Table:
+class ScanTable:
     """Rows of a file: ``layout`` is "text", "rows" or "columns" (compressed, field by field)."""
 
     dtype: np.dtype[np.void]
@@ -123,7 +123,7 @@ def open_ply(path: Path) -> ScanFile:
     header = read_header(path)
     vertices = point_vertices(path, header)
     layout = "rows" if header.order else "text"
-    table = Table(header.dtype(vertices), vertices.count, layout, header.offset)
+    table = ScanTable(header.dtype(vertices), vertices.count, layout, header.offset)
     table.check(path)
     kinds = {name: np.dtype(kind) for name, kind in vertices.columns}
     chunks = (_ply_chunk(columns, kinds) for columns in table.chunks(path))
@@ -175,7 +175,7 @@ def _pcd_chunk(columns: Columns, dtype: np.dtype[np.void]) -> Chunk:
     return Chunk(_positions(columns), colors, intensity)
 
 
-def _pcd_header(path: Path) -> Table:
+def _pcd_header(path: Path) -> ScanTable:
     with path.open("rb") as file:
         head = file.read(MAX_HEADER)
     given: dict[str, list[str]] = {}
@@ -199,7 +199,7 @@ def _pcd_header(path: Path) -> Table:
         ) from None
 
 
-def _pcd_table(given: Mapping[str, list[str]], offset: int) -> Table:
+def _pcd_table(given: Mapping[str, list[str]], offset: int) -> ScanTable:
     """The table of a header's lines, by key."""
     names = given["FIELDS"]
     counts = [int(count) for count in given.get("COUNT", ["1"] * len(names))]
@@ -221,10 +221,10 @@ def _pcd_table(given: Mapping[str, list[str]], offset: int) -> Table:
     if count < 0 or count != int(given["WIDTH"][0]) * int(given["HEIGHT"][0]):
         raise ValueError(f"{count} points")
     layouts = {"ascii": "text", "binary": "rows", "binary_compressed": "columns"}
-    return Table(dtype, count, layouts[given["DATA"][0]], offset)
+    return ScanTable(dtype, count, layouts[given["DATA"][0]], offset)
 
 
-def _check_compressed(path: Path, table: Table) -> None:
+def _check_compressed(path: Path, table: ScanTable) -> None:
     """Refuse sizes that the points or the file contradict, before anything is unpacked."""
     sizes = np.fromfile(path, "<u4", 2, offset=table.offset).tolist()
     packed, whole = sizes if len(sizes) == 2 else (0, 0)
@@ -241,7 +241,7 @@ def _check_compressed(path: Path, table: Table) -> None:
         )
 
 
-def _unpacked(path: Path, table: Table) -> dict[str, NDArray[Any]]:
+def _unpacked(path: Path, table: ScanTable) -> dict[str, NDArray[Any]]:
     """The columns of compressed points."""
     packed, whole = np.fromfile(path, "<u4", 2, offset=table.offset).tolist()
     data = np.fromfile(path, np.uint8, packed, offset=table.offset + 8)

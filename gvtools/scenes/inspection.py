@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gvtools.errors import GvError
-from gvtools.scenes.pose_contradictions import Thumbnail, contradiction_findings, thumbnail
+from gvtools.scenes.pose_contradictions import GreyThumbnail, contradiction_findings, thumbnail
 from gvtools.scenes.scene import Finding, Scene
 
 # Focal lengths of usual lenses, over the image's sides.
@@ -60,7 +60,7 @@ class _Opened(NamedTuple):
     """One view that was decoded: its number, its masked share, and of its depth what is valid."""
 
     view: int
-    thumbnail: Thumbnail
+    thumbnail: GreyThumbnail
     masked: float
     pixels: int = 0
     valid: int = 0

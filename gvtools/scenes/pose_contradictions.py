@@ -51,7 +51,7 @@ _SHIFTS = sorted(
 )
 
 
-class Thumbnail(NamedTuple):
+class GreyThumbnail(NamedTuple):
     """A picture reduced for comparison: (h, w) float32 grey levels, and where they may be used."""
 
     grey: Float32
@@ -115,7 +115,7 @@ class _Tracks:
         return len(np.intersect1d(own[0], own[1])), min(inside)
 
 
-def thumbnail(frame: Frame) -> Thumbnail:
+def thumbnail(frame: Frame) -> GreyThumbnail:
     """The frame's picture reduced to ``SIDE`` pixels on its longer side."""
     height, width = frame.rgb.shape[:2]
     scale = SIDE / max(height, width)
@@ -127,11 +127,11 @@ def thumbnail(frame: Frame) -> Thumbnail:
     if frame.mask is not None:
         share = cv2.resize(frame.mask.astype(np.float32), size, interpolation=cv2.INTER_AREA)
         valid = share > 0.99
-    return Thumbnail(grey.astype(np.float32), valid)
+    return GreyThumbnail(grey.astype(np.float32), valid)
 
 
 def contradiction_findings(
-    scene: Scene, thumbnails: Mapping[int, Thumbnail], depths: Mapping[int, float]
+    scene: Scene, thumbnails: Mapping[int, GreyThumbnail], depths: Mapping[int, float]
 ) -> list[Finding]:
     """One warning when nearly equal cameras see different things, else nothing.
 
@@ -155,7 +155,7 @@ def contradiction_findings(
 
 
 def contradictions(
-    scene: Scene, thumbnails: Mapping[int, Thumbnail], depths: Mapping[int, float]
+    scene: Scene, thumbnails: Mapping[int, GreyThumbnail], depths: Mapping[int, float]
 ) -> list[Contradiction]:
     """The pairs of views whose poses contradict each other, worst first; arguments as above."""
     if len(scene) < 2:
@@ -178,7 +178,7 @@ def contradictions(
     return sorted(found, key=lambda pair: -(pair.disagreement or 1.0))
 
 
-def disagreement(a: Thumbnail, b: Thumbnail, cameras: Cameras) -> float | None:
+def disagreement(a: GreyThumbnail, b: GreyThumbnail, cameras: Cameras) -> float | None:
     """Share of the area with contrast in which two pictures differ.
 
     Args:
@@ -190,7 +190,7 @@ def disagreement(a: Thumbnail, b: Thumbnail, cameras: Cameras) -> float | None:
     return _disagreement(a, b, _homography((a, b), cameras, (0, 1)), enough=0.0)
 
 
-def _disagreement(a: Thumbnail, b: Thumbnail, H: Float64, *, enough: float) -> float | None:
+def _disagreement(a: GreyThumbnail, b: GreyThumbnail, H: Float64, *, enough: float) -> float | None:
     """As ``disagreement``; the search among shifts ends once the share is at most ``enough``.
 
     Each shift can lower the share alone, so that ending early never turns a pair into a
@@ -230,7 +230,7 @@ def _window(values: Float32) -> Float32:
 
 
 def _homography(
-    pair: tuple[Thumbnail, Thumbnail], cameras: Cameras, views: tuple[int, int]
+    pair: tuple[GreyThumbnail, GreyThumbnail], cameras: Cameras, views: tuple[int, int]
 ) -> Float64:
     """(3, 3) from pixels of the first picture to those of the second, as OpenCV counts them."""
     Ks = []
@@ -244,7 +244,9 @@ def _homography(
     return np.asarray(np.linalg.inv(half) @ Ks[1] @ rotation @ np.linalg.inv(Ks[0]) @ half)
 
 
-def _carried(b: Thumbnail, H: Float64, shape: tuple[int, ...]) -> tuple[Float32, NDArray[np.bool_]]:
+def _carried(
+    b: GreyThumbnail, H: Float64, shape: tuple[int, ...]
+) -> tuple[Float32, NDArray[np.bool_]]:
     """The second picture seen from the first's orientation, and where it is known."""
     size = shape[1], shape[0]
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP

@@ -15,13 +15,13 @@ from gvtools.capture.panoramas import (
     rename_faces,
     write_faces,
 )
-from gvtools.capture.photographs import Photograph
+from gvtools.capture.photographs import CapturedPhotograph
 from gvtools.errors import OptionError
 
 
 def photograph(folder, name, pixels, **options):
     Image.fromarray(pixels).save(folder / name, **options)
-    return Photograph(folder / name, name, pixels.shape[1::-1], "", False, 1.0)
+    return CapturedPhotograph(folder / name, name, pixels.shape[1::-1], "", False, 1.0)
 
 
 def panorama():

@@ -201,7 +201,7 @@ def _flat(tensor: o3d.core.Tensor) -> NDArray[Any]:
     return array if array.shape[1] == 3 else array.reshape(-1)
 
 
-class Table:
+class GrowableTable:
     """Parallel arrays with spare capacity; the first ``count`` rows are in use."""
 
     # Type and width of each array.
@@ -232,7 +232,7 @@ class Table:
         return sum(rows.nbytes for rows in self.rows().values())
 
 
-class Segments(Table):
+class Segments(GrowableTable):
     """Contiguous observations of one block and one view: the unit of culling."""
 
     LAYOUT: ClassVar[dict[str, tuple[Any, int]]] = {
@@ -317,7 +317,7 @@ class Segments(Table):
         return super().nbytes + self.group_box[: self.groups].nbytes
 
 
-class SegmentPlaces(Table):
+class SegmentPlaces(GrowableTable):
     """Where the segments of a memory's table lie in its tiles, and the level of their voxels."""
 
     LAYOUT: ClassVar[dict[str, tuple[Any, int]]] = {
