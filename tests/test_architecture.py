@@ -33,6 +33,18 @@ def test_modules_open_with_the_name_of_the_thing():
     assert riddles == []
 
 
+def test_the_table_of_rooms_says_what_their_packages_say():
+    text = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
+    table = dict(re.findall(r"^\| `([\w/]+)/` \| (.+) \|$", text, re.MULTILINE))
+    for folder in (ROOT, ROOT / "gvtools"):
+        for package in sorted(folder.glob("*/__init__.py")):
+            name = package.parent.relative_to(ROOT).as_posix()
+            if name in ("gvtools", "data_specs"):
+                continue
+            doc = ast.get_docstring(ast.parse(package.read_text(encoding="utf-8"))) or ""
+            assert " ".join(doc.split()).startswith(table[name]), name
+
+
 # The device chooses the class of splatters.
 CALLED_AS = {"Splat": "splatter"}
 WAYS = re.split(r"\n## ", (ROOT / "docs/architecture.md").read_text(encoding="utf-8"))

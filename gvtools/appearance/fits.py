@@ -13,11 +13,14 @@ from collections.abc import Callable
 from gvtools.appearance.fit import Fit, validation_rows
 from gvtools.appearance.picture import mean_picture
 
-# With at most FEW_PHOTOGRAPHS, of which some are left out, the first part (TRIAL_ENDS, progress) of
-# two fits of TRIAL_STEPS tells whether a backdrop gains: an object in 12 photographs gains 3 dB, a
-# toy in 8 loses 0.8 to 2.4. It is left out where these photographs are CLEARLY better without [dB].
-# Shorter fits than TRIAL_STEPS or TRIAL_SECONDS have no time for that.
-FEW_PHOTOGRAPHS, TRIAL_STEPS, TRIAL_ENDS, TRIAL_SECONDS, CLEARLY = 16, 500, 0.2, 15.0, 0.3
+# A backdrop is another random colour behind the Gaussians at each step, see Fit. With it, an object
+# in 12 photographs gains 3 dB, and a toy in 8 loses 0.8 to 2.4. Two trials tell: the first part
+# (progress) of fits of so many steps, one with it and one over black.
+TRIAL_STEPS, TRIAL_ENDS = 500, 0.2
+# There are trials for at most so many photographs, and in fits that may take at least so long [s].
+FEW_PHOTOGRAPHS, TRIAL_SECONDS = 16, 15.0
+# The fit goes without where photographs that the trials left out are better by more than this [dB].
+CLEARLY_BETTER = 0.3
 # More fits than this gain nothing measurable.
 MOST_FITS = 6
 # No further fit is made when the last one raised the PSNR of validation photographs by less [dB].
@@ -38,7 +41,7 @@ def with_chosen_backdrop(fit: Fit) -> tuple[Fit, str]:
     for trial in trials:
         trial.run(until=TRIAL_ENDS)
     random, black = (trial.left_out_psnr() for trial in trials)
-    chosen = fit.again(0, fit.options, backdrop=False) if black > random + CLEARLY else fit
+    chosen = fit.again(0, fit.options, backdrop=False) if black > random + CLEARLY_BETTER else fit
     behind = "random colours" if chosen is fit else "black"
     return chosen, (
         f"{behind} behind the Gaussians (trials with left-out photographs: random {random:.2f} dB, "
