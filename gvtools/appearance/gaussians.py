@@ -1,4 +1,4 @@
-"""A set of anisotropic Gaussians, kept in one Open3D tensor."""
+"""A set of anisotropic Gaussians: one array, which an Open3D point cloud shares."""
 
 from __future__ import annotations
 
