@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from gvtools.errors import ProjectError
 from gvtools.scenes.scene import Finding
 from gvtools.scenes.undistort import LensParameters, camera_of
-from gvtools.untrusted import read_bytes, read_json, read_text
+from gvtools.untrusted import read_json, read_text
 
 Float64 = NDArray[np.float64]
 
@@ -119,15 +119,31 @@ def pinhole(values: Sequence[float]) -> Float64:
 def intrinsics_beside(root: Path, *, above: bool = False) -> tuple[Float64, str] | None:
     """(3, 3) as published and the file's name: ``camera-intrinsics.txt`` or Open3D's JSON.
 
-    With ``above``, the text file may also stand in the parent folder.
+    With ``above``, the text file may also stand in the parent folder. ``camera.json`` has to be of
+    Open3D's form, other JSON may be. Files that differ are refused.
     """
+    found: list[tuple[Float64, Path]] = []
     for folder in (root, root.resolve().parent) if above else (root,):
         if (folder / INTRINSICS).is_file():
-            return load_matrix(folder / INTRINSICS, (3, 3)), INTRINSICS
+            found.append((load_matrix(folder / INTRINSICS, (3, 3)), folder / INTRINSICS))
+            break
     for path in sorted(root.glob("*.json")):
-        if path.is_file() and b"intrinsic_matrix" in read_bytes(path):
-            return open3d_intrinsics(path), path.name
-    return None
+        if path.is_file() and (path.name == "camera.json" or "intrinsic_matrix" in _text(path)):
+            found.append((open3d_intrinsics(path), path))
+            break
+    if len(found) == 2 and not np.allclose(found[0][0], found[1][0], rtol=1e-4):
+        raise ProjectError(
+            f"{found[0][1]} and {found[1][1].name} differ; expected the same intrinsics; take one "
+            "away, or give color_K (--color-intrinsics)"
+        )
+    return (found[0][0], found[0][1].name) if found else None
+
+
+def _text(path: Path) -> str:
+    try:
+        return read_text(path)
+    except (OSError, ValueError):
+        return ""
 
 
 def open3d_intrinsics(path: Path) -> Float64:

@@ -476,9 +476,8 @@ def rgbd_scene(
     unit = recording.depth_unit if options.depth_unit is None else float(options.depth_unit)
     size = first_size(frame.image for frame in frames)
     if size is None and frames and strict:
-        raise ProjectError(
-            f"{frames[0].image}: unreadable, like all {len(frames)} pictures beside it"
-        )
+        what = "unreadable" if frames[0].image.exists() else "no such picture"
+        raise ProjectError(f"{frames[0].image}: {what}, like all {len(frames)} pictures beside it")
     lens = _lens(K, recording, options, size=size or (2, 2))
     reader = partial(read_depth, unit=unit, maximum=options.depth_max)
     frames = [

@@ -73,7 +73,8 @@ def _form(entry: Entry, value: Any, *, metavar: str | None) -> dict[str, Any]:
         form["choices"] = get_args(kind)
     else:
         names = {int: "N", float: "X", Path: "PATH"}
-        form["type"] = kind if plain and kind in names else str
+        # A setting that may be none takes that word, too: the settings read it.
+        form["type"] = kind if plain and kind in names and not entry.optional else str
         form["metavar"] = metavar or entry.unit.upper() or names.get(kind)
     if value is not None and kind is not bool:
         notes.append(f"default {shown(value)} {entry.unit}".rstrip())

@@ -208,7 +208,8 @@ class ExportSource:
                 )
         further = unphotographed(memory)
         if not options.observed:
-            further |= memory.generated
+            # Of round 0, that is the fit's own depth, which its Gaussians show already.
+            further |= memory.generated & (memory.columns.round > 0)
         if further.any() and rest != 0:
             points, rounds = self._point_gaussians(ExportOptions(max_points=rest), among=further)
             points[:, :LOG_SCALE] += (memory.frame.origin - first.frame.origin).astype(np.float32)

@@ -204,3 +204,9 @@ def test_a_debug_run_shows_where(scan, tmp_path):
     shutil.rmtree(scan)
     with pytest.raises(GvError):
         main([str(a) for a in reconstruct(scan, "--out", tmp_path / "run", "--debug")])
+
+
+@pytest.mark.parametrize("option", ["--voxel=auto", "--voxel=none", "--max-side=none"])
+def test_an_option_takes_the_word_for_no_value_of_its_setting(scan, tmp_path, option):
+    out = tmp_path / "run"
+    assert main([str(a) for a in reconstruct(scan, "--out", out, "--dry-run", option)]) == 0

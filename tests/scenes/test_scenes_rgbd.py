@@ -190,6 +190,23 @@ def test_tum_intrinsics_by_file_by_name_or_by_default(tmp_path):
     )
 
 
+@pytest.mark.parametrize("text", ['{"K": 3}', "\x00"])
+def test_a_damaged_camera_file_is_refused_and_two_that_differ_are(tmp_path, text):
+    root = tum(tmp_path / "office")
+    (root / "camera.json").write_text(text)
+    with pytest.raises(ProjectError, match=r"camera.json: .* expected Open3D's form"):
+        TUM.read(root)
+    K = [500.0, 0, 0, 0, 500, 0, WIDTH / 2, HEIGHT / 2, 1]
+    (root / "camera.json").write_text(json.dumps({"intrinsic_matrix": K}), encoding="utf-16")
+    given = np.array(K).reshape(3, 3).T
+    np.testing.assert_allclose(TUM.read(root).cameras.K[0, :2, :2], given[:2, :2])
+    np.savetxt(root / "camera-intrinsics.txt", given)
+    assert len(TUM.read(root)) > 0
+    np.savetxt(root / "camera-intrinsics.txt", 2 * given - np.diag([0, 0, 1]))
+    with pytest.raises(ProjectError, match=r"camera-intrinsics.txt and camera.json differ"):
+        TUM.read(root)
+
+
 def test_tum_freiburg1_distortion_is_opencvs(tmp_path):
     scene = TUM.read(tum(tmp_path / "rgbd_dataset_freiburg1_desk"))
     (fx, fy, cx, cy), (k1, k2, p1, p2, k3) = PUBLISHED["freiburg1"]
