@@ -325,12 +325,13 @@ def test_cut_and_flipped_files_end_in_one_line(tmp_path, suffix):
         cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor(positions.astype(np.float32)))
         o3d.t.io.write_point_cloud(str(path), cloud, compressed=suffix == ".pcd")
     whole = path.read_bytes()
-    for share in (0, 0.01, 0.3, 0.9):
+    # Each LAS, LAZ and E57 is read by a process of its own, which takes a second.
+    quick = suffix in (".ply", ".pcd")
+    for share in (0, 0.01, 0.3, 0.9) if quick else (0, 0.9):
         path.write_bytes(whole[: int(share * len(whole))])
         refused(path)
     rng = np.random.default_rng(0)
-    # Each LAS, LAZ and E57 is read by a process of its own.
-    for _ in range(20 if suffix in (".ply", ".pcd") else 5):
+    for _ in range(20 if quick else 3):
         data = bytearray(whole)
         for at in rng.integers(0, min(len(data), 600), 3):
             data[at] = rng.integers(0, 256)
