@@ -9,10 +9,10 @@ import shlex
 import socket
 import sys
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import asdict
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from gvtools.errors import OptionError, ProjectError
@@ -23,14 +23,18 @@ from pipelines.console import Console
 from pipelines.fleet.spec import Task, is_url
 from pipelines.fleet.task import finished_record, read_record, run_task, write_record
 from pipelines.scoring.sweep import (
+    AGAIN,
+    BEGUN,
     DONE,
+    ENDED,
     FAILED,
+    FOUND,
     WAIT_S,
+    Event,
     Job,
     Pool,
     Record,
     Threads,
-    Watch,
     difference,
     lost_worker,
     sweep,
@@ -49,89 +53,62 @@ def jobs_of(tasks: Sequence[Task]) -> list[Job[Task]]:
 
 
 def run_fleet(jobs: Sequence[Job[Task]], pool: Pool, *, console: Console) -> None:
-    """Run the tasks that are not finished; at the end every task has a record."""
-    with FleetProgress(jobs, console) as progress:
-        sweep(jobs, pool, progress)
+    """Run the tasks that are not finished; at the end every task has a record.
+
+    Progress is one table of counts on a terminal, and a line for each event elsewhere.
+    """
+    counts: dict[str, Counter[str]] = {job.work.stage: Counter() for job in jobs}
+    for job in jobs:
+        counts[job.work.stage]["waiting" if job.record is None else "done"] += 1
+    before = sum(job.record is not None for job in jobs)
+    console.line(f"{len(jobs)} tasks" + (f", {before} finished before" if before else ""))
+    with _live_table(counts, console), closing(sweep(jobs, pool)) as events:
+        for event in events:
+            task, record, reason = event.job.work, event.record, event.record.get("reason")
+            count, name = counts[task.stage], f"{task.scene} {task.stage}"
+            if event.kind == BEGUN:
+                count.update(running=1, waiting=-1)
+            elif event.kind == AGAIN:
+                count.update(running=-1, waiting=1, again=1)
+                console.warn(f"{name}: attempt {event.attempt} failed: {reason}")
+            elif event.kind != FOUND:
+                done = event.kind == ENDED and record["status"] == DONE
+                count.update({"running" if event.kind == ENDED else "waiting": -1})
+                count["done" if done else "failed"] += 1
+                over = sum(stage["done"] + stage["failed"] for stage in counts.values())
+                head = f"[{over}/{len(jobs)}] {name}"
+                if done and not console.interactive:
+                    console.line(f"{head}: {record['seconds']:.1f} s on {record['node']}")
+                elif not done:
+                    record = _failure(event)
+                    write_record(task.record(), record)
+                    console.warn(f"{head}: failed: {record['reason']}")
 
 
-class FleetProgress(Watch[Task]):
-    """Counts by stage: one table on a terminal, a line for each event elsewhere."""
+def _failure(event: Event[Task]) -> Record:
+    """The record of a task that is given up, or not begun since one before it was."""
+    task, record = event.job.work, event.record
+    head = {"scene": task.scene, "stage": task.stage, "attempts": event.attempt, **task.identity}
+    if event.after is not None:
+        record = {"status": FAILED, "reason": f"stage {event.after.work.stage} failed"}
+    return {**head, **record}
 
-    def __init__(self, jobs: Sequence[Job[Task]], console: Console) -> None:
-        self._console, self._total = console, len(jobs)
-        self._counts: dict[str, Counter[str]] = {job.work.stage: Counter() for job in jobs}
-        for job in jobs:
-            self._counts[job.work.stage]["waiting" if job.record is None else "done"] += 1
-        self._live: Any = None
-        before = sum(job.record is not None for job in jobs)
-        console.line(f"{self._total} tasks" + (f", {before} finished before" if before else ""))
 
-    def __enter__(self) -> FleetProgress:
-        if self._console.interactive:
-            from rich.live import Live
+def _live_table(
+    counts: Mapping[str, Counter[str]], console: Console
+) -> AbstractContextManager[object]:
+    if not console.interactive:
+        return nullcontext()
+    from rich.live import Live
+    from rich.table import Table
 
-            self._live = Live(self._table(), auto_refresh=False, transient=True)
-            self._live.start()
-        return self
+    def table() -> Table:
+        shown = Table("stage", *_STATES)
+        for stage, count in counts.items():
+            shown.add_row(stage, *(str(count[state]) for state in _STATES))
+        return shown
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        if self._live is not None:
-            self._live.stop()
-
-    def begin(self, job: Job[Task]) -> bool:
-        """See Watch."""
-        self._counts[job.work.stage].update(running=1, waiting=-1)
-        return True
-
-    def again(self, job: Job[Task], record: Record, attempt: int) -> None:
-        """See Watch."""
-        task = job.work
-        self._counts[task.stage].update(running=-1, waiting=1, again=1)
-        self._console.warn(
-            f"{task.scene} {task.stage}: attempt {attempt} failed: {record['reason']}"
-        )
-
-    def end(self, job: Job[Task], record: Record, attempts: int) -> None:
-        """See Watch."""
-        task, done = job.work, record["status"] == DONE
-        self._counts[task.stage].update({"running": -1, "done" if done else "failed": 1})
-        if not done:
-            self._give_up(task, record, attempts)
-        elif self._live is None:
-            self._console.line(f"{self._head(task)}: {record['seconds']:.1f} s on {record['node']}")
-
-    def skip(self, job: Job[Task], failed: Job[Task]) -> None:
-        """See Watch."""
-        self._counts[job.work.stage].update(waiting=-1, failed=1)
-        reason = f"stage {failed.work.stage} failed"
-        self._give_up(job.work, {"status": FAILED, "reason": reason}, 0)
-
-    def tick(self) -> None:
-        """See Watch."""
-        if self._live is not None:
-            self._live.update(self._table(), refresh=True)
-
-    def _give_up(self, task: Task, record: Record, attempts: int) -> None:
-        head = {"scene": task.scene, "stage": task.stage, "attempts": attempts, **task.identity}
-        write_record(task.record(), {**head, **record})
-        self._console.warn(f"{self._head(task)}: failed: {record['reason']}")
-
-    def _head(self, task: Task) -> str:
-        over = sum(count["done"] + count["failed"] for count in self._counts.values())
-        return f"[{over}/{self._total}] {task.scene} {task.stage}"
-
-    def _table(self) -> Any:
-        from rich.table import Table
-
-        table = Table("stage", *_STATES)
-        for stage, counts in self._counts.items():
-            table.add_row(stage, *(str(counts[state]) for state in _STATES))
-        return table
+    return Live(get_renderable=table, refresh_per_second=1, transient=True)
 
 
 def this_machine(tasks: Sequence[Task]) -> Threads:

@@ -36,7 +36,17 @@ from pipelines.scoring.benchmark_scenes import (
     split_of_scene,
     write_thumbnails,
 )
-from pipelines.scoring.sweep import FAILED, InTurn, Job, Record, Watch, difference, sweep
+from pipelines.scoring.sweep import (
+    BEGUN,
+    ENDED,
+    FAILED,
+    FOUND,
+    InTurn,
+    Job,
+    Record,
+    difference,
+    sweep,
+)
 
 if TYPE_CHECKING:
     from gvtools.evaluation.lpips_distance import Lpips
@@ -379,41 +389,6 @@ def read_cell(cell: BenchmarkCell) -> Record | None:
     return dict(found)
 
 
-class _Progress(Watch[BenchmarkCell]):
-    """Tells of each cell, and calls ``after`` behind each that was measured."""
-
-    def __init__(
-        self, cells: Sequence[BenchmarkCell], after: Callable[[], None], console: Console
-    ) -> None:
-        self._after, self._console = after, console
-        self._places = {
-            id(
-                cell
-            ): f"[{number}/{len(cells)}] {cell.scene}, {cell.views} views, {cell.method.name}"
-            for number, cell in enumerate(cells, start=1)
-        }
-
-    def found(self, job: Job[BenchmarkCell], record: Record) -> None:
-        """See Watch."""
-        self._console.line(
-            f"{self._places[id(job.work)]}: measured before, {_summary_line(record)}"
-        )
-
-    def begin(self, job: Job[BenchmarkCell]) -> bool:
-        """See Watch."""
-        self._console.line(self._places[id(job.work)])
-        return True
-
-    def end(self, job: Job[BenchmarkCell], record: Record, attempts: int) -> None:
-        """See Watch."""
-        where = self._places[id(job.work)]
-        if record["status"] == FAILED:
-            self._console.warn(f"{where}: failed: {record['reason']}")
-        else:
-            self._console.line(f"{where}: {_summary_line(record)}")
-        self._after()
-
-
 def measure_cells(
     cells: Sequence[BenchmarkCell],
     *,
@@ -436,7 +411,20 @@ def measure_cells(
         record = read_cell(cell)
         measured = record is not None and record["status"] == MEASURED
         jobs.append(Job(cell, record if measured and cell.method.pictures is None else None))
-    sweep(jobs, InTurn(run), _Progress(cells, after, console))
+    for event in sweep(jobs, InTurn(run)):
+        cell = event.job.work
+        head = f"[{jobs.index(event.job) + 1}/{len(jobs)}] {cell.scene}, {cell.views} views"
+        head = f"{head}, {cell.method.name}"
+        if event.kind == BEGUN:
+            console.line(head)
+        elif event.kind == FOUND:
+            console.line(f"{head}: measured before, {_summary_line(event.record)}")
+        elif event.record["status"] == FAILED:
+            console.warn(f"{head}: failed: {event.record['reason']}")
+        else:
+            console.line(f"{head}: {_summary_line(event.record)}")
+        if event.kind == ENDED:
+            after()
 
 
 def _summary_line(result: Mapping[str, Any]) -> str:

@@ -31,6 +31,7 @@ from pipelines.scoring.measurement import (
     run_targets,
     true_pictures,
 )
+from pipelines.scoring.sweep import Record, records_of
 from pipelines.scoring.tables import (
     measured_row,
     print_table,
@@ -155,13 +156,14 @@ def evaluate_runs(
 ) -> list[dict[str, Any]]:
     """The figures of each run, with what they were measured on."""
     matcher = matcher_called(options.matcher)
-    evaluations = []
-    for run in runs:
+
+    def measure(run: Run) -> Record:
         console.line(f"{run.path}: {len(run.rounds) - 1} rounds")
         if not run.complete:
             console.warn(f"{run.path}: not every round is done; measured are those that are")
-        figures = evaluate_run(run, options, matcher=matcher, console=console)
-        evaluations.append(with_run(figures, run))
+        return with_run(evaluate_run(run, options, matcher=matcher, console=console), run)
+
+    evaluations = records_of(runs, measure)
     # Runs of one name are told apart by the folders that they lie in.
     names = [evaluation["name"] for evaluation in evaluations]
     for evaluation in evaluations:

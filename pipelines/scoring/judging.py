@@ -23,6 +23,7 @@ from pipelines.scoring.measurement import (
     true_pictures,
 )
 from pipelines.scoring.method_pictures import JudgeReference, MethodPictures, open_method
+from pipelines.scoring.sweep import Record, records_of
 from pipelines.scoring.tables import differences, judge_markdown, judge_tables, print_judgement
 from viz.report.pictures import JudgedView, method_sheet
 
@@ -58,16 +59,20 @@ def judge(
         console=console,
         matcher=matcher_called(options.matcher),
     )
-    sheets = _SheetPictures(targets, sheet_views)
-    measured = []
-    for path, name in zip(paths, names, strict=True):
-        method = open_method(path, name, reference.targets, rule=rule)
+    shown = {targets[row].key: targets[row] for row in evenly(len(targets), sheet_views)}
+    on_sheets: dict[str, dict[tuple[str, int], NDArray[np.uint8]]] = {}
+
+    def measure(given: tuple[Path, str]) -> Record:
+        path, name = given
+        method = open_method(path, name, targets, rule=rule)
         if "consistency" in options.parts:
             # Pictures without depth get the memory's.
             method = replace(method, targets=reference.with_surfaces(method.targets))
         _tell(method, len(targets), console)
-        sheets.add(method)
-        measured.append(_measure(method, measurement))
+        on_sheets[name] = {t.key: t.picture.rgb for t in method.targets if t.key in shown}
+        return _measure(method, measurement)
+
+    measured = records_of(zip(paths, names, strict=True), measure)
     figures = {
         "against": str(reference.run.path),
         "project": reference.run.record["project"],
@@ -91,7 +96,7 @@ def judge(
         },
     }
     tables = judge_tables(figures)
-    files = _write(figures, tables, sheets.views(), out=out)
+    files = _write(figures, tables, _judged_views(shown, on_sheets), out=out)
     print_judgement(tables, console)
     console.line(
         f"results in {out}: judge.json, judge.md, judge.csv, "
@@ -131,37 +136,21 @@ def _measure(method: MethodPictures, measurement: Measurement) -> dict[str, Any]
     }
 
 
-class _SheetPictures:
-    """The pictures that contact sheets show, kept while the methods come one by one."""
-
-    def __init__(self, targets: Sequence[MeasuredTarget], most: int) -> None:
-        self._targets = [targets[row] for row in evenly(len(targets), most)]
-        self._methods: dict[str, dict[tuple[str, int], NDArray[np.uint8]]] = {}
-
-    def add(self, method: MethodPictures) -> None:
-        """Keep a method's pictures of the shown views."""
-        shown = {(target.picture.name, target.number) for target in self._targets}
-        self._methods[method.name] = {
-            (target.picture.name, target.number): target.picture.rgb
-            for target in method.targets
-            if (target.picture.name, target.number) in shown
-        }
-
-    def views(self) -> list[JudgedView]:
-        """The shown views, each with the methods' pictures."""
-        return [
-            JudgedView(
-                name=target.picture.name,
-                truth=None if target.truth is None else target.truth.rgb,
-                mask=None if target.truth is None else target.truth.mask,
-                never_observed=~target.observed,
-                pictures={
-                    name: pictures.get((target.picture.name, target.number))
-                    for name, pictures in self._methods.items()
-                },
-            )
-            for target in self._targets
-        ]
+def _judged_views(
+    shown: Mapping[tuple[str, int], MeasuredTarget],
+    pictures: Mapping[str, Mapping[tuple[str, int], NDArray[np.uint8]]],
+) -> list[JudgedView]:
+    """The views of the contact sheets, each with its picture of every method that has one."""
+    return [
+        JudgedView(
+            name=target.picture.name,
+            truth=None if target.truth is None else target.truth.rgb,
+            mask=None if target.truth is None else target.truth.mask,
+            never_observed=~target.observed,
+            pictures={name: own.get(key) for name, own in pictures.items()},
+        )
+        for key, target in shown.items()
+    ]
 
 
 def _write(

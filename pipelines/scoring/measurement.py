@@ -59,6 +59,11 @@ class MeasuredTarget:
     # pictures without depth of their own.
     surface: NDArray[np.float32] | None = None
 
+    @property
+    def key(self) -> tuple[str, int]:
+        """Name and round, by which a run has it once."""
+        return self.picture.name, self.number
+
 
 def run_targets(run: Run) -> list[MeasuredTarget]:
     """The completed targets of a run with the pictures that it made, in the order of its rounds."""

@@ -72,10 +72,9 @@ class JudgeReference:
         return [t if t.picture.depth is not None else self._with_surface(t) for t in targets]
 
     def _with_surface(self, target: MeasuredTarget) -> MeasuredTarget:
-        key = target.picture.name, target.number
-        if key not in self._surfaces:
-            self._surfaces[key] = self.memory.project(target.picture.camera).depth[0]
-        return replace(target, surface=self._surfaces[key])
+        if target.key not in self._surfaces:
+            self._surfaces[target.key] = self.memory.project(target.picture.camera).depth[0]
+        return replace(target, surface=self._surfaces[target.key])
 
     @property
     def poses(self) -> str:

@@ -6,7 +6,7 @@ What decides a job's result is its identity. A job with a record of the same ide
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from functools import partial
@@ -17,7 +17,7 @@ Record = dict[str, Any]
 
 # Statuses of a record. One that failed has a ``reason``, and ``again`` where another attempt helps.
 DONE, FAILED = "done", "failed"
-# Longest wait for a job to end before progress is shown again, seconds.
+# Longest wait for a job to end, seconds: then another one may have come.
 WAIT_S = 1.0
 
 
@@ -107,31 +107,32 @@ def _result(handle: Future[Record]) -> Record:
         return lost_worker(f"{type(error).__name__}: {error}")
 
 
-class Watch(Generic[Work]):
-    """Follows a sweep; by itself it says nothing and leaves nothing out."""
-
-    def found(self, job: Job[Work], record: Record) -> None:
-        """An earlier sweep has done the job."""
-
-    def begin(self, job: Job[Work]) -> bool:
-        """A job's turn has come, also once more; False leaves it out."""
-        return True
-
-    def again(self, job: Job[Work], record: Record, attempt: int) -> None:
-        """An attempt failed, and another one follows."""
-
-    def end(self, job: Job[Work], record: Record, attempts: int) -> None:
-        """A job is done, or given up."""
-
-    def skip(self, job: Job[Work], failed: Job[Work]) -> None:
-        """A job is not run, since one before it in its chain failed."""
-
-    def tick(self) -> None:
-        """Every ``WAIT_S``, and whenever jobs have ended."""
+# What happens to a job: an earlier sweep has done it; its turn has come; an attempt failed and
+# another one follows; it is done or given up; one before it in its chain failed.
+FOUND, BEGUN, AGAIN, ENDED, SKIPPED = "found", "begun", "again", "ended", "skipped"
 
 
-def sweep(jobs: Sequence[Job[Work]], pool: Pool, watch: Watch[Work]) -> None:
-    """Run the jobs without a record, each up to its ``retries`` times again."""
+@dataclass(frozen=True, eq=False)
+class Event(Generic[Work]):
+    """A step of a sweep."""
+
+    kind: str  # one of the above
+    job: Job[Work]
+    record: Record  # of the attempt, or the earlier sweep; empty where there is none
+    attempt: int  # from 1
+    after: Job[Work] | None = None  # of a skipped job, the one that failed
+
+
+def sweep(
+    jobs: Sequence[Job[Work]],
+    pool: Pool,
+    *,
+    admit: Callable[[Job[Work]], bool] = lambda job: True,
+) -> Generator[Event[Work], None, None]:
+    """Run the jobs without a record, each up to its ``retries`` times again.
+
+    A job that is not admitted when its turn has come is left out, with the rest of its chain.
+    """
     chains: dict[object, deque[Job[Work]]] = {}
     for job in jobs:
         chains.setdefault(job if job.chain is None else job.chain, deque()).append(job)
@@ -144,33 +145,34 @@ def sweep(jobs: Sequence[Job[Work]], pool: Pool, watch: Watch[Work]) -> None:
         if chain:
             ready.append((chain[0], 1))
 
-    def give_up(job: Job[Work]) -> None:
-        for later in list(chains[job if job.chain is None else job.chain])[1:]:
-            if later.record is None:
-                watch.skip(later, job)
-            else:
-                watch.found(later, later.record)
-
     try:
         while ready or running:
             while ready and len(running) < pool.slots:
                 job, attempt = ready.popleft()
                 if job.record is not None:
-                    watch.found(job, job.record)
+                    yield Event(FOUND, job, job.record, attempt)
                     proceed(job)
-                elif watch.begin(job):
+                elif admit(job):
+                    yield Event(BEGUN, job, {}, attempt)
                     running[pool.submit(job.work, attempt)] = job, attempt
             for handle, record in pool.finished(list(running)) if running else ():
                 job, attempt = running.pop(handle)
-                if record["status"] == FAILED and record.get("again") and attempt <= job.retries:
-                    watch.again(job, record, attempt)
-                    ready.append((job, attempt + 1))
-                    continue
-                watch.end(job, record, attempt)
-                if record["status"] == FAILED:
-                    give_up(job)
-                else:
+                if record.get("status") != FAILED:
+                    yield Event(ENDED, job, record, attempt)
                     proceed(job)
-            watch.tick()
+                elif record.get("again") and attempt <= job.retries:
+                    yield Event(AGAIN, job, record, attempt)
+                    ready.append((job, attempt + 1))
+                else:
+                    yield Event(ENDED, job, record, attempt)
+                    for later in list(chains[job if job.chain is None else job.chain])[1:]:
+                        kind = SKIPPED if later.record is None else FOUND
+                        yield Event(kind, later, later.record or {}, 0, job)
     finally:
         pool.close()
+
+
+def records_of(works: Iterable[Work], run: Callable[[Work], Record]) -> list[Record]:
+    """The records of jobs that are run in turn, whatever earlier sweeps left."""
+    events = sweep([Job(work) for work in works], InTurn(run))
+    return [event.record for event in events if event.kind == ENDED]

@@ -23,7 +23,7 @@ from gvtools.untrusted import read_json
 from pipelines.console import Console, Silent
 from pipelines.reconstruction.run import reconstruct
 from pipelines.reconstruction.settings import RunSettings
-from pipelines.scoring.sweep import DONE, FAILED, InTurn, Job, Record, Watch, sweep
+from pipelines.scoring.sweep import BEGUN, DONE, FAILED, InTurn, Job, Record, sweep
 from pipelines.tuning.options import FEWEST_VIEWS, TuneOptions
 from viz.plots.comparisons import draw_pareto
 
@@ -198,40 +198,6 @@ class Trials:
         )
 
 
-class _Progress(Watch[tuple[str, Settings]]):
-    """Keeps to the limit of time, and collects the trials."""
-
-    def __init__(self, limit: float, console: Console, clock: Callable[[], float]) -> None:
-        self.trials: list[Trial] = []
-        self.left_out: list[str] = []
-        self._console, self._clock, self._end = console, clock, clock() + limit
-
-    def found(self, job: Job[tuple[str, Settings]], record: Record) -> None:
-        """See Watch."""
-        self.trials.append(record["trial"])
-        self._console.line(f"{job.work[0]}: {record['trial']}")
-
-    def begin(self, job: Job[tuple[str, Settings]]) -> bool:
-        """See Watch."""
-        label, settings = job.work
-        if not self.trials:
-            return True
-        # A trial is expected to take as long as the start and its tuning, or the time of its fit.
-        tuning = 60 * settings.get("tune.minutes", 0.0)
-        fit = settings.get("refine.seconds") or 0.0
-        fits = self._clock() + max(self.trials[0].seconds + tuning, fit) <= self._end
-        if not fits:
-            self.left_out.append(label)
-        return fits
-
-    def end(self, job: Job[tuple[str, Settings]], record: Record, attempts: int) -> None:
-        """See Watch."""
-        if record["status"] == DONE:
-            self.found(job, record)
-        else:
-            self._console.line(f"{job.work[0]}: refused, {record['reason']}")
-
-
 def run_trials(
     planned: Mapping[str, Settings],
     runs: Trials,
@@ -244,29 +210,48 @@ def run_trials(
 
     The limit is of all trials but the start [s]; those that would not fit are left out and named.
     """
+    trials: list[Trial] = []
+    left_out: list[str] = []
+    end = clock() + limit
 
     def run(work: tuple[str, Settings]) -> Record:
         try:
             return {"status": DONE, "trial": runs.make(*work)}
         except GvError as error:
             # Without the start there is nothing to compare with.
-            if not progress.trials:
+            if not trials:
                 raise
             return {"status": FAILED, "reason": str(error)}
+
+    def in_time(job: Job[tuple[str, Settings]]) -> bool:
+        label, settings = job.work
+        # A trial is expected to take as long as the start and its tuning, or the time of its fit.
+        tuning = 60 * settings.get("tune.minutes", 0.0)
+        fit = settings.get("refine.seconds") or 0.0
+        fits = not trials or clock() + max(trials[0].seconds + tuning, fit) <= end
+        if not fits:
+            left_out.append(label)
+        return fits
 
     jobs = []
     for work in planned.items():
         trial = runs.stored(*work)
         jobs.append(Job(work, None if trial is None else {"status": DONE, "trial": trial}))
-    progress = _Progress(limit, console, clock)
-    sweep(jobs, InTurn(run), progress)
-    left_out = progress.left_out
+    for event in sweep(jobs, InTurn(run), admit=in_time):
+        label, record = event.job.work[0], event.record
+        if event.kind == BEGUN:
+            continue
+        if record["status"] == FAILED:
+            console.line(f"{label}: refused, {record['reason']}")
+        else:
+            trials.append(record["trial"])
+            console.line(f"{label}: {record['trial']}")
     if left_out:
         console.warn(
             f"{len(left_out)} trials were left out for --limit: {', '.join(left_out[:4])}; "
             "the same command with a longer one goes on"
         )
-    return progress.trials
+    return trials
 
 
 def pareto_front(trials: Sequence[Trial]) -> list[Trial]:
