@@ -220,8 +220,8 @@ def plane_sweep(sizes: Sizes) -> Figures:
 def training_step(sizes: Sizes) -> Figures:
     """A step of stage ``denoiser`` on random views, in bfloat16: loss, gradients, AdamW."""
     from gvtools.completers.geoverse.config import named
-    from gvtools.training.batch import Draws, TrainingBatch
     from gvtools.training.options import DenoiserStageOptions
+    from gvtools.training.samples import Draws, TrainingBatch
     from gvtools.training.stages import DenoiserStage
     from pipelines.bench.random_model import random_model, random_views
 

@@ -17,8 +17,8 @@ import torch
 
 from gvtools.completers.geoverse.config import named
 from gvtools.completers.geoverse.model import GeoVerse
-from gvtools.training.batch import TrainingBatch
 from gvtools.training.options import OptimizerOptions
+from gvtools.training.samples import TrainingBatch
 from pipelines.bench.memory import alone, fake_tensors, pass_peaks, step_peaks
 from pipelines.bench.random_model import random_views
 

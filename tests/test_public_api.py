@@ -50,7 +50,7 @@ DOCTESTED = (
     "gvtools.settings.base",
     "gvtools.system_libraries",
     "gvtools.scenes.shards.index",
-    "gvtools.training.mixture",
+    "gvtools.training.data",
     "pipelines.tuning.options",
     "gvtools.trajectory_files",
     "gvtools.untrusted",

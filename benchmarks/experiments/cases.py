@@ -13,7 +13,7 @@ from gvtools.completers.base import ContextView
 from gvtools.guidance import Guidance
 
 if TYPE_CHECKING:
-    from gvtools.training.dataset import SampleInputs
+    from gvtools.training.views import SampleInputs
 
 Float32 = NDArray[np.float32]
 # Of the pictures, px: the shipped model's own.
@@ -61,7 +61,7 @@ def held_out_cases(
         size: of the square pictures, px.
         views: of a scene, context and targets.
     """
-    from gvtools.training.dataset import ProceduralViews
+    from gvtools.training.views import ProceduralViews
 
     data = ProceduralViews(seed=seed, split="held-out", views=views, size=(size, size))
     for index in range(count):
@@ -75,7 +75,7 @@ def case_of(given: SampleInputs, name: str) -> Case:
         given: true views, and which of them are given; its generator is used up.
         name: of the case.
     """
-    from gvtools.training.sample import observe_context, project_observation
+    from gvtools.training.samples import observe_context, project_observation
 
     truth = given.clip
     targets = [view for view in range(len(truth)) if view not in given.context]

@@ -35,7 +35,7 @@ from benchmarks.experiments.rows import geoverse
 from benchmarks.experiments.scan_cases import scan_cases
 from gvtools.completers.base import Completer, create
 from gvtools.evaluation.tables import Column, Table
-from gvtools.training.sheets import write_png
+from gvtools.training.run import write_png
 
 READS = ("weights", "scenes", "size", "seed", "projects", "levels", "pictures")
 

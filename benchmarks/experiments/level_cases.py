@@ -14,8 +14,8 @@ from benchmarks.experiments.level_textures import Pictures
 from benchmarks.experiments.quake_levels import Archives, read_level
 from gvtools.cameras import Cameras
 from gvtools.training.corruption import CorruptionOptions, draw_strengths
-from gvtools.training.dataset import ContextChoice, SampleInputs
-from gvtools.training.sample import Clip
+from gvtools.training.samples import Clip
+from gvtools.training.views import ContextChoice, SampleInputs
 
 Float64 = NDArray[np.float64]
 ATTEMPTS = 60
@@ -68,7 +68,7 @@ def level_cases(
         if clip is None:
             continue
         strength = draw_strengths(rng, CorruptionOptions())
-        context = choice.chosen(rng, views, int(rng.integers(1, choice.most + 1)))
+        context = choice.choose(rng, views, int(rng.integers(1, choice.most + 1)))
         yield case_of(SampleInputs(clip, context, strength, rng), Path(name).stem)
 
 

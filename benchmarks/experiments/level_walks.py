@@ -23,7 +23,7 @@ from benchmarks.experiments.level_textures import Pictures
 from benchmarks.experiments.quake_levels import Archives, read_level
 from gvtools.errors import GvError
 from gvtools.scenes.calibration import INTRINSICS
-from gvtools.training.sample import Clip
+from gvtools.training.samples import Clip
 
 # Names of maps that begin with as many equal letters may be of one map's versions.
 LIKE = 5

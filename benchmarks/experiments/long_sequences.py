@@ -24,7 +24,7 @@ from gvtools.evaluation.pose_probe import Located, PoseProbe
 from gvtools.evaluation.posed_picture import PosedPicture
 from gvtools.evaluation.tables import Column, Table
 from gvtools.memory.spatial_memory import SpatialMemory
-from gvtools.training.sample import Clip
+from gvtools.training.samples import Clip
 from pipelines.reconstruction.rounds import CachedProjection, Clock, complete_targets
 from pipelines.reconstruction.settings import RunSettings
 
@@ -49,7 +49,7 @@ class _Arm:
 def run(options: ExperimentOptions) -> tuple[dict[str, Any], list[Table]]:
     """Figures and a table; see ``READS``."""
     from gvtools.completers.base import create
-    from gvtools.training.dataset import ProceduralViews
+    from gvtools.training.views import ProceduralViews
 
     arms = {
         f"student 3+1, {WITH}": _Arm(geoverse(options.weights), True),

@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmarks.experiments.cases import Case
 from gvtools.completers.base import Completer
-from gvtools.training.sheets import write_png
+from gvtools.training.run import write_png
 
 # Scenes that pictures are written of.
 SHOWN = 12

@@ -22,10 +22,9 @@ from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.evaluation.tables import Column, Table
 from gvtools.networks.depth_anything.geometry_head import ViewGeometry
 from gvtools.networks.depth_anything.rays import poses_least_squares
-from gvtools.training.batch import TrainingBatch
-from gvtools.training.dataset import ContextChoice, ProceduralViews
-from gvtools.training.encoder_stage import scene_unit
-from gvtools.training.sample import collate
+from gvtools.training.samples import TrainingBatch, collate
+from gvtools.training.small_model_stages import scene_unit
+from gvtools.training.views import ContextChoice, ProceduralViews
 
 READS = ("weights", "scenes", "size", "seed")
 

@@ -21,7 +21,7 @@ from gvtools.errors import OptionError
 from gvtools.evaluation.tables import Table
 from gvtools.scenes.scene import Scene, View
 from gvtools.scenes.selection import select
-from gvtools.training.sample import Observation, project_observation
+from gvtools.training.samples import Observation, project_observation
 
 READS = ("weights", "tuned", "project", "context", "targets", "seed", "pictures")
 

@@ -18,7 +18,7 @@ from gvtools.completers.base import ContextView
 from gvtools.depth.choice import choose_source
 from gvtools.errors import OptionError
 from gvtools.scenes.scene import Frame, Scene
-from gvtools.training.sample import Observation, project_observation
+from gvtools.training.samples import Observation, project_observation
 
 CONTEXT, TARGETS = 5, 25
 

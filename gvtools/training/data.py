@@ -1,72 +1,265 @@
-"""The samples of a training: procedural scenes, and recorded ones where the settings name some."""
+"""Sources of samples: rooms and recorded scenes, mixed by weight; the batches of a training.
+
+A sample's source follows from the seed and the sample's number (its index) alone: random numbers
+are read from a counter-based generator at a position that the index gives. So sample 1000 is the
+same on any number of processes and workers, and no earlier sample has to be drawn for it.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator, Iterable, Sequence
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
 
 from gvtools.completers.geoverse.config import GeoVerseConfig
-from gvtools.errors import OptionError
+from gvtools.errors import DegenerateError, OptionError
 from gvtools.files import digest
 from gvtools.scenes.collection import SceneCollection
 from gvtools.scenes.project import open_collection
-from gvtools.training.batch import TrainingBatch
-from gvtools.training.dataset import ContextChoice, ProceduralViews
-from gvtools.training.dataset import Samples as DataSet
 from gvtools.training.loader import PooledViews, batches
-from gvtools.training.mixture import ROOMS, Mixture, OwnOrEstimated, Redrawable, SampleSource
 from gvtools.training.options import SceneSource, TrainingSettings
-from gvtools.training.sample import collate
+from gvtools.training.samples import TrainingBatch, TrainingSample, collate
+from gvtools.training.views import (
+    MIXED,
+    ContextChoice,
+    InvalidSampleError,
+    ProceduralViews,
+    Samples,
+    SceneViews,
+)
 
-if TYPE_CHECKING:
-    from gvtools.training.scene_views import SceneViews
+Float64 = NDArray[np.float64]
+
+# After an invalid sample, another one is drawn from the same source, so that sources keep their
+# shares: this many attempts in all. Then another source is drawn, until none is left.
+TRIES = 10
+# Which random stream: that which chooses the source, and that which chooses the geometry.
+SOURCES, GEOMETRY = range(2)
+# Random numbers that Philox makes in one step of its counter.
+_BLOCK = 4
+# Length of the blocks that ``stratified_at`` spreads evenly.
+_RUN = 1024
+# Name of the source of procedural rooms.
+ROOMS = "rooms"
+# Kinds of notes, which are ``KIND/SOURCE/...``: a sample of the source was drawn; one was invalid,
+# for the reason that follows; whose geometry it has. Training counts them.
+DRAWN, RESAMPLED, GEOMETRY_OF = "drawn", "resampled", "geometry"
 
 
-Draw = Callable[[SceneCollection], Redrawable]
+class Redrawable(Protocol):
+    """Samples by index, of which another one can be drawn where one is invalid."""
+
+    def sample(self, index: int, attempt: int = 0) -> TrainingSample:
+        """The sample of an index; each attempt gives another one."""
+        ...
+
+    def describe(self) -> dict[str, Any]:
+        """Everything that decides the samples, as plain data."""
+        ...
 
 
 @dataclass(frozen=True)
-class _Opened:
-    """A source with what its spec says of it."""
+class SampleSource:
+    """One source of a mixture."""
 
-    collection: SceneCollection
-    weight: float
-    own_share: float
+    name: str  # unique in a mixture; part of the notes
+    weight: float  # 0 or more; its share of the samples is weight / sum of all weights
+    samples: Redrawable  # drawn from it
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """Sources that samples are drawn from by weight."""
+
+    sources: tuple[SampleSource, ...]  # at least one
+    seed: int = 0  # 0 or more
+
+    @cached_property
+    def shares(self) -> Float64:
+        """(S,) expected share of each source."""
+        weights = np.array([source.weight for source in self.sources], np.float64)
+        return weights / weights.sum()
+
+    def choose_sources(
+        self, start: int, count: int, *, without: Collection[int] = ()
+    ) -> NDArray[np.int64]:
+        """(count,) index of the source of each of the samples from ``start`` on.
+
+        Of the sources that are not ``without``, one with a weight above 0 has to remain.
+        """
+        numbers = stratified_at(start, count, stream=[self.seed, MIXED, SOURCES, len(without)])
+        shares = np.where(np.isin(np.arange(len(self.sources)), list(without)), 0, self.shares)
+        ends = np.cumsum(shares) / shares.sum()
+        # If rounding leaves the last end below 1, the last source of weight above 0 gets the rest.
+        last = int(np.flatnonzero(shares)[-1])
+        return np.minimum(np.searchsorted(ends, numbers, side="right"), last)
+
+    def sample(self, index: int) -> TrainingSample:
+        """The sample of an index, with notes of its source and of invalid draws."""
+        notes: list[str] = []
+        failed: list[int] = []
+        problem = ""
+        while len(failed) < np.count_nonzero(self.shares):
+            number = int(self.choose_sources(index, 1, without=failed)[0])
+            source = self.sources[number]
+            for attempt in range(TRIES):
+                try:
+                    sample = source.samples.sample(index, attempt)
+                except InvalidSampleError as error:
+                    notes.append(f"{RESAMPLED}/{source.name}/{error.reason}")
+                    problem = f"{source.name}: {error}"
+                    continue
+                parts = [note.partition("/") for note in sample.notes]
+                own = [f"{kind}/{source.name}/{text}" for kind, _, text in parts]
+                return replace(sample, notes=(*notes, f"{DRAWN}/{source.name}", *own))
+            failed.append(number)
+        raise DegenerateError(
+            f"sample {index}: {len(notes)} draws and none is valid, the last of {problem}"
+        )
+
+    def describe(self) -> dict[str, Any]:
+        """Everything that decides the samples, as plain data."""
+        return {
+            "seed": self.seed,
+            "sources": {
+                source.name: {"weight": source.weight, **source.samples.describe()}
+                for source in self.sources
+            },
+        }
+
+
+@dataclass(frozen=True)
+class OwnOrEstimated:
+    """Samples with a data set's own poses and depth, or with estimated ones, at a given ratio.
+
+    The GeoVerse paper mixes both. Where the estimate is to be used and there is none, the data
+    set's own is; where own depth is missing or incomplete, the estimate is. Both cases are noted.
+    """
+
+    own: Redrawable  # samples with recorded poses and depth
+    # samples with estimated poses and depth; None where there are none
+    estimated: Redrawable | None = None
+    # share of samples that are to have recorded geometry, 0 to 1; 2/3 for the paper's 2:1
+    own_share: float = 1.0
+    seed: int = 0  # 0 or more
+
+    def wants_own(self, start: int, count: int, attempt: int = 0) -> NDArray[np.bool_]:
+        """(count,) whether the samples from ``start`` on are to have recorded geometry."""
+        stream = [self.seed, MIXED, GEOMETRY, attempt]
+        return stratified_at(start, count, stream=stream) < self.own_share
+
+    def sample(self, index: int, attempt: int = 0) -> TrainingSample:
+        """The sample of an index, 0 or more; each attempt gives another one."""
+        if self.wants_own(index, 1, attempt)[0]:
+            try:
+                return _noted(self.own.sample(index, attempt), "own")
+            except InvalidSampleError as error:
+                if error.reason != "depth" or self.estimated is None:
+                    raise
+            return _noted(self.estimated.sample(index, attempt), "estimated (own depth incomplete)")
+        if self.estimated is None:
+            return _noted(self.own.sample(index, attempt), "own (no estimate)")
+        return _noted(self.estimated.sample(index, attempt), "estimated")
+
+    def describe(self) -> dict[str, Any]:
+        """Everything that decides the samples, as plain data."""
+        estimated = None if self.estimated is None else self.estimated.describe()
+        own = {"own_share": self.own_share, "own": self.own.describe()}
+        return {**own, "estimated": estimated, "seed": self.seed}
+
+
+def stratified_at(start: int, count: int, *, stream: Sequence[int]) -> Float64:
+    """(count,) random numbers in [0, 1): those at ``start``, ``start`` + 1, ... of a stream.
+
+    They do not depend on ``start`` and ``count`` otherwise, and take no time for those before.
+
+    Each number is uniform by itself, but each block of 1024 (from a multiple of 1024 on) is
+    stratified: it has one number in every interval of length 1/1024, in random order. So the
+    shares of what is drawn by them are closer to those wanted than with independent numbers, of
+    which one seed in thirty has one of fifteen sources more than three standard deviations off.
+
+    >>> whole = stratified_at(0, 10, stream=[1, 2])
+    >>> bool((stratified_at(7, 2, stream=[1, 2]) == whole[7:9]).all())
+    True
+    >>> sorted(int(1024 * number) for number in stratified_at(2048, 1024, stream=[3])) == [
+    ...     *range(1024)
+    ... ]
+    True
+
+    ``stream``: integers of 0 or more that name the stream, the seed among them.
+    """
+    first, last = start // _RUN, -(-(start + count) // _RUN)
+    key = np.random.SeedSequence(list(stream)).generate_state(2, np.uint64)
+    bits = np.random.Philox(key=key)
+    bits.advance(first * 2 * _RUN // _BLOCK)
+    order, place = np.moveaxis(np.random.Generator(bits).random((last - first, 2, _RUN)), 1, 0)
+    numbers = (order.argsort(1).argsort(1) + place) / _RUN
+    return numbers.ravel()[start - first * _RUN :][:count]
+
+
+def _noted(sample: TrainingSample, text: str) -> TrainingSample:
+    return replace(sample, notes=(*sample.notes, f"{GEOMETRY_OF}/{text}"))
+
+
+# Of the log's keys that count what drawing met: logged, and printed at the end.
+NOTE_PREFIXES = tuple(f"{kind}/" for kind in (DRAWN, RESAMPLED, GEOMETRY_OF))
+
+
+def sampling_report(counts: Mapping[str, int]) -> Iterator[str]:
+    """One line for each source: how many samples, whose geometry, what was invalid and why.
+
+    >>> counts = {"drawn/rooms": 30, "drawn/kitchen": 10, "resampled/kitchen/overlap": 2}
+    >>> list(sampling_report(counts))
+    ['10 samples (25 %) of kitchen; drawn again: 2 overlap', '30 samples (75 %) of rooms']
+    """
+    parts = [(name.split("/", 2), count) for name, count in sorted(counts.items())]
+    samples = {part[1]: count for part, count in parts if part[0] == DRAWN}
+    total = sum(samples.values())
+    for source in sorted({part[1] for part, _ in parts}):
+        count = samples.get(source, 0)
+        line = f"{count} samples ({count / max(total, 1):.0%}) of {source}".replace("%", " %")
+        for kind, title in ((GEOMETRY_OF, "geometry"), (RESAMPLED, "drawn again")):
+            found = [f"{n} {part[2]}" for part, n in parts if part[:2] == [kind, source]]
+            line += f"; {title}: {', '.join(found)}" if found else ""
+        yield line
 
 
 def recorded_sources(
-    entries: Sequence[str | SceneSource], draw: Draw, *, share: float, seed: int
+    entries: Sequence[str | SceneSource],
+    draw: Callable[[SceneCollection], Redrawable],
+    *,
+    share: float,  # of all samples, for these together
+    seed: int,
 ) -> tuple[SampleSource, ...]:
-    """The sources of recorded scenes.
-
-    ``seed``: 0 or more.
-    """
+    """The sources of recorded scenes."""
     whole = [SceneSource(project=entry) if isinstance(entry, str) else entry for entry in entries]
-    opened = [_opened(entry) for entry in whole]
-    total = sum(each.weight for each in opened)
+    opened = [_open(entry) for entry in whole]
+    total = sum(weight for _, weight, _ in opened)
+    if not total:
+        raise OptionError("data.scenes: every weight is 0; give one of them a weight above 0")
     sources: list[SampleSource] = []
-    for entry, each in zip(whole, opened, strict=True):
-        name = _unique(each.collection.title, [source.name for source in sources])
-        samples = _samples(entry, each, draw, seed=seed)
-        sources.append(SampleSource(name, share * each.weight / total, samples))
+    for entry, (collection, weight, own_share) in zip(whole, opened, strict=True):
+        name = _unique(collection.title, [source.name for source in sources])
+        estimated = None if entry.estimated is None else draw(open_collection(entry.estimated))
+        samples = estimated
+        if estimated is None or own_share > 0:
+            samples = own = draw(collection)
+            if own_share < 1 or estimated is not None:
+                samples = OwnOrEstimated(own, estimated, own_share, seed)
+        assert samples is not None
+        sources.append(SampleSource(name, share * weight / total, samples))
     return tuple(sources)
 
 
-def _samples(entry: SceneSource, opened: _Opened, draw: Draw, *, seed: int) -> Redrawable:
-    if entry.estimated is None:
-        own = draw(opened.collection)
-        return own if opened.own_share == 1 else OwnOrEstimated(own, None, opened.own_share, seed)
-    estimated = draw(open_collection(entry.estimated))
-    if opened.own_share == 0:
-        return estimated
-    return OwnOrEstimated(draw(opened.collection), estimated, opened.own_share, seed)
-
-
-def _opened(entry: SceneSource) -> _Opened:
+def _open(entry: SceneSource) -> tuple[SceneCollection, float, float]:
+    """A source's scenes, their weight, and the share of samples with the data set's geometry."""
     root = None if entry.root is None else Path(entry.root)
     collection = open_collection(entry.project, root)
     weight, own_share = 0.0, 1.0
@@ -94,7 +287,7 @@ def _opened(entry: SceneSource) -> _Opened:
             f"{entry.project}: how many images {collection.title} has is not known; give its "
             "'weight'"
         )
-    return _Opened(collection, weight, own_share)
+    return collection, weight, own_share
 
 
 def _unique(name: str, others: Sequence[str]) -> str:
@@ -120,7 +313,10 @@ class TrainingSamples:
         self._context = ContextChoice(most=most)
         self._fill = model.hints.fill
         self._train = self._data_set("train")
-        self._data = self._pooled(self._train)
+        data, cache = config.data, config.data.cache
+        self._data = self._train
+        if data.pool:
+            self._data = PooledViews(self._train, data.pool, None if cache is None else Path(cache))
 
     @property
     def group(self) -> int:
@@ -142,13 +338,12 @@ class TrainingSamples:
 
     def batches(self, parts: Iterable[range]) -> Generator[TrainingBatch, None, None]:
         """The batches of the samples with these numbers, made ahead."""
-        made = batches(self._data, parts, workers=self.config.data.workers)
-        with closing(made):
-            yield from map(self._shown, made)
+        with closing(batches(self._data, parts, workers=self.config.data.workers)) as stream:
+            yield from map(self._projected, stream)
 
     def batch(self, samples: range) -> TrainingBatch:
         """The samples with these numbers."""
-        return self._shown(collate([self._data.sample(index) for index in samples]))
+        return self._projected(collate([self._data.sample(index) for index in samples]))
 
     def aside(self, index: int, count: int) -> TrainingBatch:
         """Training scenes that no step sees."""
@@ -159,23 +354,13 @@ class TrainingSamples:
 
     def held_out(self, count: int) -> TrainingBatch:
         """Scenes of other photographs and layouts."""
-        data = self._data_set("held-out")
-        return self._shown(
-            collate([data.sample(index) for index in range(min(count, self._context.group))])
-        )
+        data, most = self._data_set("held-out"), min(count, self._context.group)
+        return self._projected(collate([data.sample(index) for index in range(most)]))
 
-    def _pooled(self, data: DataSet) -> DataSet:
-        options = self.config.data
-        if not options.pool:
-            return data
-        return PooledViews(
-            data, options.pool, None if options.cache is None else Path(options.cache)
-        )
-
-    def _shown(self, batch: TrainingBatch) -> TrainingBatch:
+    def _projected(self, batch: TrainingBatch) -> TrainingBatch:
         return batch if self.config.data.projections else batch.unprojected
 
-    def _data_set(self, split: str) -> DataSet:
+    def _data_set(self, split: str) -> Samples:
         data = self.config.data
         rooms = ProceduralViews(
             seed=self.config.seed,
@@ -193,8 +378,6 @@ class TrainingSamples:
         return Mixture((SampleSource(ROOMS, 1 - share, rooms), *recorded), seed)
 
     def _recorded(self, scenes: SceneCollection) -> SceneViews:
-        from gvtools.training.scene_views import SceneViews
-
         data = self.config.data
         return SceneViews(
             scenes=scenes,

@@ -26,11 +26,10 @@ import torch
 from numpy.typing import NDArray
 
 import gvtools
-from gvtools.errors import GvError, OptionError, ProjectError
+from gvtools.errors import GvError, ProjectError
 from gvtools.files import replaced_when_written
-from gvtools.training.batch import TrainingBatch
-from gvtools.training.dataset import Samples
-from gvtools.training.sample import TENSORS, TrainingSample, collate
+from gvtools.training.samples import TENSORS, TrainingBatch, TrainingSample, collate
+from gvtools.training.views import Samples
 from gvtools.untrusted import load_arrays
 
 COLORS, DEPTHS = ("images", "hint"), ("depth", "hint_depth", "evidence")
@@ -41,32 +40,25 @@ GREATEST = float(np.finfo(np.float16).max)
 class PooledViews:
     """The first ``count`` samples of a data set, over and over."""
 
-    data: Samples  # the samples
+    data: Samples
     count: int  # a multiple of the data set's group, so that a batch stays within one
     # where they are kept, in a folder of their own named after what decides them, the code
     # included; None makes them anew each time
     folder: Path | None = None
 
-    def __post_init__(self) -> None:
-        if self.count % 8:
-            raise OptionError(
-                f"data.pool = {self.count}; expected a multiple of 8, such as "
-                f"{-(-self.count // 8) * 8}"
-            )
-
     def sample(self, index: int) -> TrainingSample:
-        """The sample of a number, 0 or more; numbers ``count`` apart have the same."""
+        """The sample of a number; numbers ``count`` apart have the same."""
         number = index % self.count
         if self.folder is None:
-            return _sample(_packed(self.data.sample(number)))
+            return _dequantise(_quantise(self.data.sample(number)))
         path = self._place / f"{number:06d}.npz"
         packed = _read(path) if path.exists() else None
         if packed is None:
-            packed = _packed(self.data.sample(number))
+            packed = _quantise(self.data.sample(number))
             # Without compression: reading is to cost nothing.
             with replaced_when_written(path) as temporary, temporary.open("wb") as file:
                 np.savez(file, **packed)  # type: ignore[arg-type]
-        return _sample(packed)
+        return _dequantise(packed)
 
     def describe(self) -> dict[str, Any]:
         """Everything that decides the samples, as plain data."""
@@ -88,7 +80,7 @@ def _code() -> bytes:
     return digest.digest()
 
 
-def _packed(sample: TrainingSample) -> dict[str, NDArray[Any]]:
+def _quantise(sample: TrainingSample) -> dict[str, NDArray[Any]]:
     packed: dict[str, NDArray[Any]] = {
         "context": np.array(sample.context),
         "notes": np.array(sample.notes, str),
@@ -103,7 +95,7 @@ def _packed(sample: TrainingSample) -> dict[str, NDArray[Any]]:
     return packed
 
 
-def _sample(packed: dict[str, NDArray[Any]]) -> TrainingSample:
+def _dequantise(packed: dict[str, NDArray[Any]]) -> TrainingSample:
     tensors: dict[str, Any] = {}
     for name in TENSORS:
         values = packed[name]
@@ -118,15 +110,15 @@ def _sample(packed: dict[str, NDArray[Any]]) -> TrainingSample:
 
 
 def _read(path: Path) -> dict[str, NDArray[Any]] | None:
-    """What a file holds; None where it is damaged, and then it is made again."""
+    """None where the file is damaged: it is made again."""
     try:
         return load_arrays(path)
     except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile):
         return None
 
 
-# A sample on its way: its context views and notes, its tensors as arrays; or why there is none.
-_Made = tuple[int, tuple[str, ...], dict[str, NDArray[Any]]] | GvError
+# A sample on its way to the training, or why there is none.
+_Parcel = tuple[int, tuple[str, ...], dict[str, NDArray[Any]]] | GvError
 
 
 def batches(
@@ -134,32 +126,29 @@ def batches(
 ) -> Generator[TrainingBatch, None, None]:
     """Batches of the samples with these numbers; closing the iterator ends the workers.
 
-    ``data``: the data set; has to be picklable when there are workers. ``parts``: numbers of each
-    batch's samples, without end. ``workers``: processes that make samples; 0 makes them when they
-    are asked for.
+    With ``workers``, ``data`` has to be picklable; 0 makes samples when they are asked for.
     """
     if not workers:
         for part in parts:
             yield collate([data.sample(number) for number in part])
         return
-    loader: torch.utils.data.DataLoader[list[_Made]] = torch.utils.data.DataLoader(
+    loader: torch.utils.data.DataLoader[list[_Parcel]] = torch.utils.data.DataLoader(
         _Arrays(data),  # type: ignore[arg-type]
         batch_sampler=parts,  # type: ignore[arg-type]
         num_workers=workers,
-        collate_fn=_unchanged,
-        worker_init_fn=_begun,
+        collate_fn=_identity,
+        worker_init_fn=_start_worker,
         # Threads of a compiled kernel do not survive a fork.
         multiprocessing_context="spawn",
         # Torch would otherwise draw a number from its global generator.
         generator=torch.Generator(),
     )
     stream = iter(loader)
-    while (items := _next(stream)) is not None:
-        yield collate([_restored(item) for item in items])
+    while (parcels := _next(stream)) is not None:
+        yield collate([_unpack(parcel) for parcel in parcels])
 
 
-def _next(stream: Iterator[list[_Made]]) -> list[_Made] | None:
-    """The samples of the next batch."""
+def _next(stream: Iterator[list[_Parcel]]) -> list[_Parcel] | None:
     try:
         return next(stream, None)
     except RuntimeError as error:
@@ -180,7 +169,7 @@ class _Arrays:
     def __init__(self, data: Samples) -> None:
         self.data = data
 
-    def __getitem__(self, number: int) -> _Made:
+    def __getitem__(self, number: int) -> _Parcel:
         try:
             sample = self.data.sample(number)
         except GvError as error:
@@ -190,19 +179,19 @@ class _Arrays:
         return sample.context, sample.notes, arrays
 
 
-def _restored(made: _Made) -> TrainingSample:
-    if isinstance(made, GvError):
-        raise made
-    context, notes, values = made
-    tensors: dict[str, Any] = {name: torch.from_numpy(value) for name, value in values.items()}
+def _unpack(parcel: _Parcel) -> TrainingSample:
+    if isinstance(parcel, GvError):
+        raise parcel
+    context, notes, arrays = parcel
+    tensors: dict[str, Any] = {name: torch.from_numpy(value) for name, value in arrays.items()}
     return TrainingSample(**tensors, context=context, notes=notes)
 
 
-def _unchanged(item: Any) -> Any:
+def _identity(item: Any) -> Any:
     return item
 
 
-def _begun(worker: int) -> None:
+def _start_worker(worker: int) -> None:
     numba.set_num_threads(1)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 

@@ -231,8 +231,9 @@ class DataOptions(Settings):
     """(H, W) of the pictures. [px]"""
     workers: int = Field(1, ge=0)
     """Processes that render; 0 renders in the training process."""
-    pool: int = Field(0, ge=0)
-    """So many samples are made and seen again and again; 0: every sample is new."""
+    pool: int = Field(0, ge=0, multiple_of=8)
+    """So many samples are made and seen again and again, a multiple of 8; 0: every sample is
+    new."""
     cache: str | None = None
     """Folder where a pool's samples are kept; none makes them anew each time."""
     projections: bool = True

@@ -1,4 +1,4 @@
-"""One stage of a training as a user runs it: its start, its data, its log, its weights."""
+"""One stage of a training as a user runs it: its start, data, log, sample sheets and weights."""
 
 from __future__ import annotations
 
@@ -8,8 +8,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
+from torch import Tensor
 
+from gvtools.completers.geoverse.composition import compose
+from gvtools.completers.geoverse.conditioning import encode_views, fill_holes
 from gvtools.completers.geoverse.config import FlowConfig, GeoVerseConfig
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.completers.geoverse.refiner import Refiner
@@ -22,23 +27,26 @@ from gvtools.completers.geoverse.weights import (
     save_pretrained,
 )
 from gvtools.errors import CheckpointError, OptionError
-from gvtools.files import write_text
+from gvtools.files import replaced_when_written, write_text
 from gvtools.networks.compute import name_of, training_type
 from gvtools.networks.config_json import to_json
 from gvtools.procedural.textures import photograph_names
 from gvtools.runs.digests import folder_digest
-from gvtools.training.batch import TrainingBatch
-from gvtools.training.data import TrainingSamples
+from gvtools.training.data import NOTE_PREFIXES, TrainingSamples, sampling_report
 from gvtools.training.distributed import Processes, Replicated, models_of
-from gvtools.training.encoder_stage import EncoderStage, HeadsStage, measure_statistics
-from gvtools.training.loop import Record, Reporting, Trainer
-from gvtools.training.mixture import NOTE_PREFIXES, sampling_report
+from gvtools.training.loop import FILE, Record, Reporting, Trainer, saved_identity
 from gvtools.training.options import ReflowStageOptions, TrainingSettings
 from gvtools.training.records import STAGES, TrainingLog, read_log
-from gvtools.training.refiner_stage import RefinerStage
-from gvtools.training.sheets import completion_sheet, encoder_sheet, write_png
+from gvtools.training.samples import TrainingBatch
+from gvtools.training.small_model_stages import (
+    EncoderStage,
+    HeadsStage,
+    RefinerStage,
+    decode_heads,
+    head_features,
+    measure_statistics,
+)
 from gvtools.training.stages import DenoiserStage, ReflowStage, Stage
-from gvtools.training.state import FILE, saved_identity
 
 WEIGHTS = "weights"
 # Settings of all stages, written into the folder of each stage when it is started or resumed.
@@ -352,3 +360,92 @@ def _last_record(folder: Path) -> dict[str, float]:
     """The stage's last record."""
     records = read_log(folder)
     return records[-1] if records else {}
+
+
+GAP = 4
+
+
+@torch.no_grad()
+def completion_sheet(model: GeoVerse, batch: TrainingBatch, *, seed: int = 0) -> NDArray[np.uint8]:
+    """A row for each sample: its views as the model gets them, what it makes of them, the truth.
+
+    Three bands a sample: given pictures and projections, completions (context pictures stay), true
+    pictures; then the same for depth, each sample in its own range.
+
+    Returns:
+        (H, W, 3).
+    """
+    training = model.training
+    model.eval()
+    made = model.generate(batch.views, seed=seed)
+    model.train(training)
+    context = batch.views.context
+    shown = fill_holes(batch.views, model.config.hints)
+    rgb, found = compose(shown, made.decoded, made.hint)
+    pictures = batch.images.clone()
+    pictures[:, context:] = rgb.clamp(0, 1)
+    depth = made.decoded.geometry.depth[:, :, None].float()
+    depth[:, context:] = found[:, :, None]
+    rows = []
+    for index in range(len(batch)):
+        rows += [
+            _band(shown.images[index]),
+            _band(pictures[index]),
+            _band(batch.images[index]),
+            _depth_band(shown.depth[index]),
+            _depth_band(depth[index]),
+            _depth_band(batch.depth[index]),
+        ]
+    return np.concatenate(rows)
+
+
+@torch.no_grad()
+def encoder_sheet(model: GeoVerse, batch: TrainingBatch) -> NDArray[np.uint8]:
+    """Four bands a sample: pictures decoded from their own features, true ones, depth likewise.
+
+    Returns:
+        (H, W, 3).
+    """
+    levels = encode_views(model.geometry, batch.true_views, slice(None), config=model.config.hints)
+    geometry, rgb = decode_heads(model, head_features(model, levels, batch), batch)
+    depth = geometry.depth[:, :, None]
+    rows = []
+    for index in range(len(batch)):
+        rows += [
+            _band(rgb[index].clamp(0, 1)),
+            _band(batch.images[index]),
+            _depth_band(depth[index]),
+            _depth_band(batch.depth[index]),
+        ]
+    return np.concatenate(rows)
+
+
+def write_png(path: Path, image: NDArray[np.uint8]) -> None:
+    """Written under another name, then renamed."""
+    from PIL import Image
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replaced_when_written(path) as temporary:
+        Image.fromarray(image).save(temporary, format="PNG")
+
+
+def _band(pictures: Tensor) -> NDArray[np.uint8]:
+    """(V, 3, H, W) in [0, 1] side by side."""
+    tiles = (pictures.cpu().permute(0, 2, 3, 1).numpy() * 255).round().clip(0, 255)
+    return _joined(tiles.astype(np.uint8))
+
+
+def _depth_band(depth: Tensor) -> NDArray[np.uint8]:
+    """(V, 1, H, W) side by side; near is bright, unknown black."""
+    values = depth[:, 0].cpu().numpy()
+    known = values > 0
+    inverse = np.where(known, 1 / np.where(known, values, 1), 0)
+    top = np.percentile(inverse[known], 98) if known.any() else 1.0
+    grey = np.clip(inverse / max(top, 1e-12), 0, 1) * 255
+    return _joined(np.repeat(grey[..., None], 3, axis=-1).astype(np.uint8))
+
+
+def _joined(tiles: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """(V, H, W, 3) to (H + gap, V (W + gap), 3)."""
+    padded = np.pad(tiles, ((0, 0), (0, GAP), (0, GAP), (0, 0)), constant_values=255)
+    return np.concatenate(list(padded), axis=1)

@@ -1,4 +1,12 @@
-"""Stages of the denoisers: joint training of both levels, and distillation of level 1."""
+"""Stages of the denoisers: joint flow matching of both levels, and distillation of level 1.
+
+``DenoiserStage`` computes the paper's complete objective: flow matching of the latents of level 1
+(coarse) and level 0 (fine, predicted by the cascade from level 1), and errors of pictures, depth
+and camera centres that are decoded from the clean latents which the velocities point back to.
+``ReflowStage`` distils level 1: a frozen copy of the denoiser, the teacher, makes many Euler steps
+in an interval of time, and the student learns to get as far in one. ``geoverse.flow`` holds the
+formulas: state x_t = (1 - t) clean + t noise, velocity noise - clean.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +19,7 @@ from torch import Tensor, nn
 
 from gvtools.completers.geoverse.composition import compose
 from gvtools.completers.geoverse.flow import (
+    Velocity,
     clean_from_velocity,
     fast_loss,
     guide,
@@ -29,12 +38,20 @@ from gvtools.completers.geoverse.objective import (
 )
 from gvtools.networks.compute import set_recompute
 from gvtools.networks.depth_anything.rays import camera_centres
-from gvtools.training.batch import Draws, TrainingBatch
 from gvtools.training.options import DenoiserStageOptions, ReflowStageOptions
+from gvtools.training.samples import Draws, TrainingBatch
+
+# A floor below all times that the teacher's steps begin at: with the floor of training, short last
+# steps would leave noise behind.
+TEACHER_LEAST_TIME = 1e-6
 
 
 class Stage(nn.Module):
-    """A model in training; all but its ``learning_parts`` is frozen."""
+    """A model with the loss that one stage minimises; all but ``learning_parts`` is frozen.
+
+    A call takes a batch with the random draws of its step, and gives the loss with its terms for
+    the log.
+    """
 
     name: str
     options: Any
@@ -60,14 +77,21 @@ class Stage(nn.Module):
         """The loss, and its terms for the log."""
         raise NotImplementedError
 
-    def time(self, draws: Draws, name: str) -> Tensor:
-        """(B,) times of flow matching, uniform before the shift; on the CPU."""
+    def prepare(self, batch: TrainingBatch, draws: Draws, model: GeoVerse) -> Prepared:
+        """The batch as ``model`` takes it; student and teacher get the same noise."""
+        return model.prepare(batch.views, seed=draws.seeds("video", batch.images.shape[1]))
+
+    def noisy_state(
+        self, clean: Tensor, noise: Tensor, uniform: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """State x_t (B, ...), its t (B,) and its velocity, at a time of ``uniform`` (B, 1)."""
         flow = self.model.config.flow
-        return training_times(draws.uniform(name, 1)[:, 0], shift=flow.shift, most=flow.most_time)
+        t = training_times(uniform[:, 0], shift=flow.shift, most=flow.most_time).to(clean.device)
+        return interpolate(clean, noise, t), t, velocity_target(clean, noise)
 
 
 class DenoiserStage(Stage):
-    """Loss of stage 1; see the module."""
+    """Both denoisers, trained together under the complete objective."""
 
     name = "denoiser"
 
@@ -80,37 +104,37 @@ class DenoiserStage(Stage):
     def forward(self, batch: TrainingBatch, draws: Draws) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss, and its terms for the log."""
         model, options = self.model, self.options
-        prepared = model.prepare(batch.views, seed=draws.seeds("video", batch.images.shape[1]))
+        prepared = self.prepare(batch, draws, model)
         clean0, clean1 = model.clean_latents(batch.true_views)
         device = clean1.device
         drop = draws.uniform("cameras", 1)[:, 0] < options.cameras
         if options.cameras and bool(drop.any()):
             prepared = model.without_cameras(prepared, drop.to(device))
 
-        t1 = self.time(draws, "t1").to(device)
+        # Level 1: the velocity from a noisy state.
         noise1 = draws.normal("eps1", clean1.shape, device)
-        state1 = interpolate(clean1, noise1, t1)
+        state1, t1, true_velocity1 = self.noisy_state(clean1, noise1, draws.uniform("t1", 1))
         velocity1 = model.velocity1(prepared, state1, t1)
         predicted = {"level1": velocity1}
-        wanted = {"level1": model.velocity_wanted(velocity_target(clean1, noise1), t1)}
+        truth = {"level1": model.velocity_wanted(true_velocity1, t1)}
 
-        found0 = torch.zeros_like(clean1)
+        # Level 0: likewise, on the condition of a true level 1 with a little noise.
+        level0 = torch.zeros_like(clean1)
         if model.cascade is not None:
-            t0 = self.time(draws, "t0").to(device)
             noise0 = draws.normal("eps0", clean0.shape, device)
-            state0 = interpolate(clean0, noise0, t0)
+            state0, t0, truth["level0"] = self.noisy_state(clean0, noise0, draws.uniform("t0", 1))
             amount = options.source_noise * draws.uniform("source", 1, 1, 1, 1).to(device)
             source = clean1 + amount * draws.normal("source_eps", clean1.shape, device)
             velocity0 = model.cascade(state0, t0, model.cascade_conditions(prepared, source))
             predicted["level0"] = velocity0
-            wanted["level0"] = velocity_target(clean0, noise0)
-            found0 = clean_from_velocity(velocity0, state0, t0)
+            level0 = clean_from_velocity(velocity0, state0, t0)
 
+        # Pictures, depth and camera centres of the clean latents that these velocities mean.
         if draws.chance("decode", options.decode):
-            found1 = clean_from_velocity(velocity1, state1, t1)
+            level1 = clean_from_velocity(velocity1, state1, t1)
             context = batch.views.context
-            predicted |= self._decoded(prepared, found0, found1, batch=batch)
-            wanted |= {
+            predicted |= self._decode(prepared, level0, level1, batch=batch)
+            truth |= {
                 "image": batch.images[:, context:],
                 "depth": batch.depth[:, context:, 0],
                 "centers": batch.centers,
@@ -118,17 +142,17 @@ class DenoiserStage(Stage):
             if model.config.composition == "correction":
                 # What memory knows is kept as it is.
                 holes = ~batch.views.valid[:, context:, 0]
-                wanted |= {"image_valid": holes, "depth_valid": holes}
+                truth |= {"image_valid": holes, "depth_valid": holes}
         result = objective(
             PredictedTerms(**predicted),
-            ReferenceTerms(**wanted),
+            ReferenceTerms(**truth),
             context=batch.views.context,
             weights=options.weights,
             context_weight=options.context_weight,
         )
         return result.total, {**result.terms, **result.counts}
 
-    def _decoded(
+    def _decode(
         self, prepared: Prepared, level0: Tensor, level1: Tensor, *, batch: TrainingBatch
     ) -> dict[str, Tensor]:
         """Target pictures and depth with all camera centres, composed as inference does."""
@@ -148,14 +172,11 @@ class DenoiserStage(Stage):
         return {"image": image, "depth": depth, "centers": centers}
 
 
-# The floor of the teacher's times, below any that its steps begin at.
-LEAST = 1e-6
-
-
 class ReflowStage(Stage):
-    """Loss of stage 2: rho L_PRF + (1 - rho) L_FM; see the module.
+    """Level 1 of a student that starts as its teacher: rho L_PRF + (1 - rho) L_FM.
 
-    The student starts as the teacher. The cascade and the heads are not touched.
+    L_PRF compares the student's velocity with the teacher's displacement over one interval, L_FM
+    with the velocity to the truth. The cascade and the heads are not touched.
     """
 
     name = "reflow"
@@ -164,66 +185,60 @@ class ReflowStage(Stage):
 
     def __init__(self, model: GeoVerse, options: ReflowStageOptions) -> None:
         super().__init__(model, options)
-        teacher = copy.deepcopy(model).eval().requires_grad_(False)
-        # Not a submodule: its weights are no part of the stage's state.
-        self._teacher = [teacher]
+        # In a list, so that its weights are no part of the stage's state.
+        self._teacher = [copy.deepcopy(model).eval().requires_grad_(False)]
 
     def learning_parts(self) -> Iterable[nn.Module | None]:
         """Level 1, and what steers it."""
         return self.model.level1, self.model.control, self.model.shared
 
-    @property
-    def bounds(self) -> tuple[float, ...]:
-        """tau_0 .. tau_K."""
-        return self.options.bounds or self.model.config.flow.level1
-
     def forward(self, batch: TrainingBatch, draws: Draws) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss, and its terms for the log."""
-        model, options = self.model, self.options
-        teacher = self._teacher[0]
-        seeds = draws.seeds("video", batch.images.shape[1])
-        prepared = model.prepare(batch.views, seed=seeds)
+        model, options, flow = self.model, self.options, self.model.config.flow
+        prepared = self.prepare(batch, draws, model)
         _, clean = model.clean_latents(batch.true_views)
-        device = clean.device
-        context = batch.views.context
-        noise = draws.normal("eps", clean.shape, device)
+        bounds = options.bounds or flow.level1
         intervals, t = interval_times(
-            draws.uniform("interval", 1)[:, 0], draws.uniform("t_inside", 1)[:, 0], self.bounds
+            draws.uniform("interval", 1)[:, 0], draws.uniform("t_inside", 1)[:, 0], bounds
         )
-        known = teacher.prepare(batch.views, seed=seeds) if options.rho > 0 else prepared
-
-        def taught(conditions: Prepared, state: Tensor, time: Tensor) -> Tensor:
-            # As in sampling: with the floor, short last steps would leave noise behind.
-            return teacher.velocity1(conditions, state, time, least=LEAST)
-
-        without = teacher.without_cameras(known) if options.cfg_scale != 1 else known
+        noise = draws.normal("eps", clean.shape, clean.device)
         pair = reflow_pair(
-            guide(
-                lambda state, time: taught(known, state, time),
-                lambda state, time: taught(without, state, time),
-                options.cfg_scale,
-            ),
+            self._teacher_velocity(batch, draws, prepared),
             clean,
             noise,
             intervals=intervals,
             t=t,
-            bounds=self.bounds,
+            bounds=bounds,
             steps=options.steps,
-            shift=model.config.flow.shift,
+            shift=flow.shift,
         )
-        student = model.velocity1(prepared, pair.state, pair.t)
-        time = self.time(draws, "t").to(device)
-        state = interpolate(clean, noise, time)
-        plain = model.velocity1(prepared, state, time)
+        reflow = self._error(prepared, pair.state, pair.t, velocity=pair.velocity)
+        state, time, velocity = self.noisy_state(clean, noise, draws.uniform("t", 1))
+        matching = self._error(prepared, state, time, velocity=velocity)
+        total = fast_loss(reflow, matching, rho=options.rho)
+        return total, {"reflow": reflow, "flow": matching}
 
-        def error(found: Tensor, wanted: Tensor, at: Tensor) -> Tensor:
-            return flow_matching_loss(
-                found,
-                model.velocity_wanted(wanted, at),
-                context=context,
-                context_weight=options.context_weight,
-            ).mean()
+    def _teacher_velocity(self, batch: TrainingBatch, draws: Draws, prepared: Prepared) -> Velocity:
+        """The teacher's velocity (state, t), with classifier-free guidance if that is asked for."""
+        teacher, scale = self._teacher[0], self.options.cfg_scale
+        if self.options.rho > 0:
+            # By its own weights, from which the student's move away.
+            prepared = self.prepare(batch, draws, teacher)
 
-        reflow = error(student, pair.velocity, pair.t)
-        flow = error(plain, velocity_target(clean, noise), time)
-        return fast_loss(reflow, flow, rho=options.rho), {"reflow": reflow, "flow": flow}
+        def velocity(conditions: Prepared) -> Velocity:
+            return lambda state, t: teacher.velocity1(
+                conditions, state, t, least=TEACHER_LEAST_TIME
+            )
+
+        if scale == 1:
+            return velocity(prepared)
+        return guide(velocity(prepared), velocity(teacher.without_cameras(prepared)), scale)
+
+    def _error(self, prepared: Prepared, state: Tensor, t: Tensor, *, velocity: Tensor) -> Tensor:
+        """The loss of the student's velocity at a state, against the given one."""
+        return flow_matching_loss(
+            self.model.velocity1(prepared, state, t),
+            self.model.velocity_wanted(velocity, t),
+            context=prepared.batch.context,
+            context_weight=self.options.context_weight,
+        ).mean()

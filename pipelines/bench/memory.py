@@ -34,10 +34,10 @@ from gvtools.completers.geoverse.flow import interval_bounds
 from gvtools.completers.geoverse.model import DECODE, DECODING, VIDEO, GeoVerse
 from gvtools.completers.geoverse.video_prior import VideoPrior
 from gvtools.networks.compute import autocast, name_of
-from gvtools.training.batch import TrainingBatch
 from gvtools.training.distributed import Processes, Replicated
 from gvtools.training.loop import Trainer
 from gvtools.training.options import DenoiserStageOptions, OptimizerOptions, ReflowStageOptions
+from gvtools.training.samples import TrainingBatch
 from gvtools.training.stages import DenoiserStage, ReflowStage, Stage
 from pipelines.bench.complete import INSIDE
 from pipelines.bench.options import CompleteOptions

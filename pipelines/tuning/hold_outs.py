@@ -14,15 +14,22 @@ from gvtools.errors import ProjectError
 from gvtools.guidance import Guidance
 from gvtools.scenes.scene import Scene
 from gvtools.training.corruption import GENTLE, draw_strengths
-from gvtools.training.dataset import FAULTS, PATH, ContextChoice
-from gvtools.training.sample import (
+from gvtools.training.samples import (
     Clip,
     Observation,
     TrainingSample,
     make_sample,
     project_observation,
 )
-from gvtools.training.scene_views import SampleView, concatenate_clips, covisibility, reduced_view
+from gvtools.training.views import (
+    FAULTS,
+    PATH,
+    ContextChoice,
+    SampleView,
+    concatenate_clips,
+    covisibility,
+    reduced_view,
+)
 from gvtools.view_selection import evenly_spread
 from pipelines.tuning.options import FEWEST_VIEWS
 

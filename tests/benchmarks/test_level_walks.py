@@ -6,7 +6,7 @@ from quake_map import room, write_archive
 
 from benchmarks.experiments.level_walks import unjudged, write_walks
 from gvtools.scenes.project import open_project
-from gvtools.training.sample import Observation, project_observation
+from gvtools.training.samples import Observation, project_observation
 
 
 def test_versions_of_judged_maps_are_left_out():

@@ -16,7 +16,7 @@ from kill_commands import PLAIN
 from kill_contents import contents
 
 from gvtools.errors import GvError, ProjectError
-from gvtools.training.state import StageState, TrainingProgress, load_state, save_state
+from gvtools.training.loop import StageState, TrainingProgress, load_state, save_state
 from pipelines.cli import main
 
 RUN = (*PLAIN, "--quiet")

@@ -21,12 +21,11 @@ from gvtools.scenes.data_sets.catalogue import load_spec
 from gvtools.scenes.project import open_collection
 from gvtools.scenes.shards.writer import ShardOptions, write_shards
 from gvtools.settings import with_texts
-from gvtools.training.batch import TrainingBatch
-from gvtools.training.data import TrainingSamples
-from gvtools.training.mixture import Mixture
+from gvtools.training.data import Mixture, TrainingSamples
+from gvtools.training.loop import load_state
 from gvtools.training.options import shipped_or_read
 from gvtools.training.records import read_log
-from gvtools.training.state import load_state
+from gvtools.training.samples import TrainingBatch
 from pipelines.cli import main
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -98,11 +97,6 @@ def test_a_torn_file_of_a_pool_is_made_again_and_other_data_lie_elsewhere(tmp_pa
     other = micro_samples(pool, cache, "seed=1").batch(range(1))
     assert not torch.equal(other.images, whole.images)
     assert len(list(tmp_path.iterdir())) == 2
-
-
-def test_a_pool_that_cannot_be_is_refused():
-    with pytest.raises(OptionError, match="multiple of 8, such as 16"):
-        micro_samples("data.pool=12")
 
 
 PARTS = [range(4 * i, 4 * i + 4) for i in range(4)]
@@ -203,6 +197,8 @@ def test_sources_that_cannot_be_are_one_line_before_training(home, tmp_path):
         samples(str(home / "kitchen"), share=0)
     with pytest.raises(OptionError, match=r"data\.scenes.*weight"):
         samples({"project": str(home / "kitchen"), "weight": -1})
+    with pytest.raises(OptionError, match=r"data\.scenes: every weight is 0"):
+        samples({"project": str(home / "kitchen"), "weight": 0})
 
 
 def test_the_papers_rule_is_taken_from_the_spec(home, monkeypatch):

@@ -17,8 +17,7 @@ from gvtools.training.corruption import (
     corrupted_depth,
     draw_strengths,
 )
-from gvtools.training.dataset import ContextChoice, ProceduralViews
-from gvtools.training.sample import (
+from gvtools.training.samples import (
     TENSORS,
     Clip,
     TrainingSample,
@@ -26,6 +25,7 @@ from gvtools.training.sample import (
     observe_context,
     project_observation,
 )
+from gvtools.training.views import ContextChoice, ProceduralViews, context_seed
 
 CLEAN = ProceduralViews(faults=None)
 COUNT = 12
@@ -94,7 +94,8 @@ def test_splits_have_other_scenes_and_photographs() -> None:
 def test_shapes_ranges_and_unit(split: str, clean: bool) -> None:
     for index, sample in enumerate(_samples(split, clean)):
         k = sample.context
-        assert k == ProceduralViews(split=split).context_count(index)
+        data = ProceduralViews(split=split)
+        assert k == data.context.count(context_seed(0, split), index)
         assert sample.images.shape == sample.hint.shape == (8, 3, 96, 96)
         assert sample.depth.shape == sample.hint_depth.shape == sample.valid.shape == (8, 1, 96, 96)
         for name in TENSORS:
@@ -276,8 +277,3 @@ def test_batches_are_what_the_model_takes() -> None:
     mixed = [data.sample(index) for index in range(12)]
     with pytest.raises(ShapeError, match="group"):
         collate(mixed)
-
-
-def test_impossible_data_is_refused() -> None:
-    with pytest.raises(OptionError, match="sample -1"):
-        CLEAN.sample(-1)

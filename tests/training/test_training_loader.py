@@ -10,9 +10,9 @@ import pytest
 import torch
 
 from gvtools.errors import DegenerateError
-from gvtools.training.batch import TrainingBatch
-from gvtools.training.dataset import ContextChoice, ProceduralViews
 from gvtools.training.loader import batches
+from gvtools.training.samples import TrainingBatch
+from gvtools.training.views import ContextChoice, ProceduralViews
 
 DATA = ProceduralViews(views=3, size=(24, 24), context=ContextChoice(most=2, group=4))
 
@@ -49,8 +49,8 @@ class Refusing:
 
 _ORPHANS = """
 import os, time
-from gvtools.training.dataset import ContextChoice
-from gvtools.training.dataset import ProceduralViews
+from gvtools.training.views import ContextChoice
+from gvtools.training.views import ProceduralViews
 from gvtools.training.loader import batches
 
 if __name__ == "__main__":
@@ -88,8 +88,8 @@ def test_workers_end_with_a_process_that_is_killed(tmp_path):
 _DEATH = """
 import multiprocessing, os, signal
 from gvtools.errors import ProjectError
-from gvtools.training.dataset import ContextChoice
-from gvtools.training.dataset import ProceduralViews
+from gvtools.training.views import ContextChoice
+from gvtools.training.views import ProceduralViews
 from gvtools.training.loader import batches
 
 if __name__ == "__main__":

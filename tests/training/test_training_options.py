@@ -52,6 +52,7 @@ def test_the_faults_of_observations_are_settings():
     ("text", "complaint"),
     [
         ("encoder.optimizer.cycles=9999", "cycles 9999; expected at most optimizer.steps"),
+        ("data.pool=12", "data.pool '12'; expected a multiple of 8"),
         ("data.cache=here data.pool=0", "data.cache needs data.pool"),
         ("heads.ray=0 heads.rgb=0 heads.depth=0", "ray, rgb and depth are all 0"),
         ("heads.origin.deep=3", "heads.origin is a value without settings below it"),

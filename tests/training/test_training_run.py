@@ -16,8 +16,8 @@ import torch
 from PIL import Image
 
 from gvtools.completers.geoverse import from_pretrained
+from gvtools.training.loop import load_state
 from gvtools.training.records import read_log
-from gvtools.training.state import load_state
 from pipelines.cli import main
 
 pytestmark = pytest.mark.usefixtures("one_thread")

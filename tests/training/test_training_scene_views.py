@@ -17,8 +17,7 @@ from gvtools.procedural.render import radiance, to_srgb
 from gvtools.scenes.collection import of_scenes
 from gvtools.scenes.project import open_project
 from gvtools.scenes.scene import Frame, Scene, View
-from gvtools.training.dataset import ContextChoice
-from gvtools.training.scene_views import SceneViews, overlaps
+from gvtools.training.views import ContextChoice, SceneViews, overlaps
 
 TALL, WIDE = 96, 128
 

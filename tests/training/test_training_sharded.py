@@ -21,10 +21,10 @@ from gvtools.completers.geoverse import GeoVerse, from_pretrained
 from gvtools.completers.geoverse.config import GeoVerseConfig, read
 from gvtools.completers.geoverse.weights import save_pretrained
 from gvtools.networks.config_json import to_json
-from gvtools.training.batch import Draws
 from gvtools.training.data import TrainingSamples
 from gvtools.training.options import SHIPPED, shipped_or_read
 from gvtools.training.records import read_log
+from gvtools.training.samples import Draws
 from gvtools.training.stages import DenoiserStage
 from pipelines.cli import main
 

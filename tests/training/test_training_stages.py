@@ -14,10 +14,10 @@ from gvtools.completers.geoverse.flow import interpolate, velocity_from_clean, v
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.completers.geoverse.refiner import CompletedViews, RefinerConfig
 from gvtools.errors import OptionError
-from gvtools.training.batch import Draws, TrainingBatch
 from gvtools.training.data import TrainingSamples
 from gvtools.training.options import RefinerStageOptions, ReflowStageOptions, shipped_or_read
-from gvtools.training.refiner_stage import CUT, RefinerStage, augment, view_errors
+from gvtools.training.samples import Draws, TrainingBatch
+from gvtools.training.small_model_stages import CUT, RefinerStage, augment, view_errors
 from gvtools.training.stages import ReflowStage
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -1,11 +1,11 @@
-"""Samples from recorded scenes with depth: windows of ordered views that see the same things."""
+"""Views that samples are made of: procedural scenes, and windows of recorded ones."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import lru_cache
-from typing import Any
+from typing import Any, Literal, Protocol
 
 import numpy as np
 import torch
@@ -14,21 +14,184 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras, concatenate
 from gvtools.completers.geoverse.views import resample
-from gvtools.errors import GvError, ProjectError
+from gvtools.errors import DegenerateError, GvError, ProjectError
+from gvtools.procedural.layouts import scene
+from gvtools.procedural.paths import camera_path
+from gvtools.procedural.render import radiance, to_srgb
+from gvtools.procedural.textures import check_split, photograph_names
 from gvtools.scenes.collection import SceneCollection
 from gvtools.scenes.scene import View
 from gvtools.scenes.selection import select
 from gvtools.training.corruption import GENTLE, CorruptionOptions, draw_strengths
-from gvtools.training.dataset import (
-    FAULTS,
-    PATH,
-    RECORDED,
-    ContextChoice,
-    context_seed,
-    shared_settings,
-)
-from gvtools.training.mixture import DEPTH, OVERLAP, SCENE, UNREADABLE, InvalidSampleError
-from gvtools.training.sample import Clip, TrainingSample, make_sample
+from gvtools.training.samples import Clip, TrainingSample, make_sample
+
+COUNTS = 101  # the stream of random numbers that counts are drawn from
+EXTRAPOLATION = 0.5  # chance that the first views are given, and not views all along the path
+ENDS = 0.4  # chance, of the other cases, that both ends are given and not every k-th view
+
+
+@dataclass(frozen=True)
+class ContextChoice:
+    """How many views are given, and which."""
+
+    most: int = 4  # context views; at least one is given
+    # so many samples in a row have the same number, so that a batch of them is possible
+    group: int = 8
+
+    def count(self, seed: list[int], index: int) -> int:
+        """The number of context views of a sample of the data set with this seed."""
+        rng = np.random.default_rng([*seed, index // self.group, COUNTS])
+        return int(rng.integers(1, self.most + 1))
+
+    def choose(self, rng: np.random.Generator, views: int, count: int) -> tuple[int, ...]:
+        """Which of a path's views are given, ascending."""
+        rule: Literal["every", "ends", "first"] = "first"
+        if rng.random() >= EXTRAPOLATION:
+            rule = "ends" if rng.random() < ENDS else "every"
+        return choose_context(rng, views, count, rule=rule)
+
+
+def choose_context(
+    rng: np.random.Generator,
+    views: int,
+    count: int,
+    *,
+    # every k-th view, placed by ``rng``; evenly spaced with both ends; or the first ones
+    rule: Literal["every", "ends", "first"],
+) -> tuple[int, ...]:
+    """Which views of a path are given, ascending."""
+    if rule == "first":
+        return tuple(range(count))
+    if rule == "ends":
+        last = views - 1
+        return tuple(round(i * last / max(count - 1, 1)) for i in range(count))
+    step = views // count
+    start = int(rng.integers(0, views - step * (count - 1)))
+    return tuple(start + step * i for i in range(count))
+
+
+# Streams of random numbers of one sample.
+SCENE, PATH, FAULTS = range(3)
+# The same streams of procedural and recorded samples do not meet.
+PROCEDURAL, RECORDED, MIXED = range(3)
+
+
+class InvalidSampleError(DegenerateError):
+    """A sample that is not to be learnt from."""
+
+    def __init__(
+        self,
+        # a scene cannot be opened, a view cannot be read, views hardly share anything, too little
+        # depth
+        reason: Literal["scene", "unreadable", "overlap", "depth"],
+        message: str,
+    ) -> None:
+        super().__init__(message)
+        self.reason = reason
+
+    def __reduce__(self) -> tuple[type[InvalidSampleError], tuple[str, str]]:
+        # Errors travel from workers to the training.
+        return type(self), (self.reason, str(self))
+
+
+class Samples(Protocol):
+    """A data set of samples by number.
+
+    A sample follows from seed, split and number alone: no state is kept and no global random
+    number is drawn, so that workers, processes and a continued training see what one process would
+    have seen.
+    """
+
+    def sample(self, index: int) -> TrainingSample:
+        """The sample of a number, 0 or more."""
+        ...
+
+    def describe(self) -> dict[str, Any]:
+        """Everything that decides the samples, as plain data."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class SampleInputs:
+    """What a sample is made of."""
+
+    clip: Clip  # its true views in order
+    context: tuple[int, ...]  # which of them are given, ascending
+    strength: CorruptionOptions  # of its faults
+    rng: np.random.Generator  # draws the faults; used up by one sample
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProceduralViews:
+    """Views of procedural scenes; every number has a scene of its own."""
+
+    seed: int = 0  # 0 or more
+    split: str = "train"  # "train" or "held-out": other photographs, layouts and numbers
+    views: int = 8  # of a sample, context and targets
+    size: tuple[int, int] = (96, 96)  # (H, W) of the pictures
+    # how many views are given, and which
+    context: ContextChoice = field(default_factory=ContextChoice)
+    # see CorruptionOptions; None for clean observations
+    faults: CorruptionOptions | None = field(default_factory=CorruptionOptions)
+    fill: str = "none"  # of the model's configuration, ``hints.fill``
+
+    def __post_init__(self) -> None:
+        check_split(self.split)
+
+    def sample(self, index: int, attempt: int = 0) -> TrainingSample:
+        """The sample of a number, the same at every attempt."""
+        inputs = self.inputs(index)
+        return make_sample(
+            inputs.clip,
+            inputs.clip,
+            inputs.context,
+            rng=inputs.rng,
+            strength=inputs.strength,
+            fill=self.fill,
+        )
+
+    def inputs(self, index: int) -> SampleInputs:
+        """What the sample of a number is made of."""
+        clip = self.clip(index)
+        rng = self._rng(index, FAULTS)
+        strength = draw_strengths(rng, self.faults or CorruptionOptions(clean=1.0))
+        count = self.context.count(context_seed(self.seed, self.split), index)
+        context = self.context.choose(rng, self.views, count)
+        return SampleInputs(clip, context, strength, rng)
+
+    def clip(self, index: int) -> Clip:
+        """The true views of a sample in order."""
+        place = scene(self._rng(index, SCENE), self.split)
+        cameras = camera_path(
+            self._rng(index, PATH), place.geometry, views=self.views, size=self.size
+        )
+        light, depth = radiance(place.geometry, place.look, cameras)
+        exposure = place.key / max(float(light.mean()), 1e-6)
+        return Clip(to_srgb(light, exposure), depth, cameras)
+
+    def describe(self) -> dict[str, Any]:
+        """Everything that decides the samples, as plain data."""
+        return {
+            "source": "procedural",
+            **shared_settings(self),
+            "photographs": photograph_names(self.split),
+        }
+
+    def _rng(self, index: int, stream: int) -> np.random.Generator:
+        return np.random.default_rng([*context_seed(self.seed, self.split), index, stream])
+
+
+def context_seed(seed: int, split: str = "train") -> list[int]:
+    """What numbers of context views are drawn with: one for all sources that batches mix."""
+    return [seed, PROCEDURAL, check_split(split)]
+
+
+def shared_settings(views: Any) -> dict[str, Any]:
+    """The settings that procedural and recorded views share, as plain data."""
+    plain = {name: getattr(views, name) for name in ("seed", "views", "size", "fill")}
+    faults = None if views.faults is None else views.faults.to_dict()
+    return {**plain, "context": asdict(views.context), "faults": faults}
+
 
 ATTEMPTS = 40
 MOST_STRIDE = 6  # steps between the views of a window
@@ -101,7 +264,7 @@ class SceneViews:
         rng = np.random.default_rng([self.seed, RECORDED, index, FAULTS, attempt])
         strength = draw_strengths(rng, self.faults or CorruptionOptions(clean=1.0))
         count = self.context.count(context_seed(self.seed), index)
-        context = self.context.chosen(rng, self.views, count)
+        context = self.context.choose(rng, self.views, count)
         return make_sample(clip, truth, context, rng=rng, strength=strength, fill=self.fill)
 
     def clips(self, index: int, attempt: int = 0) -> tuple[Clip, Clip]:
@@ -111,20 +274,20 @@ class SceneViews:
         try:
             views = _usable(self, number)
         except GvError as error:
-            reason = DEPTH if isinstance(error, TooFewViewsError) else SCENE
-            raise InvalidSampleError(reason, str(error)) from None
+            too_few = isinstance(error, TooFewViewsError)
+            raise InvalidSampleError("depth" if too_few else "scene", str(error)) from None
         best = 0.0
         for trial in range(ATTEMPTS):
             rows = self._rows(rng, len(views), trial)
             try:
-                frames = [_kept(views[row], self.size) for row in rows]
+                frames = [_cached_view(views[row], self.size) for row in rows]
             except GvError as error:
-                raise InvalidSampleError(UNREADABLE, str(error)) from None
+                raise InvalidSampleError("unreadable", str(error)) from None
             truth = concatenate_clips([frame.truth for frame in frames])
             covered = float((truth.depth > 0).mean((1, 2)).min())
             if covered < LEAST_DEPTH:
                 raise InvalidSampleError(
-                    DEPTH,
+                    "depth",
                     f"{self.scenes.title}: a view has depth in {covered:.0%} of its pixels; "
                     f"expected {LEAST_DEPTH:.0%}",
                 )
@@ -133,7 +296,7 @@ class SceneViews:
             if found >= self.overlap:
                 return concatenate_clips([frame.observed for frame in frames]), truth
         raise InvalidSampleError(
-            OVERLAP,
+            "overlap",
             f"{self.scenes.title}: no window of {self.views} views in {ATTEMPTS} trials of which "
             f"neighbours share {self.overlap:.0%} of their depth (best {best:.0%}); lower the "
             "overlap",
@@ -177,14 +340,11 @@ def _usable(data: SceneViews, number: int) -> tuple[View, ...]:
 
 def overlaps(clip: Clip) -> list[float]:
     """Share of each view's known depth that the next view shows likewise; 0 without any."""
-    return [float(covisibility(clip, i, [i + 1])[0]) for i in range(len(clip) - 1)]
+    return [float(covisibility(clip, i, [i + 1])[0]) for i in range(len(clip.rgb) - 1)]
 
 
 def covisibility(clip: Clip, index: int, others: Sequence[int]) -> NDArray[np.float64]:
-    """(len(others),) share of one view's known depth that each of others shows likewise.
-
-    ``index``: of the view whose depth is looked for; without any, the shares are 0.
-    """
+    """(len(others),) share of a view's known depth that each of others shows likewise."""
     height, width = clip.depth.shape[1:]
     rows = np.linspace(0, height - 1, PROBE).astype(int)[:, None]
     columns = np.linspace(0, width - 1, PROBE).astype(int)[None]
@@ -234,7 +394,7 @@ def reduced_view(view: View, size: tuple[int, int]) -> SampleView:
     return SampleView(*parts)
 
 
-_kept = lru_cache(KEPT_FRAMES)(reduced_view)
+_cached_view = lru_cache(KEPT_FRAMES)(reduced_view)
 
 
 def _resized(

@@ -1,4 +1,4 @@
-"""One training sample: context views, their memory projected into the targets, and the truth.
+"""Training samples: context views with faults, their memory projected into targets, the truth.
 
 Views are lifted to the project's memory and splatted to the targets as inference does it, by the
 same code: back-projection, fusion, projection, reduction to the model's size. A memory of four
@@ -8,9 +8,9 @@ views at 96 x 96 costs milliseconds, so nothing faster stands in.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 import torch
@@ -21,12 +21,12 @@ from torch import Tensor
 from gvtools.cameras import Cameras
 from gvtools.completers.base import ContextView
 from gvtools.completers.geoverse.conditioning import ViewBatch
+from gvtools.completers.geoverse.flow import seeded_noise, view_seed
 from gvtools.completers.geoverse.views import view_batch
 from gvtools.completers.surface_fill import surface_fill
 from gvtools.errors import ShapeError
 from gvtools.guidance import Guidance
 from gvtools.memory.spatial_memory import SpatialMemory
-from gvtools.training.batch import TrainingBatch
 from gvtools.training.corruption import (
     NOTHING,
     CorruptionOptions,
@@ -46,13 +46,6 @@ class Clip:
     depth: Float32  # (V, H, W) float32 z-depth, scene units, 0 = none
     cameras: Cameras  # V of them
 
-    def __post_init__(self) -> None:
-        if self.rgb.shape != (*self.depth.shape, 3) or len(self.cameras) != len(self.rgb):
-            raise ShapeError(
-                f"clip: rgb {self.rgb.shape}, depth {self.depth.shape}, {len(self.cameras)} "
-                "cameras; expected (V, H, W, 3), (V, H, W) and V"
-            )
-
     def __len__(self) -> int:
         return len(self.rgb)
 
@@ -65,18 +58,11 @@ class Observation:
     views: tuple[ContextView, ...]
     lifted: tuple[Cameras, ...]  # the cameras that their depth is lifted by
 
-    def with_more(self, other: Observation) -> Observation:
-        """These views and others."""
-        return Observation(self.views + other.views, self.lifted + other.lifted)
-
 
 def observe_context(
     clip: Clip, context: Sequence[int], strength: CorruptionOptions, *, rng: np.random.Generator
 ) -> Observation:
-    """Context views of a clip with their faults.
-
-    ``strength``: of this sample's faults, see ``corruption.drawn``.
-    """
+    """Context views of a clip with faults of this strength."""
     known = clip.depth[list(context)]
     unit = float(known[known > 0].mean()) if (known > 0).any() else 1.0
     views, lifted = [], []
@@ -153,7 +139,8 @@ def make_sample(
     observation = observe_context(clip, context, strength, rng=rng)
     known = observation
     if more is not None:
-        known = observation.with_more(observe_context(more, range(len(more)), strength, rng=rng))
+        further = observe_context(more, range(len(more)), strength, rng=rng)
+        known = Observation(known.views + further.views, known.lifted + further.lifted)
     guidance = project_observation(known, clip.cameras[targets])
     size = truth.depth.shape[1], truth.depth.shape[2]
     with _one_thread():
@@ -237,3 +224,104 @@ def collate(samples: Sequence[TrainingSample]) -> TrainingBatch:
         evidence=stacked["evidence"],
     )
     return TrainingBatch(views, stacked["images"], stacked["depth"], notes)
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingBatch:
+    """Views with their hints, and the truth of all of them."""
+
+    # as the model gets them: context pictures and depth, then the targets' projections
+    views: ViewBatch
+    images: Tensor  # (B, V, 3, H, W) true pictures in [0, 1]
+    depth: Tensor  # (B, V, 1, H, W) true z-depth; 0 = unknown
+    # how often what happened when its samples were drawn
+    notes: Mapping[str, int] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    @property
+    def true_views(self) -> ViewBatch:
+        """The same views with true pictures and depth everywhere."""
+        return replace(
+            self.views,
+            images=self.images,
+            depth=self.depth,
+            valid=torch.ones_like(self.views.valid),
+        )
+
+    @property
+    def unprojected(self) -> TrainingBatch:
+        """The same views with nothing projected into the targets."""
+        context = self.views.context
+        known = torch.zeros_like(self.views.valid)
+        known[:, :context] = True
+        views = replace(
+            self.views,
+            images=self.views.images * known,
+            depth=self.views.depth * known,
+            valid=self.views.valid & known,
+        )
+        return replace(self, views=views)
+
+    @property
+    def relative(self) -> Tensor:
+        """(B, V, 4, 4) float64 cameras from the frame of the first view."""
+        pose = self.views.cam_from_world.double()
+        return pose @ torch.linalg.inv(pose[:, :1])
+
+    @property
+    def centers(self) -> Tensor:
+        """(B, V, 3) true camera centres in the frame of the first view."""
+        rotation, translation = self.relative[..., :3, :3], self.relative[..., :3, 3:]
+        return -(rotation.mT @ translation)[..., 0].to(self.images.dtype)
+
+    def samples(self, index: Tensor) -> TrainingBatch:
+        """Some samples of the batch, without its notes."""
+        return TrainingBatch(self.views.samples(index), self.images[index], self.depth[index])
+
+    def to(self, device: torch.device | str) -> TrainingBatch:
+        """On another device."""
+        images, depth = self.images.to(device), self.depth.to(device)
+        return TrainingBatch(self.views.to(device), images, depth, self.notes)
+
+
+@dataclass(frozen=True)
+class Draws:
+    """Draws for one mini-batch."""
+
+    seed: int  # of the training
+    stage: str  # its name
+    step: int  # number of the optimiser step
+    # the numbers of the step's samples, B of them; none occurs twice in a training
+    samples: tuple[int, ...]
+
+    def chance(self, name: str, share: float) -> bool:
+        """Whether something happens in this step; the same for all samples and processes."""
+        return float(self.numbers(name, 1)) < share
+
+    def numbers(self, name: str, count: int) -> Tensor:
+        """(count,) in [0, 1); the same for all samples and processes."""
+        seed = view_seed(self.seed, self.stage, name, "step", self.step)
+        return torch.rand(count, generator=torch.Generator().manual_seed(seed))
+
+    def uniform(self, name: str, *shape: int) -> Tensor:
+        """(B, *shape) in [0, 1), float32 on the CPU."""
+        return torch.stack([torch.rand(shape, generator=g) for g in self._generators(name)])
+
+    def normal(self, name: str, shape: Sequence[int], device: torch.device | str) -> Tensor:
+        """(B, V, ...) standard normal, every view by itself."""
+        return seeded_noise(shape, self.seeds(name, int(shape[1])), device=device)
+
+    def seeds(self, name: str, views: int) -> list[list[int]]:
+        """B rows of a seed for every view."""
+        return [
+            [view_seed(self.seed, self.stage, name, sample, view) for view in range(views)]
+            for sample in self.samples
+        ]
+
+    def _generators(self, name: str) -> list[torch.Generator]:
+        return [
+            torch.Generator().manual_seed(view_seed(self.seed, self.stage, name, sample))
+            for sample in self.samples
+        ]
