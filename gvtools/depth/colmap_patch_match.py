@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from gvtools.depth.source import DepthMap, RecordedDepth
 from gvtools.errors import DegenerateError, ProjectError
-from gvtools.scenes.colmap import depth_map_path, read_depth_map
+from gvtools.scenes.colmap import depth_map_path
 from gvtools.scenes.colmap_model import write_colmap
+from gvtools.scenes.images import read_depth
 from gvtools.scenes.scene import Frame, Scene, View
 
 # Source pictures of each, chosen by COLMAP from co-visibility.
@@ -88,7 +89,7 @@ class ColmapPatchMatch:
         for name in self.views:
             found = depth_map_path(folder / "stereo" / "depth_maps", name)
             if found is not None:
-                out[name] = read_depth_map(found[0])
+                out[name] = read_depth(found)
         return out
 
 

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
 from gvtools.errors import ProjectError
-from gvtools.scenes.colmap import write_depth_map
 from gvtools.scenes.colmap_model import write_colmap
+from gvtools.scenes.images import write_depth_map
 
 RECORD = "sample.json"
 

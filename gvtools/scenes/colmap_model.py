@@ -21,7 +21,7 @@ from gvtools.cameras import Cameras, rigid_transform
 from gvtools.errors import ProjectError, ShapeError
 from gvtools.scenes.faces import perspective_views
 from gvtools.scenes.photographs import rotation_findings
-from gvtools.scenes.scene import Finding, SparsePoints, natural_key
+from gvtools.scenes.scene import Finding, Scene, SparsePoints, natural_key
 from gvtools.scenes.undistort import Undistortion, undistortion
 from gvtools.untrusted import number_key, read_bytes, read_text, regular
 
@@ -381,14 +381,8 @@ def _rotation(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(square * Rotation.from_quat(quaternion).as_matrix())
 
 
-def sparse_points(
-    model: ColmapModel, views_of_image: dict[int, list[int]]
-) -> tuple[SparsePoints | None, list[Finding]]:
-    """The model's points with their tracks in the views' pinhole pixels.
-
-    Args:
-        views_of_image: for the model's image ids, the indices of their views, in the order of
-            the camera's ``views``.
+def sparse_points(model: ColmapModel, scene: Scene) -> tuple[SparsePoints | None, list[Finding]]:
+    """The model's points with their tracks in the pixels of a scene's views.
 
     Returns:
         The points ordered by id (None when the model has none), and what was dropped.
@@ -397,7 +391,8 @@ def sparse_points(
     if not len(points):
         return None, [Finding("info", "the model has no sparse points")]
     ids = np.array(sorted(points), np.uint64)
-    tracks = [_observations(model, image, views_of_image, ids=ids) for image in model.images]
+    index = {name: i for i, name in enumerate(scene.names)}
+    tracks = [_observations(model, image, scene, index=index, ids=ids) for image in model.images]
     point = np.concatenate([track[0] for track in tracks])
     view = np.concatenate([track[1] for track in tracks])
     xy = np.concatenate([track[2] for track in tracks])
@@ -437,12 +432,15 @@ def sparse_points(
 def _observations(
     model: ColmapModel,
     image: RegisteredImage,
-    views_of_image: dict[int, list[int]],
+    scene: Scene,
     *,
+    index: dict[str, int],
     ids: NDArray[np.uint64],
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float64]]:
-    """Point index, view index and pinhole pixels of all that one image saw."""
-    if image.image_id not in views_of_image:
+    """Point index, view index and pixels of all that one image saw."""
+    lenses = model.views[image.camera_id]
+    rows = [index[name] for name in (lens.name(image.name) for lens in lenses) if name in index]
+    if not rows:
         return np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros((0, 2))
     seen = model.reconstruction.images[image.image_id].get_observation_points2D()
     keys = np.fromiter((point.point3D_id for point in seen), np.uint64, len(seen))
@@ -454,11 +452,28 @@ def _observations(
             f"{model.files.folder}: {strange} detections of image {image.name} name points that "
             "points3D does not hold; expected files of one model; export the model again"
         )
-    rows = views_of_image[image.image_id]
-    places = np.stack([lens.points(xy) for lens in model.views[image.camera_id]])
+    places = np.stack(
+        [
+            _of_view(lens, scene.views[row].camera.K[0], lens.points(xy))
+            for lens, row in zip(lenses, rows, strict=True)
+        ]
+    )
     # Faces meet at their sides: the first that shows a detection takes it.
     shown = np.isfinite(places).all(-1).argmax(0)
     return point_index, np.array(rows, np.int32)[shown], places[shown, np.arange(len(xy))]
+
+
+def _of_view(
+    lens: Undistortion, K: NDArray[np.float64], xy: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """(N, 2) pixels of a model's pinhole camera as those of the view, whose picture may be scaled.
+
+    Both look along the same axes from the same place, so that the ray stays the same.
+    """
+    if np.array_equal(lens.K, K):
+        return xy
+    change = K @ np.linalg.inv(lens.K)
+    return np.asarray(xy @ change[:2, :2].T + change[:2, 2])
 
 
 def write_colmap(

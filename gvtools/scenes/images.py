@@ -6,23 +6,29 @@ turned picture would no longer fit its camera.
 
 from __future__ import annotations
 
+import re
 import struct
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from PIL import Image, UnidentifiedImageError
 
-from gvtools.errors import ProjectError
+from gvtools.errors import ProjectError, ShapeError
+from gvtools.files import replaced_when_written
 from gvtools.scenes.scene import Frame
 from gvtools.untrusted import load_array, load_arrays, open_picture, regular
 
 DEPTH_SATURATED = 65535  # "no reading" of Kinect-like 16-bit depth, besides 0
+# What a folder of pictures may hold.
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".ppm")
 OPAQUE_FROM = 128  # an alpha at or above this counts as part of the picture
 
 _EXIF_ORIENTATION = 0x0112
+# COLMAP's dense depth maps: ``width&height&channels&``, then float32 row by row.
+_COLMAP_HEAD = re.compile(rb"(\d{1,9})&(\d{1,9})&(\d{1,9})&")
 # What Pillow's decoders stumble upon in damaged files, they raise as it comes.
 UNREADABLE = (
     OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError, struct.error,
@@ -114,7 +120,8 @@ def read_depth(
     """The depth map at ``path``.
 
     Args:
-        path: 16-bit PNG, PGM or TIFF, float TIFF, ``.npy``, or ``.npz`` with the key ``depth``.
+        path: 16-bit PNG, PGM or TIFF, float TIFF, ``.npy``, ``.npz`` with the key ``depth``, or
+            COLMAP's ``.bin``.
         unit: scene units per stored unit.
         maximum: greater depths, in scene units, count as no reading.
 
@@ -122,7 +129,8 @@ def read_depth(
         (H, W) float32 z-depth, scene units; 0 where the file says 0, a negative number, NaN or
         infinity, or, in 16-bit files, 65535.
     """
-    raw = _load_array(path) if path.suffix in (".npy", ".npz") else _load_depth_image(path)
+    loaders = {".npy": _load_array, ".npz": _load_array, ".bin": _load_colmap}
+    raw = loaders.get(path.suffix, _load_depth_image)(path)
     if raw.ndim == 3 and raw.shape[-1] == 1:
         raw = raw[..., 0]
     elif raw.ndim == 3 and raw.shape[0] == 1:
@@ -171,6 +179,55 @@ def _load_array(path: Path) -> NDArray[Any]:
         raise ProjectError(f"{path}: {error.args[0]}; expected the key 'depth'") from None
     except UNREADABLE as error:
         raise _unreadable(path, error) from None
+
+
+def stored_depth_size(path: Path) -> tuple[int, int] | None:
+    """Width and height of a depth map, without its pixels; None for arrays."""
+    if path.suffix in (".npy", ".npz"):
+        return None
+    if path.suffix == ".bin":
+        return _colmap_head(path)[:2]
+    header = read_header(path)
+    if header.mode in ("L", "P", "RGB", "RGBA"):
+        raise ProjectError(f"{path}: 8-bit depth ({header.mode}); expected 16-bit grey")
+    return header.width, header.height
+
+
+def _colmap_head(path: Path) -> tuple[int, int, int]:
+    """Width, height and where the values begin of COLMAP's depth map, which has to be whole."""
+    try:
+        with regular(path).open("rb") as file:
+            head = _COLMAP_HEAD.match(file.read(64))
+        size = path.stat().st_size
+    except OSError as error:
+        raise _unreadable(path, error) from None
+    if head is None:
+        raise ProjectError(
+            f"{path}: no COLMAP depth map; expected it to start with 'width&height&1&'"
+        )
+    width, height, channels = (int(group) for group in head.groups())
+    expected = head.end() + 4 * width * height * channels
+    if channels != 1 or size != expected:
+        raise ProjectError(
+            f"{path}: {size} bytes with the head {width}x{height}x{channels}; expected {expected} "
+            "bytes and one channel; the file is truncated or damaged; compute or copy it again"
+        )
+    return width, height, head.end()
+
+
+def _load_colmap(path: Path) -> NDArray[np.float32]:
+    width, height, start = _colmap_head(path)
+    return np.fromfile(regular(path), "<f4", offset=start).reshape(height, width)
+
+
+def write_depth_map(path: Path, depth: ArrayLike) -> None:
+    """Write (H, W) z-depth, scene units, 0 = none, in COLMAP's form."""
+    values = np.asarray(depth, "<f4")
+    if values.ndim != 2:
+        raise ShapeError(f"{path}: depth of shape {values.shape}; expected (H, W)")
+    head = f"{values.shape[1]}&{values.shape[0]}&1&".encode()
+    with replaced_when_written(path) as temporary:
+        temporary.write_bytes(head + values.tobytes())
 
 
 def resize_nearest(array: NDArray[Any], width: int, height: int) -> NDArray[Any]:

@@ -47,6 +47,14 @@ def scenes_holding(root: Path, *patterns: str) -> tuple[str, ...]:
     return natural(path.relative_to(root).as_posix() for path in found)
 
 
+def given_folder(folder: Path, held: str) -> Path:
+    """The folder that the caller gave for what lies beside a project, named in the plural."""
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise ProjectError(f"{folder}: no such folder ({held} were expected there)")
+    return folder
+
+
 def pictures_in(folder: Path) -> list[Path]:
     """The folder's pictures in natural order of their names; none where it is absent."""
     if not folder.is_dir():

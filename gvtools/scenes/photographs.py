@@ -2,16 +2,17 @@
 
 A reader lists the frames that a scene should have, present on disk or not, as ``PosedFrame``. Here
 they are checked by file size and header alone, distorted cameras become pinholes, and depth of
-another camera is registered. What is missing or damaged of a data set is left out and counted, and
-intrinsics follow pictures of another size; a project of the user's own is read strictly: an
-impossible pose or camera is refused, a damaged picture an error.
+another camera is registered. What is missing is left out and counted. A data set is read as far as
+it can be: what is damaged is left out, too, and intrinsics follow pictures of another size. A
+project of the user's own is read strictly: an impossible pose or camera is refused, a damaged
+picture an error.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -30,6 +31,7 @@ from gvtools.scenes.images import (
     read_image,
     read_mask,
     same_aspect,
+    stored_depth_size,
 )
 from gvtools.scenes.matching import named
 from gvtools.scenes.scene import Finding, Frame, Scene, View, natural_key
@@ -63,9 +65,9 @@ class PosedFrame:
 
     name: str  # the view's
     image: Path  # the picture, or the file that holds it among others
-    # Of pictures of ``lens.size``; a picture of the same aspect and another size gets it scaled.
-    # None where the layout lacks it.
-    lens: LensParameters | None
+    # Of pictures of ``lens.size``; a data set's picture of the same aspect and another size gets it
+    # scaled. Or the ways to the views of one picture. None where the layout lacks it.
+    lens: LensParameters | tuple[Undistortion, ...] | None
     pose: Float64 | None  # (4, 4) or (3, 4), OpenCV axes, scene units; None where there is none
     depth: Path | None = None  # the depth map, or the file that holds it
     # To (h, w) float32 z-depth in scene units, 0 = none.
@@ -74,7 +76,7 @@ class PosedFrame:
     registration: Registration | None = None
     # None: ``image`` is a picture file. What has a reader of its own is of ``lens.size``.
     read: Callable[[Path], Frame] | None = None
-    where: str = ""  # the file of the pose, for messages
+    where: str = ""  # the place of the pose in its file, for messages
 
 
 class _LeftOut(Exception):
@@ -125,69 +127,68 @@ def posed_scene(
     findings: Sequence[Finding] = (),
     home: Path | None = None,
     unposed: str = NO_POSE,
+    advice: str = "complete the download",
 ) -> Scene:
     """The scene of the frames that can be used.
 
     Args:
         poses: which way ``PosedFrame.pose`` maps.
         metric: whether the units of poses and depth are metres.
-        home: the folder that no file of a frame may lie outside of; None: ``root``.
+        home: the folder that no file of a data set's frame may lie outside of; None: ``root``.
         unposed: reason for which frames without a pose are left out.
+        advice: where no frame can be used, what to do.
     """
     sieve = _Sieve(len(frames), strict)
     lenses: dict[LensParameters, Undistortion] = {}
-    photographs = []
+    photographs, read = list[Photograph](), list[PosedFrame]()
     for frame in sorted(frames, key=lambda item: natural_key(item.name)):
-        for path in (frame.image, frame.depth, frame.mask):
+        for path in () if strict else (frame.image, frame.depth, frame.mask):
             # A download may be kept elsewhere and linked; a name out of a file may not lead there.
             if path is not None:
                 where = f"{root}, frame {frame.name}"
                 named_file(home or root, path, where=where, follow_links=True)
         try:
             pose = _rigid(frame, sieve, unposed=unposed)
-            lens = _lens(frame, lenses, sieve)
+            views = _views(frame, lenses, sieve)
         except _LeftOut as left:
             reason, *detail = left.args
             sieve.dropped.setdefault(reason, []).append(frame.name)
             sieve.details.setdefault(reason, detail)
             continue
-        photographs.append(
-            Photograph(
-                frame.name,
-                frame.image,
-                lens,
-                pose if poses == "cam_from_world" else invert_rigid(pose),
-                sieve.present(frame.mask),
-                sieve.present(frame.depth),
-                frame.read_depth,
-                frame.registration,
-                frame.read or read_image,
-            )
-        )
-    missing = [item.name for item in photographs if item.depth is None]
+        pose = pose if poses == "cam_from_world" else invert_rigid(pose)
+        mask, depth = sieve.present(frame.mask), sieve.present(frame.depth)
+        there = replace(frame, mask=mask, depth=depth)
+        read.append(frame)
+        photographs += [Photograph(there, lens, lens.pose(pose)) for lens in views]
     report = [*findings, *sieve.findings()]
     if not photographs:
         reasons = "; ".join(item.message for item in report if item.level != "info")
         raise ProjectError(
             f"{root}: none of {len(frames)} frames can be read{reasons and f' ({reasons})'}; "
-            "expected at least one with picture and pose"
-            + ("" if strict else "; complete the download")
+            f"expected at least one with picture and pose; {advice}"
         )
-    if missing and any(frame.depth is not None for frame in frames):
-        line = f"{len(missing)} of {len(photographs)} frames have no depth map ({named(missing)})"
-        report.append(Finding("warning", line))
+    for noun, paths in (
+        ("mask", {frame.name: frame.mask for frame in read}),
+        ("depth map", {frame.name: frame.depth for frame in read}),
+    ):
+        missing = [name for name, path in paths.items() if sieve.present(path) is None]
+        if missing and any(paths.values()):
+            line = f"{len(missing)} of {len(read)} frames have no {noun} ({named(missing)})"
+            report.append(Finding("warning", line))
+    photographs.sort(key=lambda item: natural_key(item.name))
     report += lens_findings([item.lens for item in photographs])
     if strict:
-        files = [item for item in photographs if item.read is read_image]
-        report += header_findings([(item.image, item.lens.source_size) for item in files])
-    views = tuple(item.view() for item in photographs)
-    return Scene(Path(root), kind, views, None, tuple(report), metric=metric)
+        files = [item for item in photographs if item.frame.read is None]
+        report += header_findings([(item.frame.image, item.lens.source_size) for item in files])
+        report += depth_findings(photographs)
+    views_of_scene = tuple(item.view() for item in photographs)
+    return Scene(Path(root), kind, views_of_scene, None, tuple(report), metric=metric)
 
 
 def _rigid(frame: PosedFrame, sieve: _Sieve, *, unposed: str) -> Float64:
     """(4, 4), the frame's pose as it maps in its layout."""
     if sieve.present(frame.image) is None:
-        raise _LeftOut(NO_PICTURE)
+        raise _LeftOut(NO_PICTURE, *([f"expected {frame.image}"] if sieve.strict else []))
     if frame.pose is None or (np.isnan(frame.pose).any() and not sieve.strict):
         raise _LeftOut(unposed)
     if np.isinf(frame.pose).any():
@@ -202,12 +203,14 @@ def _rigid(frame: PosedFrame, sieve: _Sieve, *, unposed: str) -> Float64:
     return rigid
 
 
-def _lens(
+def _views(
     frame: PosedFrame, lenses: dict[LensParameters, Undistortion], sieve: _Sieve
-) -> Undistortion:
-    """The frame's way to a pinhole camera; ``lenses`` is added to."""
+) -> tuple[Undistortion, ...]:
+    """The frame's ways to pinhole cameras; ``lenses`` is added to."""
     if frame.lens is None:
         raise _LeftOut(NO_LENS)
+    if not isinstance(frame.lens, LensParameters):
+        return frame.lens
     size = frame.lens.size
     if frame.read is None and not sieve.strict:
         try:
@@ -226,7 +229,7 @@ def _lens(
         if params not in lenses:
             what = str(frame.image) if sieve.strict else frame.name
             lenses[params] = undistortion(params.model, params.values, size, what=what)
-        return lenses[params]
+        return (lenses[params],)
     except ProjectError as error:
         if sieve.strict:
             raise
@@ -249,18 +252,16 @@ def first_size(pictures: Iterable[Path]) -> tuple[int, int] | None:
 
 @dataclass(frozen=True, eq=False)
 class Photograph:
-    """One picture on disk, its mask and its depth, of one recorded camera (or a depth camera)."""
+    """One view of a frame whose files are there."""
 
-    name: str  # the view's
-    image: Path
+    frame: PosedFrame
     lens: Undistortion  # from the recorded camera to the view's
-    cam_from_world: NDArray[np.float64]  # (4, 4), rigid
-    mask: Path | None = None  # black = ignore
-    depth: Path | None = None
-    # To (h, w) float32 z-depth in scene units, 0 = none.
-    read_depth: Callable[[Path], Depth] | None = None
-    registration: Registration | None = None
-    read: Callable[[Path], Frame] = read_image  # ``image`` may hold many pictures
+    cam_from_world: Float64  # (4, 4), rigid, of the view
+
+    @property
+    def name(self) -> str:
+        """The view's name."""
+        return self.lens.name(self.frame.name)
 
     def view(self) -> View:
         """The photograph as a view that loads lazily."""
@@ -272,57 +273,44 @@ class Photograph:
             np.array([height]),
             (self.name,),
         )
-        paths = (path for path in (self.image, self.mask, self.depth) if path is not None)
-        files = tuple(dict.fromkeys(paths))
-        return View(self.name, camera, self.load, self.depth is not None, files)
+        paths = (self.frame.image, self.frame.mask, self.frame.depth)
+        files = tuple(dict.fromkeys(path for path in paths if path is not None))
+        return View(self.name, camera, self.load, self.frame.depth is not None, files)
 
     def load(self) -> Frame:
         """The pixels in the pinhole camera."""
-        picture = self.read(self.image)
-        check_size(picture.rgb.shape[1::-1], self.lens.source_size, path=self.image)
-        masks = [] if picture.mask is None else [self.lens.nearest(picture.mask)]
-        if self.mask is not None:
-            mask = read_mask(self.mask)
-            check_size(mask.shape[::-1], self.lens.source_size, path=self.mask)
-            masks.append(self.lens.nearest(mask))
-        if self.lens.inside is not None:
-            masks.append(self.lens.inside)
+        frame, lens = self.frame, self.lens
+        picture = (frame.read or read_image)(frame.image)
+        check_size(picture.rgb.shape[1::-1], lens.source_size, path=frame.image)
+        masks = [] if picture.mask is None else [lens.nearest(picture.mask)]
+        if frame.mask is not None:
+            mask = read_mask(frame.mask)
+            check_size(mask.shape[::-1], lens.source_size, path=frame.mask)
+            masks.append(lens.nearest(mask))
+        if lens.inside is not None:
+            masks.append(lens.inside)
         usable = np.all(masks, axis=0) if masks else None
-        return Frame(self.lens.image(picture.rgb), self._depth(), usable)
+        return Frame(lens.image(picture.rgb), self._depth(), usable)
 
     def _depth(self) -> Depth | None:
-        if self.depth is None or self.read_depth is None:
+        frame, lens = self.frame, self.lens
+        if frame.depth is None:
             return None
-        depth = self.read_depth(self.depth)
-        if self.registration is None:
-            depth = fit_depth(depth, *self.lens.source_size, path=self.depth)
-            return np.ascontiguousarray(self.lens.depth(depth))
+        depth = frame.read_depth(frame.depth)
+        if frame.registration is None:
+            depth = fit_depth(depth, *lens.source_size, path=frame.depth)
+            return np.ascontiguousarray(lens.depth(depth))
         from gvtools.scenes.registration import register_depth
 
-        width, height = self.lens.size
+        width, height = lens.size
         return register_depth(
             depth,
-            self.registration.depth_K,
-            self.lens.K,
-            color_from_depth=self.registration.color_from_depth,
+            frame.registration.depth_K,
+            lens.K,
+            color_from_depth=frame.registration.color_from_depth,
             width=width,
             height=height,
         )
-
-
-def given_folder(folder: Path, held: str) -> Path:
-    """The folder that the caller gave for what lies beside pictures, named in the plural."""
-    folder = Path(folder)
-    if not folder.is_dir():
-        raise ProjectError(f"{folder}: no such folder ({held} were expected there)")
-    return folder
-
-
-def mask_findings(unmasked: int, folder: Path | None) -> list[Finding]:
-    """A warning when some views have no mask in the folder of masks."""
-    if folder is None or not unmasked:
-        return []
-    return [Finding("warning", f"{unmasked} views have no mask in {folder.name}")]
 
 
 def header_findings(pictures: Sequence[tuple[Path, tuple[int, int]]]) -> list[Finding]:
@@ -360,19 +348,21 @@ def conversion_findings(headers: Sequence[ImageHeader]) -> list[Finding]:
     return [Finding("info", f"{count} pictures {kind}") for kind, count in kinds.items()]
 
 
-def depth_findings(
-    depths: Sequence[tuple[Path, tuple[int, int]]], size_of: Callable[[Path], tuple[int, int]]
-) -> list[Finding]:
+def depth_findings(photographs: Sequence[Photograph]) -> list[Finding]:
     """An error for each unreadable depth map or other aspect, and a line a size that differs.
 
-    Each file comes with the width and height of its picture; ``size_of`` reads a map's own and
-    raises ProjectError. None is decoded.
+    None is decoded. Maps of a depth camera of its own, which may be of any size, are not looked at.
     """
     findings: list[Finding] = []
     resized: Counter[str] = Counter()
-    for path, expected in depths:
+    maps = {
+        item.frame.depth: item.lens.source_size
+        for item in photographs
+        if item.frame.depth is not None and item.frame.registration is None
+    }
+    for path, expected in maps.items():
         try:
-            found = size_of(path)
+            found = stored_depth_size(path) or expected
         except ProjectError as error:
             findings.append(Finding("error", str(error)))
             continue

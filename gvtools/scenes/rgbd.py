@@ -39,7 +39,7 @@ from gvtools.scenes.calibration import (
     pinhole,
     sensor_default,
 )
-from gvtools.scenes.images import read_depth, read_header
+from gvtools.scenes.images import read_depth
 from gvtools.scenes.layout import Layout
 from gvtools.scenes.matching import (
     associate,
@@ -53,7 +53,6 @@ from gvtools.scenes.photographs import (
     NO_POSE,
     PosedFrame,
     Registration,
-    depth_findings,
     first_size,
     posed_scene,
 )
@@ -492,18 +491,16 @@ def rgbd_scene(
         strict=strict,
         findings=recording.findings,
         unposed=recording.unposed,
+        advice="give its pictures and poses",
     )
     findings = [*scene.findings, *_principal_point_findings(K, lens.size)]
-    measured = {view.name for view in scene if view.has_depth}
-    if not measured:
+    if not any(view.has_depth for view in scene):
         findings.append(Finding("warning", f"none of {len(scene)} frames has a depth map"))
     else:
         findings.append(Finding("info", f"depth unit: {unit:.6g} m"))
         if registration is not None:
             findings.append(Finding("info", "depth is registered into the colour camera"))
         elif strict:
-            maps = [item.depth for item in frames if item.name in measured and item.depth]
-            findings += depth_findings([(path, lens.size) for path in maps], _depth_size)
             line = "depth is taken as seen by the colour camera (no depth_K)"
             findings.append(Finding("info", line))
     return replace(scene, findings=tuple(findings))
@@ -559,10 +556,3 @@ def _principal_point_findings(K: Float64, size: tuple[int, int]) -> list[Finding
             f"{size[0]}x{size[1]} pixels: are the intrinsics of another size?",
         )
     ]
-
-
-def _depth_size(path: Path) -> tuple[int, int]:
-    header = read_header(path)
-    if header.mode in ("L", "P", "RGB", "RGBA"):
-        raise ProjectError(f"{path}: 8-bit depth ({header.mode}); expected 16-bit grey")
-    return header.width, header.height

@@ -21,24 +21,17 @@ from pydantic import BaseModel, Field, ValidationError
 from gvtools.cameras import Cameras, invert_rigid, rigid_transform
 from gvtools.errors import ProjectError
 from gvtools.files import write_text
+from gvtools.scenes.calibration import OPENCV_FROM_OPENGL, Float64, finite_array, opencv_pose
 from gvtools.scenes.faces import PANORAMA, perspective_views
 from gvtools.scenes.images import read_depth, read_header
-from gvtools.scenes.matching import named
-from gvtools.scenes.photographs import (
-    Photograph,
-    given_folder,
-    header_findings,
-    lens_findings,
-    mask_findings,
-    rotation_findings,
-)
-from gvtools.scenes.scene import Finding, Scene, natural_key
+from gvtools.scenes.matching import given_folder
+from gvtools.scenes.photographs import PosedFrame, posed_scene
+from gvtools.scenes.scene import Scene, natural_key
 from gvtools.scenes.undistort import LensParameters, Undistortion
-from gvtools.untrusted import named_file, read_json
+from gvtools.untrusted import is_file, named_file, read_json
 
 FILE = "transforms.json"
 EXPORTER = "gvtools"  # the value of ``exported_by`` in files written here
-OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 GUESSED_SUFFIXES = (".png", ".jpg", ".jpeg")  # Blender's files name pictures without a suffix
 
 # nerfstudio's names; the fisheye ones share one model, the others the polynomial one.
@@ -74,83 +67,71 @@ def read_transforms(path: Path, *, images: Path | None = None, masks: Path | Non
     path = Path(path)
     path = path / FILE if path.is_dir() else path
     data = load_frames(path)
-    frames = data["frames"]
-    findings: list[Finding] = []
-    files = [_picture(path.parent, frame, f"{path}, frame {i}") for i, frame in enumerate(frames)]
+    files = _pictures(path, data["frames"])
     names = _names(files)
     masks = None if masks is None else given_folder(masks, "masks")
     home = path.parent
     if images is not None:
-        if not Path(images).is_dir():
-            raise ProjectError(f"{images}: no such image folder")
-        home = Path(images)
+        home = given_folder(images, "images")
         files = [home / name for name in names]
-    for i, file in enumerate(files):
+    cameras: dict[LensParameters, tuple[Undistortion, ...]] = {}
+    frames = []
+    for i, (entry, name, file) in enumerate(zip(data["frames"], names, files, strict=True)):
         named_file(home, file, where=f"{path}, frame {i}")
-    photographs, absent, defects = _photographs(path, data, list(zip(names, files, strict=True)),
-                                                masks=masks, findings=findings)  # fmt: skip
-    if not photographs:
-        raise ProjectError(
-            f"{path}: none of the pictures of its {len(frames)} frames is on disk (looked for "
-            f"{named([str(file) for file in files])}); expected them there; give their folder with "
-            "--images"
-        )
-    if absent:
-        message = f"{len(absent)} of {len(frames)} frames are absent on disk: {named(absent)}"
-        findings.append(Finding("warning", message))
-    photographs.sort(key=lambda item: natural_key(item.name))
-    findings += rotation_findings(defects)
-    findings += lens_findings([item.lens for item in photographs])
-    findings += header_findings([(item.image, item.lens.source_size) for item in photographs])
-    views = tuple(item.view() for item in photographs)
-    return Scene(path.parent, "transforms", views, None, tuple(findings), metric=False)
-
-
-def _photographs(
-    path: Path,
-    data: dict[str, Any],
-    files: list[tuple[str, Path]],
-    *,
-    masks: Path | None,
-    findings: list[Finding],
-) -> tuple[list[Photograph], list[str], list[float]]:
-    """Photographs of the frames on disk, names of the others, and defects of the rotations.
-
-    ``files`` holds each frame's name and picture; ``findings`` is added to.
-    """
-    lenses: dict[LensParameters, tuple[Undistortion, ...]] = {}
-    photographs, absent, defects, unmasked = list[Photograph](), [], [], 0
-    for i, (frame, (name, file)) in enumerate(zip(data["frames"], files, strict=True)):
-        what = f"{path}, frame {i} ({name})"
-        if not os.path.isfile(file):
-            absent.append(name)
+        if not is_file(file):
+            frames.append(PosedFrame(name, file, None, None))
             continue
-        keys = frame_keys(frame, data, what=what)
-        cam_from_world, defect = _pose(keys, what)
-        defects.append(defect)
-        views = _views(keys, file, lenses, what=what)
-        mask = _beside(path.parent, keys.mask_path, what)
-        depth = _beside(path.parent, keys.depth_file_path, what)
-        lost = [item.name for item in (mask, depth) if item and not os.path.isfile(item)]
-        if lost:
-            findings.append(Finding("warning", f"{what}: {', '.join(lost)} is absent on disk"))
-        if mask is None and masks is not None:
-            mask = masks / f"{name}.png"
-            unmasked += not os.path.isfile(mask)
-        photographs += [
-            Photograph(
-                lens.name(name),
+        what = f"{path}, frame {i} ({name})"
+        keys = frame_keys(entry, data, what=what)
+        mask = None if masks is None else masks / f"{name}.png"
+        if keys.mask_path:
+            mask = named_file(path.parent, keys.mask_path, where=what)
+        depth = keys.depth_file_path
+        frames.append(
+            PosedFrame(
+                name,
                 file,
-                lens,
-                lens.pose(cam_from_world),
-                mask if mask and os.path.isfile(mask) else None,
-                depth if depth and os.path.isfile(depth) else None,
+                _views(keys, file, cameras, what=what),
+                _pose(keys, what),
+                named_file(path.parent, depth, where=what) if depth else None,
                 partial(read_depth, unit=keys.depth_unit_scale_factor),
+                mask,
+                where=what,
             )
-            for lens in views
-        ]
-    findings += mask_findings(unmasked, masks)
-    return photographs, absent, defects
+        )
+    return posed_scene(
+        path.parent,
+        frames,
+        poses="world_from_cam",
+        metric=False,
+        kind="transforms",
+        strict=True,
+        advice="give their folder with --images",
+    )
+
+
+def transforms_frames(
+    path: Path, home: Path, *, lists: tuple[str, ...] = ("frames",)
+) -> list[PosedFrame]:
+    """Frames of a data set's ``transforms.json`` whose pictures lie in ``home``, world_from_cam.
+
+    ``lists`` name the lists of frames that are read.
+    """
+    data = load_frames(path)
+    frames = []
+    for key in lists:
+        entries = data.get(key) or []
+        if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+            raise ProjectError(f"{path}: {key} is no list of frames; download it again")
+        for i, entry in enumerate(entries):
+            what = f"{path}, {key} {i}"
+            picture = home / _file_path(entry, what).rpartition("/")[2]
+            keys = frame_keys(entry, data, what=what)
+            pose = finite_array(keys.transform_matrix, 4, 4)
+            pose = None if pose is None else opencv_pose(pose)
+            lens = keys.lens(picture, what=what)
+            frames.append(PosedFrame(picture.name, picture, lens, pose, where=what))
+    return frames
 
 
 def read_transforms_cameras(path: Path) -> Cameras:
@@ -163,17 +144,15 @@ def read_transforms_cameras(path: Path) -> Cameras:
         has.
     """
     data = load_frames(path)
-    frames = data["frames"]
-    files = [_picture(path.parent, frame, f"{path}, frame {i}") for i, frame in enumerate(frames)]
-    names = _names(files)
-    lenses: dict[LensParameters, tuple[Undistortion, ...]] = {}
+    files = _pictures(path, data["frames"])
+    cameras: dict[LensParameters, tuple[Undistortion, ...]] = {}
     found = []
-    for i, frame in enumerate(frames):
-        what = f"{path}, frame {i} ({names[i]})"
-        keys = frame_keys(frame, data, what=what)
-        pose = _pose(keys, what)[0]
-        for lens in _views(keys, files[i], lenses, what=what):
-            found.append((lens.name(names[i]), lens.K, lens.pose(pose), *lens.size))
+    for i, (entry, name, file) in enumerate(zip(data["frames"], _names(files), files, strict=True)):
+        what = f"{path}, frame {i} ({name})"
+        keys = frame_keys(entry, data, what=what)
+        pose = invert_rigid(rigid_transform(_pose(keys, what), what=what)[0])
+        for lens in _views(keys, file, cameras, what=what):
+            found.append((lens.name(name), lens.K, lens.pose(pose), *lens.size))
     found.sort(key=lambda camera: natural_key(camera[0]))
     seen, K, poses, width, height = zip(*found, strict=True)
     return Cameras(np.array(K), np.array(poses), np.array(width), np.array(height), seen)
@@ -244,18 +223,23 @@ def load_frames(path: Path) -> dict[str, Any]:
     return data
 
 
-def _picture(folder: Path, frame: dict[str, Any], what: str) -> Path:
+def _file_path(frame: Mapping[str, Any], what: str) -> str:
     name = frame.get("file_path")
-    if not isinstance(name, str) or not name:
-        raise ProjectError(f"{what}: no file_path; expected the picture's path")
-    file = Path(os.path.normpath(folder / name.replace("\\", "/")))
-    if not file.name:
+    if not isinstance(name, str) or not os.path.basename(os.path.normpath(name)).strip("./"):
         raise ProjectError(f"{what}: file_path is {name!r}; expected the picture's path")
-    # Unlike Path.is_file, this takes names that no file can have for absent ones.
-    if os.path.isfile(file) or file.suffix.lower() in GUESSED_SUFFIXES:
-        return file
-    guesses = [file.with_name(file.name + suffix) for suffix in GUESSED_SUFFIXES]
-    return next((guess for guess in guesses if os.path.isfile(guess)), guesses[0])
+    return name.replace("\\", "/")
+
+
+def _pictures(path: Path, frames: Sequence[Mapping[str, Any]]) -> list[Path]:
+    """The pictures that frames name, on disk or not."""
+    files = []
+    for i, frame in enumerate(frames):
+        file = Path(os.path.normpath(path.parent / _file_path(frame, f"{path}, frame {i}")))
+        if not is_file(file) and file.suffix.lower() not in GUESSED_SUFFIXES:
+            guesses = [file.with_name(file.name + suffix) for suffix in GUESSED_SUFFIXES]
+            file = next((guess for guess in guesses if is_file(guess)), guesses[0])
+        files.append(file)
+    return files
 
 
 def _names(files: Sequence[Path]) -> list[str]:
@@ -266,10 +250,15 @@ def _names(files: Sequence[Path]) -> list[str]:
     return [file.relative_to(shared).as_posix() for file in whole]
 
 
-def _pose(keys: FrameKeys, what: str) -> tuple[np.ndarray, float]:
-    """(4, 4) cam_from_world with OpenCV axes, and how far the rotation was off."""
-    pose, defect = rigid_transform(_matrix(keys.transform_matrix, what), what=what)
-    return invert_rigid(pose @ OPENCV_FROM_OPENGL), defect
+def _pose(keys: FrameKeys, what: str) -> Float64:
+    """world_from_cam with OpenCV axes, of any shape and as the file has it otherwise."""
+    if keys.transform_matrix is None:
+        raise ProjectError(f"{what}: no transform_matrix; expected a 4x4 pose")
+    try:
+        pose = np.array(keys.transform_matrix, np.float64)
+    except (OverflowError, TypeError, ValueError):
+        raise ProjectError(f"{what}: transform_matrix is no matrix; expected 4x4 numbers") from None
+    return pose * np.diag(OPENCV_FROM_OPENGL) if pose.shape[-1:] == (4,) else pose
 
 
 def _views(
@@ -284,20 +273,6 @@ def _views(
     if params not in lenses:
         lenses[params] = perspective_views(params.model, params.values, params.size, what=what)
     return lenses[params]
-
-
-def _matrix(value: Any, what: str) -> np.ndarray:
-    if value is None:
-        raise ProjectError(f"{what}: no transform_matrix; expected a 4x4 pose")
-    try:
-        return np.array(value, np.float64)
-    except (OverflowError, TypeError, ValueError):
-        raise ProjectError(f"{what}: transform_matrix is no matrix; expected 4x4 numbers") from None
-
-
-def _beside(folder: Path, name: str | None, what: str) -> Path | None:
-    """The file that a frame names, on disk or not; None when it names none."""
-    return named_file(folder, name, where=what) if name else None
 
 
 class FrameKeys(BaseModel):

@@ -18,7 +18,8 @@ from gvtools.depth.scale import disagrees, scale_to_points
 from gvtools.depth.source import DepthMap, MixedDepth, RecordedDepth, is_recorded
 from gvtools.depth.stereo.plane_sweep import PlaneSweepStereo
 from gvtools.errors import CheckpointError, DegenerateError, OptionError, ProjectError
-from gvtools.scenes.colmap import read_colmap, write_depth_map
+from gvtools.scenes.colmap import read_colmap
+from gvtools.scenes.images import write_depth_map
 from gvtools.scenes.rgbd import SEVENSCENES
 from gvtools.scenes.scene import Frame, Scene, SparsePoints, View
 from pipelines.cli import main

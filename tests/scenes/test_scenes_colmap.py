@@ -6,7 +6,8 @@ import pytest
 from scenes_workspace import HEIGHT, LENSES, WIDTH, ramp, save, workspace
 
 from gvtools.errors import ProjectError
-from gvtools.scenes.colmap import read_colmap, write_depth_map
+from gvtools.scenes.colmap import read_colmap
+from gvtools.scenes.images import write_depth_map
 from gvtools.scenes.inspection import reprojection_errors
 from gvtools.scenes.project import open_as, open_project
 
@@ -86,7 +87,7 @@ def test_unused_cameras_absent_and_unregistered_images_are_reported(tmp_path):
     assert len(scene) == 3
     messages = " | ".join(finding.message for finding in scene.findings)
     assert "1 cameras of the model are used by no image" in messages
-    assert "1 of 4 registered images are absent on disk" in messages
+    assert "1 of 4 frames have no picture: dropped" in messages
     assert "4 of 5 pictures registered" in messages
     assert "40 track elements belong to views that are not read" in messages
     assert reprojection_errors(scene).max() < 1e-3
@@ -139,8 +140,8 @@ def test_mask_and_depth_go_through_the_mapping_of_the_image(tmp_path, model):
     sure = np.abs(frame.rgb[..., 1].astype(int) - 127) > 255 / HEIGHT + 1
     np.testing.assert_array_equal(frame.mask[sure], frame.rgb[..., 1][sure] > 127)
     messages = " | ".join(finding.message for finding in scene.findings)
-    assert "depth maps: 1 geometric, 3 none" in messages
-    assert "3 views have no mask" in messages
+    assert "depth maps: 1 geometric" in messages
+    assert "3 of 4 frames have no mask" in messages
 
 
 def test_depth_maps_of_another_size_are_taken_at_the_same_aspect_alone(tmp_path):

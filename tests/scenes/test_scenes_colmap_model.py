@@ -11,8 +11,9 @@ from scenes_workspace import workspace
 
 from gvtools.cameras import Cameras
 from gvtools.errors import GvError, ProjectError, ShapeError
-from gvtools.scenes.colmap import depth_map_size, read_colmap, read_depth_map, write_depth_map
+from gvtools.scenes.colmap import read_colmap
 from gvtools.scenes.colmap_model import write_colmap
+from gvtools.scenes.images import read_depth, stored_depth_size, write_depth_map
 
 VIEWS, POINTS = 5, 60
 
@@ -177,7 +178,10 @@ def test_no_picture_on_disk(tmp_path):
     workspace(tmp_path)
     for path in (tmp_path / "images").iterdir():
         path.unlink()
-    with pytest.raises(ProjectError, match="none of the model's 4 registered images"):
+    with pytest.raises(
+        ProjectError,
+        match=r"none of 4 frames .* have no picture.* --images",
+    ):
         read_colmap(tmp_path)
 
 
@@ -189,21 +193,21 @@ def test_depth_map_round_trip_is_what_pycolmap_reads(tmp_path):
     peer = pycolmap.DepthMap()
     peer.read(tmp_path / "deep" / "a.bin")
     np.testing.assert_array_equal(peer.to_array(), depth)
-    np.testing.assert_array_equal(read_depth_map(tmp_path / "deep" / "a.bin"), depth)
-    assert depth_map_size(tmp_path / "deep" / "a.bin") == (11, 7)
+    np.testing.assert_array_equal(read_depth(tmp_path / "deep" / "a.bin"), depth)
+    assert stored_depth_size(tmp_path / "deep" / "a.bin") == (11, 7)
     pycolmap.DepthMap.from_array(depth, 0, 10).write(tmp_path / "b.bin")
-    np.testing.assert_array_equal(read_depth_map(tmp_path / "b.bin"), depth)
+    np.testing.assert_array_equal(read_depth(tmp_path / "b.bin"), depth)
 
 
 def test_depth_map_without_readings_and_damaged_ones(tmp_path):
     path = tmp_path / "a.bin"
     write_depth_map(path, [[1, -1, np.nan, np.inf, 0]])
-    np.testing.assert_array_equal(read_depth_map(path), [[1, 0, 0, 0, 0]])
+    np.testing.assert_array_equal(read_depth(path), [[1, 0, 0, 0, 0]])
     data = path.read_bytes()
     for damaged in (data[:-1], data + b"\0", b"9999999&9999999&1&", b"nothing", b""):
         path.write_bytes(damaged)
         with pytest.raises(ProjectError) as error:
-            read_depth_map(path)
+            read_depth(path)
         assert "a.bin" in one_line(error)
 
 

@@ -25,7 +25,6 @@ from scenes_workspace import (
 from gvtools.cameras import Cameras
 from gvtools.errors import GvError, ProjectError
 from gvtools.scenes.colmap import read_colmap
-from gvtools.scenes.scene import Finding
 from gvtools.scenes.transforms import read_transforms, write_transforms
 from pipelines.cli import main
 
@@ -122,10 +121,11 @@ def test_absent_frames_masks_and_depth_are_reported(tmp_path):
     frames = [frame(mask_path="m.png", depth_file_path="d.png"), frame("images/b.png")]
     scene = read_transforms(transforms(tmp_path, frames, **PINHOLE))
     assert len(scene) == 1
-    assert "1 of 2 frames are absent on disk: b.png" in messages(scene)
-    assert "m.png, d.png is absent on disk" in messages(scene)
+    assert "1 of 2 frames have no picture: dropped (b.png; expected " in messages(scene)
+    assert "1 of 1 frames have no mask (a.png)" in messages(scene)
+    assert "1 of 1 frames have no depth map (a.png)" in messages(scene)
     (tmp_path / "images/a.png").unlink()
-    with pytest.raises(ProjectError, match="none of the pictures of its 2 frames"):
+    with pytest.raises(ProjectError, match=r"none of 2 frames .* have no picture.* --images"):
         read_transforms(tmp_path)
 
 
@@ -154,7 +154,7 @@ def test_masks_are_given_and_missed_as_those_of_colmap(tmp_path):
     for image in list(reconstruction.images.values())[2:]:
         save(tmp_path / "ignore" / f"{image.name}.png", black)
     for found in (scene, read_colmap(tmp_path / "colmap", masks=tmp_path / "ignore")):
-        assert Finding("warning", "2 views have no mask in ignore") in found.findings
+        assert any("2 of 4 frames have no mask" in message for message in found.findings)
     for read in (read_transforms, read_colmap):
         root = tmp_path / "colmap" if read is read_colmap else path
         with pytest.raises(ProjectError, match=r"no such folder \(masks were expected there\)"):
@@ -243,14 +243,14 @@ def test_whole_numbers_may_be_written_as_floats(tmp_path):
 @pytest.mark.parametrize("name", ["/", "images/" + "a" * 5000, "a\0b.png"], ids=reprlib.repr)
 def test_paths_that_no_file_has_are_absent_or_refused(tmp_path, name):
     save(tmp_path / "images/a.png", ramp())
-    with pytest.raises(ProjectError, match=r"file_path|none of the pictures|names the file"):
+    with pytest.raises(ProjectError, match=r"file_path|none of 1 frames|names the file"):
         read_transforms(transforms(tmp_path, [frame(name)], **PINHOLE))
     if "\0" in name:
         with pytest.raises(ProjectError, match="names the file"):
             read_transforms(transforms(tmp_path, [frame(mask_path=name)], **PINHOLE))
     elif name != "/":
         scene = read_transforms(transforms(tmp_path, [frame(mask_path=name)], **PINHOLE))
-        assert "is absent on disk" in messages(scene)
+        assert "1 of 1 frames have no mask" in messages(scene)
 
 
 def test_absolute_and_relative_pictures_may_be_mixed(tmp_path, monkeypatch):

@@ -8,7 +8,7 @@ these say. A scene is read from its largest pictures; ``SCENE/images_4`` asks fo
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -18,19 +18,17 @@ import numpy as np
 from gvtools.errors import ProjectError
 from gvtools.scenes.calibration import (
     MILLIMETRES,
-    OPENCV_FROM_OPENGL,
-    Float64,
     finite_array,
     json_file,
     pinhole_lens,
 )
+from gvtools.scenes.colmap import colmap_frames, colmap_scene, model_in
 from gvtools.scenes.colmap_model import (
     ColmapModel,
     RegisteredImage,
     find_model,
     has_model,
     load_model,
-    sparse_points,
 )
 from gvtools.scenes.images import read_depth, readings
 from gvtools.scenes.layout import Layout
@@ -41,126 +39,13 @@ from gvtools.scenes.matching import (
     scenes_holding,
 )
 from gvtools.scenes.photographs import Depth, PosedFrame, first_size, posed_scene
-from gvtools.scenes.scene import Finding, Scene, SparsePoints
+from gvtools.scenes.scene import Finding, Scene
 from gvtools.scenes.transforms import FILE as TRANSFORMS
-from gvtools.scenes.transforms import frame_keys, load_frames
-from gvtools.scenes.undistort import LensParameters, Undistortion
+from gvtools.scenes.transforms import transforms_frames
+from gvtools.scenes.undistort import Undistortion
 from gvtools.untrusted import is_file, load_array, regular
 
 FULL = "images"
-
-
-# --- COLMAP models ----------------------------------------------------------------------------
-
-
-def colmap_frames(
-    model: ColmapModel, picture_of: Callable[[RegisteredImage], Path]
-) -> list[PosedFrame]:
-    """The model's images as frames, named as the model names them."""
-    cameras = {key: model.reconstruction.cameras[key] for key in model.lenses}
-    lenses = {
-        key: LensParameters(
-            camera.model_name,
-            tuple(float(value) for value in camera.params),
-            (int(camera.width), int(camera.height)),
-        )
-        for key, camera in cameras.items()
-    }
-    return [
-        PosedFrame(image.name, picture_of(image), lenses[image.camera_id], image.cam_from_world)
-        for image in model.images
-    ]
-
-
-def colmap_scene(
-    root: Path, model: ColmapModel, frames: list[PosedFrame], *, metric: bool = False
-) -> Scene:
-    """The scene of a model's frames with its sparse points, detections in the views' pixels.
-
-    Frames are named as the model names its images; not every one has to be there.
-    """
-    scene = posed_scene(
-        root,
-        frames,
-        poses="cam_from_world",
-        metric=metric,
-        kind="colmap",
-        findings=model.findings,
-    )
-    index = {name: i for i, name in enumerate(scene.names)}
-    views_of_image = {
-        image.image_id: [index[image.name]] for image in model.images if image.name in index
-    }
-    points, findings = sparse_points(model, views_of_image)
-    if points is not None:
-        points = _moved_detections(points, model, scene)
-    return replace(scene, points=points, findings=(*scene.findings, *findings))
-
-
-def _moved_detections(points: SparsePoints, model: ColmapModel, scene: Scene) -> SparsePoints:
-    """Detections moved from the pinholes of the model's cameras to those of the views.
-
-    Both look along the same axes from the same place, so that the ray stays the same.
-    """
-    camera_of = {image.name: image.camera_id for image in model.images}
-    change = np.stack(
-        [
-            view.camera.K[0] @ np.linalg.inv(model.lenses[camera_of[view.name]].K)
-            for view in scene.views
-        ]
-    )[points.view_index]
-    flat = np.concatenate([points.xy, np.ones((len(points.xy), 1))], axis=1)
-    xy = np.einsum("nij,nj->ni", change, flat)
-    if not np.isfinite(xy).all():
-        raise ProjectError(
-            f"{model.files.folder}: detections and cameras that do not belong together; download "
-            "the model again"
-        )
-    return replace(points, xy=xy[:, :2])
-
-
-def model_in(folder: Path) -> ColmapModel:
-    """The COLMAP model of a folder."""
-    found = find_model(folder)
-    if found is None:
-        raise ProjectError(
-            f"{folder}: no COLMAP model; expected cameras.bin or cameras.txt in sparse/0, sparse "
-            "or the folder itself; complete the download"
-        )
-    return load_model(found)
-
-
-# --- files of nerfstudio ----------------------------------------------------------------------
-
-
-def nerfstudio_frames(
-    file: Path, home: Path, *, keys: tuple[str, ...] = ("frames",)
-) -> list[PosedFrame]:
-    """Frames of a ``transforms.json`` whose pictures lie in ``home``, poses world_from_cam.
-
-    ``keys`` name the lists of frames that are read.
-    """
-    data = load_frames(file)
-    frames = []
-    for key in keys:
-        listed = data.get(key) or []
-        if not isinstance(listed, list) or not all(isinstance(frame, dict) for frame in listed):
-            raise ProjectError(f"{file}: {key} is no list of frames; download it again")
-        for i, frame in enumerate(listed):
-            what = f"{file}, {key} {i}"
-            name = frame.get("file_path")
-            if not isinstance(name, str) or not name:
-                raise ProjectError(f"{what}: no file_path; expected the picture's path")
-            path = home / name.replace("\\", "/").rpartition("/")[2]
-            values = frame_keys(frame, data, what=what)
-            try:
-                pose: Float64 | None = np.array(values.transform_matrix, np.float64)
-            except (OverflowError, TypeError, ValueError):
-                pose = None
-            if pose is not None:
-                pose = pose @ OPENCV_FROM_OPENGL if pose.shape == (4, 4) else None
-            frames.append(PosedFrame(path.name, path, values.lens(path, what=what), pose))
-    return frames
 
 
 # --- folders of reduced copies: ``images``, ``images_2``, ``images_4`` ------------------------
@@ -223,7 +108,7 @@ def _read_mipnerf360(root: Path, scene: str) -> Scene:
         exact = pictures / image.name
         return exact if is_file(exact) else by_stem.get(Path(image.name).stem, exact)
 
-    return colmap_scene(folder, model, colmap_frames(model, picture_of))
+    return colmap_scene(folder, model, colmap_frames(model, picture_of, scaled=True))
 
 
 MIPNERF360 = Layout(
@@ -324,14 +209,14 @@ def _read_dl3dv(root: Path, scene: str) -> Scene:
     folder, pictures = chosen_folder(root, scene, inside=inside)
     file = folder / inside / TRANSFORMS
     if file.is_file():
-        frames = nerfstudio_frames(file, pictures)
+        frames = transforms_frames(file, pictures)
         return posed_scene(folder, frames, poses="world_from_cam", metric=False)
     if find_model(folder) is None:
         raise ProjectError(
             f"{folder}: neither {TRANSFORMS} nor a COLMAP model; complete the download"
         )
     model = model_in(folder)
-    frames = colmap_frames(model, lambda image: pictures / Path(image.name).name)
+    frames = colmap_frames(model, lambda image: pictures / Path(image.name).name, scaled=True)
     return colmap_scene(folder, model, frames)
 
 
@@ -367,7 +252,7 @@ def _read_eth3d(root: Path, scene: str) -> Scene:
             model = undistorted
     if model is None:
         raise ProjectError(f"{folder}: neither {UNDISTORTED} nor {ORIGINAL}; complete the download")
-    frames = colmap_frames(model, lambda image: home / image.name)
+    frames = colmap_frames(model, lambda image: home / image.name, scaled=True)
     findings = []
     if maps.is_dir() and original is None:
         line = f"depth is of the original pictures and needs {ORIGINAL}, which is absent"
@@ -455,9 +340,9 @@ def _read_dslr(folder: Path) -> Scene:
     lenses, depths = {}, folder / "render_depth"
     if undistorted:
         keys = ("frames", "test_frames")
-        lenses = {frame.name: frame.lens for frame in nerfstudio_frames(cameras, home, keys=keys)}
+        lenses = {frame.name: frame.lens for frame in transforms_frames(cameras, home, lists=keys)}
     frames = []
-    for frame in colmap_frames(model, lambda image: home / Path(image.name).name):
+    for frame in colmap_frames(model, lambda image: home / Path(image.name).name, scaled=True):
         png = f"{Path(frame.name).stem}.png"
         if undistorted:
             # Poses stay those of COLMAP: a pinhole looks along the fisheye camera's own axes.
@@ -465,7 +350,7 @@ def _read_dslr(folder: Path) -> Scene:
         elif depths.is_dir():
             reader = partial(read_depth, unit=MILLIMETRES)
             frame = replace(frame, depth=depths / png, read_depth=reader)
-        frames.append(replace(frame, mask=masks / png))
+        frames.append(replace(frame, mask=masks / png if masks.is_dir() else None))
     return colmap_scene(folder, model, frames, metric=True)
 
 
