@@ -12,17 +12,17 @@ Which segments go into which pixels is decided here; a back end (``Splatter``) d
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras, check_usable
 from gvtools.errors import OptionError, ShapeError
-from gvtools.guidance import Guidance, concatenate
+from gvtools.guidance import IMAGES, Guidance, concatenate
 from gvtools.kernels import in_threads
 from gvtools.memory import culling
-from gvtools.memory.occlusion import in_free_space, stacked
+from gvtools.memory.culling import in_free_space, stacked
 from gvtools.memory.splat.api import ONE_PIXEL, FrameBuffers, SplatOptions, SplatRequest, Splatter
 from gvtools.memory.store.store import Store
 from gvtools.memory.store.views import FreeGrid
@@ -58,9 +58,6 @@ def project(
 
     What is nearer to the camera's plane than a voxel and than 1e-4 of the typical depth is not
     drawn. A back end that blends leaves out what the view named ``without`` saw.
-
-    Raises:
-        ShapeError: the cameras have images of several sizes, or there is none, or one is unusable.
     """
     sizes = set(zip(cameras.width.tolist(), cameras.height.tolist(), strict=True))
     if len(sizes) != 1:
@@ -68,9 +65,9 @@ def project(
             f"projection into cameras of {len(sizes)} image sizes; expected one; "
             "project each size by itself"
         )
-    check_usable(cameras)
     options = options or SplatOptions()
     if options.backend in ONE_PIXEL:
+        check_usable(cameras)
         if not store.in_ram:
             raise OptionError(
                 f"splat.backend {options.backend}: does not project a memory in tiles; choose cpu "
@@ -80,54 +77,11 @@ def project(
 
         return project_one_pixel(store, cameras, open3d=options.backend == "open3d")
     splatter = _splatter(store, options)
-    views = []
-    for camera in cameras:
-        projection = _Projection(store, camera, options, splatter=splatter, without=without)
-        projection.observe()
-        views.append(projection.guidance())
+    views = [
+        Projection(store, camera, options, splatter=splatter, without=without).guidance()
+        for camera in cameras
+    ]
     return concatenate(views)
-
-
-@dataclass(frozen=True, eq=False)
-class Observed:
-    """What observed views show of a camera; nothing generated changes it. See FrameBuffers."""
-
-    rgb: NDArray[np.float32]
-    depth: NDArray[np.float32]
-    valid: NDArray[np.bool_]
-    confidence: NDArray[np.float32]
-    scanned: NDArray[np.bool_]
-    # Typical depth, scene units; 0 where no observed view shows anything.
-    scale: float
-    # How many tiers of views there are, and the size of the next one.
-    tiers: int
-    size: int
-
-
-def project_again(
-    store: Store, camera: Cameras, observed: Observed | None, *, options: SplatOptions
-) -> tuple[Guidance, Observed]:
-    """``project`` into one camera, to the bit, and what the observed views show there.
-
-    ``observed`` of an earlier call is taken over: the caller knows that nothing observed was fused
-    or forgotten since. None splats all.
-    """
-    check_usable(camera)
-    projection = _Projection(store, camera, options, splatter=_splatter(store, options))
-    if observed is None:
-        projection.observe()
-        observed = projection.observed()
-    else:
-        projection.reuse(observed)
-    return projection.guidance(), observed
-
-
-def observed_of(store: Store, camera: Cameras, *, options: SplatOptions) -> Observed:
-    """What observed views show of a camera, a batch of one; for ``project_again``."""
-    check_usable(camera)
-    projection = _Projection(store, camera, options, splatter=_splatter(store, options))
-    projection.observe()
-    return projection.observed()
 
 
 def _splatter(store: Store, options: SplatOptions) -> Splatter:
@@ -140,8 +94,24 @@ def _splatter(store: Store, options: SplatOptions) -> Splatter:
     return CpuSplatter(store, options)
 
 
-class _Projection:
-    """The steps that write one target camera's images: what was observed, then the rest."""
+class Observed(NamedTuple):
+    """What observed views show of a camera; nothing generated changes it."""
+
+    # By their names, see FrameBuffers.
+    images: dict[str, NDArray[Any]]
+    # Typical depth, scene units; 0 where no observed view shows anything.
+    scale: float
+    # How many tiers of views there are, and the size of the next one.
+    tiers: int
+    size: int
+
+
+class Projection:
+    """The images of one target camera: what observed views show, then what generated ones add.
+
+    ``observed`` of an earlier one is taken over: the caller knows that nothing observed was fused
+    or forgotten since. None splats all; the result is the same to the bit.
+    """
 
     def __init__(
         self,
@@ -149,13 +119,15 @@ class _Projection:
         camera: Cameras,
         options: SplatOptions,
         *,
-        splatter: Splatter,
+        observed: Observed | None = None,
+        splatter: Splatter | None = None,
         without: str | None = None,
     ) -> None:
+        check_usable(camera)
         names = [view.camera.names[0] for view in store.views]
         self.shown = np.array([name != without for name in names], np.bool_)
         self.store, self.camera, self.options = store, camera, options
-        self.splatter = splatter
+        self.splatter = splatter or _splatter(store, options)
         shape = (int(camera.height[0]), int(camera.width[0]))
         # In one order of memory, for which alone the kernels are compiled.
         self.K = np.ascontiguousarray(camera.K[0])
@@ -169,6 +141,14 @@ class _Projection:
         )  # fmt: skip
         self.scale, self.tiers, self.size = 0.0, 0, options.nearest_views
         self.tier = np.full(len(store.views), -1)
+        if observed is None:
+            self.observe()
+            return
+        for name, image in observed.images.items():
+            getattr(self.target, name)[:] = image
+        self.tiers, self.size = observed.tiers, observed.size
+        if observed.scale:
+            self._set_scale(observed.scale)
 
     def observe(self) -> None:
         """Write what observed views show."""
@@ -181,32 +161,15 @@ class _Projection:
                     self._splat_occluders(self.seen[scanned == source])
 
     def observed(self) -> Observed:
-        """A copy of what is written so far."""
-        t = self.target
-        return Observed(
-            t.rgb.copy(), t.depth.copy(), t.valid.copy(), t.confidence.copy(), t.scanned.copy(),
-            self.scale, self.tiers, self.size,
-        )  # fmt: skip
-
-    def reuse(self, observed: Observed) -> None:
-        """Write what observed views show, as an earlier projection found it."""
-        t = self.target
-        t.rgb[:], t.depth[:] = observed.rgb, observed.depth
-        t.valid[:], t.confidence[:] = observed.valid, observed.confidence
-        t.scanned[:] = observed.scanned
-        self.tiers, self.size = observed.tiers, observed.size
-        if observed.scale:
-            self._set_scale(observed.scale)
+        """A copy of what is written before ``guidance``."""
+        images = {name: getattr(self.target, name).copy() for name in IMAGES if name != "generated"}
+        return Observed(images, self.scale, self.tiers, self.size)
 
     def guidance(self) -> Guidance:
         """The images, after what was generated has been written where nothing was observed."""
-        t = self.target
         if self.store.views.generated.any() and self._find_segments(generated=True):
             self._splat_tiers()
-        return Guidance(
-            self.camera, t.rgb[None], t.depth[None], t.valid[None], t.confidence[None],
-            t.generated[None], t.scanned[None],
-        )  # fmt: skip
+        return Guidance(self.camera, *(getattr(self.target, name)[None] for name in IMAGES))
 
     def _set_scale(self, scale: float) -> None:
         self.scale = scale
@@ -216,17 +179,14 @@ class _Projection:
     def _find_segments(self, *, generated: bool) -> bool:
         """Find the segments in view, of one kind, and rank the views that they come from."""
         store, segments, target = self.store, self.store.segments, self.target
-        self.z_range = np.empty((segments.count, 2), np.float32)
         groups = np.arange(segments.groups)
         group_rect = np.empty((segments.groups, 4), np.int32)
-        group_z = np.empty((segments.groups, 2), np.float32)
-        self._cull_boxes(segments.group_box, groups, group_rect, z_range=group_z)
+        self._cull_boxes(segments.group_box, groups, group_rect)
         rows = groups[group_rect[:, 1] >= 0, None] * segments.GROUP + np.arange(segments.GROUP)
-        rows = rows.ravel()
         rows = rows[rows < segments.count]
-        rows = rows[store.views.generated[segments.view[rows]] == generated]
-        rows = rows[self.shown[segments.view[rows]]]
-        self._cull_boxes(segments.box, rows, target.rect, z_range=self.z_range)
+        view = segments.view[rows]
+        rows = rows[self.shown[view] & (store.views.generated[view] == generated)]
+        self.z_range = self._cull_boxes(segments.box, rows, target.rect)
         self.seen = rows[target.rect[rows, 1] >= 0]
         if not len(self.seen):
             return False
@@ -246,14 +206,15 @@ class _Projection:
         boxes: NDArray[np.float32],
         rows: NDArray[np.int64],
         rect: NDArray[np.int32],
-        *,
-        z_range: NDArray[np.float32],
-    ) -> None:
+    ) -> NDArray[np.float32]:
+        """Rectangles of ``rows`` of boxes go to ``rect``; returns their depth ranges."""
         height, width = self.target.shape
+        z_range = np.empty((len(rect), 2), np.float32)
         in_threads(
             culling.cull_segments, len(rows), boxes, rows, self.target.cam_from_local,
             self.K, width, height, self.options.blend_reach, rect, z_range,
         )  # fmt: skip
+        return z_range
 
     def _splat_tiers(self) -> None:
         """Nearest views first, in tiers that double in size; each writes what is still open.

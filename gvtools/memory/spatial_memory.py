@@ -13,14 +13,12 @@ from gvtools.cameras import Cameras
 from gvtools.errors import DegenerateError, GvError, MemoryFileError, OptionError, ShapeError
 from gvtools.memory import fusion
 from gvtools.memory.back_projection import BackProjectionOptions, back_project
+from gvtools.memory.culling import behind_free_space
 from gvtools.memory.fusion import FuseReport
-from gvtools.memory.occlusion import behind_free_space
-from gvtools.memory.store.columns import LAYOUT
 from gvtools.memory.store.local_frame import LocalFrame
-from gvtools.memory.store.observations import rows_of
+from gvtools.memory.store.observations import LAYOUT, rows_of
 from gvtools.memory.store.store import MemoryOptions, Store
-from gvtools.memory.store.thinned_copies import DOUBLINGS
-from gvtools.memory.store.tile import COLUMNS, of_views
+from gvtools.memory.store.tile import COLUMNS, DOUBLINGS, of_views
 from gvtools.memory.store.tile_set import IN_RAM
 from gvtools.memory.store.views import PointSet
 from gvtools.memory.store.voxel_index import rounded_origin
@@ -70,13 +68,11 @@ class SpatialMemory(Store):
 
         Args:
             rgb: (H, W, 3) uint8, as a photograph has it, or float from 0 to 1, as a completion.
-            depth: (H, W) float32 z-depth, scene units; 0, NaN and inf mean none.
+            depth: (H, W) z-depth, scene units; 0, NaN and inf mean none.
             camera: a batch of one, of the same image size, in the world frame.
-            round: see ``fuse``.
-            mask: (H, W) bool, True = use; None uses all.
-            confidence: (H, W) float32 of the source, > 0; None means 1.
-            generated: see ``fuse``.
-            options: see BackProjectionOptions.
+            round: see ``fuse``, as ``generated``.
+            mask: (H, W), True = use.
+            confidence: (H, W) of the source, > 0; None means 1.
             pixel_binning: see ``back_project``.
 
         Raises:
@@ -100,15 +96,9 @@ class SpatialMemory(Store):
     def behind_free_space(
         self, depth: NDArray[np.float32], camera: Cameras, *, where: NDArray[np.bool_]
     ) -> NDArray[np.float32]:
-        """Generated depth, moved back where an observed ray saw its place to be free.
+        """Depth (H, W), moved back ``where`` an observed ray saw its place to be free.
 
-        Args:
-            depth: (H, W) float32 z-depth, scene units.
-            camera: a batch of one.
-            where: (H, W) bool, the generated pixels; the others stay as they are.
-
-        Returns:
-            (H, W) float32; 0 where all places along the ray are free.
+        0 where all places along the ray are free.
         """
         where = where & (depth > 0)
         rows, columns = np.nonzero(where)
@@ -130,11 +120,11 @@ class SpatialMemory(Store):
 
         Args:
             points: in this memory's frame.
-            round: the round they belong to, 0 to 65535; not smaller than any round already there.
-            generated: True for a completer's points: they enter neither voxels that hold observed
-                content nor space that an observed ray saw to be free.
-            scanned: True for points of a scan: they are observed, but shown only where no camera's
-                observations are, with which they never merge.
+            round: 0 to 65535; not smaller than any round already there.
+            generated: by a completer: they enter neither voxels that hold observed content nor
+                space that an observed ray saw to be free.
+            scanned: of a scan: they are observed, but shown only where no camera's observations
+                are, with which they never merge.
 
         Raises:
             OptionError: ``round`` lies before the last one or out of range.
@@ -157,8 +147,7 @@ class SpatialMemory(Store):
         view keeps one observation for each cube of 4, or of 16, voxels a side; confidence that
         later rounds added to these stays if such a round is forgotten.
 
-        Args:
-            most: observations of a memory in tiles; None: as many as half of the budget holds.
+        ``most`` observations of a memory in tiles; None: as many as half of the budget holds.
         """
         if self.in_ram:
             return self
@@ -214,41 +203,28 @@ class SpatialMemory(Store):
         return SpatialMemory(self.voxel, origin=frame.origin, axes=frame.axes, options=self.options)
 
     def save(self, path: Path | str) -> Path:
-        """Write the memory: a file, see gvtools.memory.io.npz, or a folder of tiles.
+        """Write the memory to a file, or to a folder of tiles; what was there stays if that fails.
 
-        Tiles go to the folder of the same name with the suffix ``.tiles``.
-
-        Returns:
-            Where it is.
-
-        Raises:
-            ProjectError: the disk is full or the folder cannot be written; what was there before
-                is intact.
+        Tiles go to the folder of the same name with the suffix ``.tiles``. Returns where it is.
         """
+        from gvtools.memory.files import save_memory, save_tiles, tile_folder
+
         if not self.in_ram:
-            from gvtools.memory.io.tile_folder import save_tiles, tile_folder
-
             return save_tiles(self, tile_folder(Path(path)))
-        from gvtools.memory.io.npz import save_memory
-
         save_memory(self, Path(path))
         return Path(path)
 
     @classmethod
     def load(cls, path: Path | str) -> SpatialMemory:
-        """Read a memory's file; see gvtools.memory.io.npz."""
-        from gvtools.memory.io.npz import load_memory
+        """Read a memory's file; see gvtools.memory.files."""
+        from gvtools.memory.files import load_memory
 
         return load_memory(Path(path), cls)
 
     @classmethod
     def from_ply(cls, path: Path | str) -> SpatialMemory:
-        """Read a coloured binary PLY as a memory, see ``from_point_cloud``.
-
-        Raises:
-            MemoryFileError: truncated, damaged, or without what a memory needs.
-        """
-        from gvtools.memory.io.ply import read_point_cloud
+        """Read a coloured binary PLY as a memory, see ``from_point_cloud``."""
+        from gvtools.memory.ply import read_point_cloud
 
         cloud = read_point_cloud(Path(path))
         try:
@@ -283,10 +259,6 @@ class SpatialMemory(Store):
                 None for the world's.
             options: None has one edge throughout: the points were seen as finely as they lie.
             name: of the camera.
-
-        Raises:
-            ShapeError: no colours, or colours of another type or range.
-            DegenerateError: no two distinct points, or none with a positive confidence and spacing.
         """
         columns = {key: cloud.point[key].cpu().numpy() for key in cloud.point}
         if "colors" not in columns or "positions" not in columns:
@@ -351,19 +323,13 @@ class TiledMemory(SpatialMemory):
     larger than its tile; then colours are summed in another order there.
 
     Args:
-        voxel: see Store, as the others.
-        origin: see Store.
-        axes: see Store.
-        options: with a ``budget``.
+        options: with a ``budget``; the others as those of Store.
         scratch: folder for the files of tiles that are not in RAM; None takes the system's for
             temporary files. They are deleted with the memory; ``save`` keeps them.
 
     >>> memory = TiledMemory(voxel=0.05, options=MemoryOptions(budget="400MB"))
     >>> len(memory), memory.in_ram
     (0, True)
-
-    Raises:
-        OptionError: no budget.
     """
 
     def __init__(
@@ -389,13 +355,8 @@ class TiledMemory(SpatialMemory):
             path: the path given to ``save``, or the folder of tiles.
             budget: bytes; None takes the budget saved with tiles.
             scratch: see TiledMemory; if given, the saved folder may be removed afterwards.
-
-        Raises:
-            MemoryFileError: absent, truncated, altered, of another kind or version.
-            OptionError: no budget for a memory that was saved as a file.
         """
-        from gvtools.memory.io.npz import load_memory
-        from gvtools.memory.io.tile_folder import load_tiles, tile_folder
+        from gvtools.memory.files import load_memory, load_tiles, tile_folder
 
         folder = tile_folder(Path(path))
         if folder.is_dir():

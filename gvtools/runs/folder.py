@@ -19,7 +19,7 @@ from typing import Any
 
 from gvtools.errors import ProjectError
 from gvtools.files import remove, replaced_when_written, write_json, write_text
-from gvtools.memory.io.tile_folder import copy_tiles
+from gvtools.memory.files import copy_tiles
 from gvtools.runs.digests import SUMS, check_sums, versions, write_sums
 from gvtools.runs.folder_lock import folder_lock
 from gvtools.runs.layout import (

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gvtools.errors import OptionError, ProjectError
-from gvtools.memory.io.tile_folder import INDEX
+from gvtools.memory.files import INDEX
 from gvtools.runs.digests import check_sums
 from gvtools.runs.layout import APPEARANCE, MEMORY, POINTS, RECORD, round_folder, saved_memory
 

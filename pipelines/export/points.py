@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.files import replaced_when_written
-from gvtools.memory.io.ply import export_memory_ply
+from gvtools.memory.ply import export_memory_ply
 from pipelines.export.source import ExportOptions, ExportSource, box_middle
 
 # LAS: point format 7 has colours of 16 bits.

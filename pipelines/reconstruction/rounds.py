@@ -30,7 +30,7 @@ from gvtools.depth.source import DepthMap
 from gvtools.errors import ProjectError
 from gvtools.guidance import Guidance, concatenate
 from gvtools.kernels import parallel_kernels_may_overlap
-from gvtools.memory.projection import Observed, observed_of, project_again
+from gvtools.memory.projection import Observed, Projection
 from gvtools.memory.spatial_memory import FuseReport, SpatialMemory
 from gvtools.memory.splat.api import ONE_PIXEL, SplatOptions
 from gvtools.prefetch import prefetch
@@ -86,7 +86,7 @@ class CachedProjection:
             snapshot: of the memory; so this may run beside fusions of generated content.
         """
         if self.reuse and self.options.backend == "cpu":
-            self._observed = observed_of(snapshot, self.camera, options=self.options)
+            self._observed = Projection(snapshot, self.camera, self.options).observed()
             self._at = (-1, snapshot.observed_changes)
 
     def guidance(self) -> Guidance:
@@ -98,9 +98,9 @@ class CachedProjection:
                 self._guidance = memory.project(self.camera, options=self.options)
             else:
                 observed = self._observed if at[1] == self._at[1] else None
-                self._guidance, self._observed = project_again(
-                    memory, self.camera, observed, options=self.options
-                )
+                projection = Projection(memory, self.camera, self.options, observed=observed)
+                self._observed = observed or projection.observed()
+                self._guidance = projection.guidance()
             if self.appearance is not None:
                 if self._picture is None:
                     self._picture = self.appearance.picture(self.camera)

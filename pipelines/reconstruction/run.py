@@ -13,7 +13,7 @@ import numpy as np
 from gvtools.errors import OptionError, ProjectError
 from gvtools.evaluation.images import FIGURES, view_figures
 from gvtools.files import folder_replaced_when_written, only_in, recover_folder, write_json
-from gvtools.memory.io.ply import export_memory_ply
+from gvtools.memory.ply import export_memory_ply
 from gvtools.memory.spatial_memory import SpatialMemory, TiledMemory
 from gvtools.prefetch import prefetch
 from gvtools.runs.depth_cache import DepthCache

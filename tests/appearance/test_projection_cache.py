@@ -15,7 +15,7 @@ from gvtools.appearance.splat.project_kernels import VALUES
 from gvtools.cameras import Cameras
 from gvtools.guidance import Guidance
 from gvtools.memory.back_projection import back_project
-from gvtools.memory.projection import _Projection
+from gvtools.memory.projection import Projection
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.splat.api import SplatOptions
 from gvtools.memory.splat.cpu import CpuSplatter
@@ -156,7 +156,7 @@ def test_looking_ahead_beside_fusions_gives_the_picture_of_a_whole_projection(me
         raise AssertionError("what was looked at is projected again")
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(_Projection, "observe", again)
+        patch.setattr(Projection, "observe", again)
         seen = [target.guidance() for target in targets]
     for target, guidance in zip(targets, seen, strict=True):
         assert same(guidance, memory.project(target.camera))

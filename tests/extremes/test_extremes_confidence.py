@@ -14,7 +14,7 @@ from reference_splat import reference_project
 
 from gvtools.errors import MemoryFileError, OptionError
 from gvtools.memory.back_projection import back_project
-from gvtools.memory.io.ply import export_memory_ply
+from gvtools.memory.ply import export_memory_ply
 from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory
 from gvtools.memory.splat.api import SplatOptions
 from gvtools.memory.splat.cpu import FAINTEST

@@ -19,7 +19,7 @@ from memory_scenes import camera, plane_view, points
 from scipy.spatial import cKDTree
 
 from gvtools.errors import GvError, MemoryFileError, OptionError
-from gvtools.memory.io.ply import export_memory_ply
+from gvtools.memory.ply import export_memory_ply
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.splat.api import SplatOptions
 from gvtools.memory.store.voxel_index import VOXEL_RANGE, rounded_origin

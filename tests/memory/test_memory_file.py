@@ -9,9 +9,9 @@ import pytest
 from memory_scenes import points, random_memory, saved_bytes
 
 from gvtools.errors import GvError, MemoryFileError, ProjectError
-from gvtools.memory.io import npz
+from gvtools.memory import files
 from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory
-from gvtools.memory.store.columns import LAYOUT
+from gvtools.memory.store.observations import LAYOUT
 
 
 def _small() -> SpatialMemory:
@@ -175,10 +175,10 @@ def test_a_file_of_another_make_is_refused_by_name(change, complaint, tmp_path):
 
 @pytest.mark.parametrize("kind", [np.int8, np.int64, np.float64])
 def test_levels_of_another_kind_are_refused(kind, tmp_path, monkeypatch):
-    arrays = npz._arrays(memory := _small())
+    arrays = files._arrays(memory := _small())
     arrays["level"] = arrays["level"].astype(kind)
     arrays["level"][0] = -1
-    monkeypatch.setattr(npz, "_arrays", lambda _: arrays)
+    monkeypatch.setattr(files, "_arrays", lambda _: arrays)
     memory.save(tmp_path / "memory.npz")
     with pytest.raises(MemoryFileError, match="of a level that is not there"):
         SpatialMemory.load(tmp_path / "memory.npz")
@@ -203,7 +203,7 @@ def test_a_failed_write_leaves_the_earlier_file_whole(tmp_path, monkeypatch):
     def full(*_args, **_kwargs):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("gvtools.memory.io.npz.np.save", full)
+    monkeypatch.setattr("gvtools.memory.files.np.save", full)
     with pytest.raises(ProjectError, match="No space left"):
         memory.save(path)
     assert issubclass(ProjectError, GvError)

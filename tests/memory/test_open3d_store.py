@@ -14,7 +14,7 @@ from gvtools.errors import DegenerateError, OptionError, ShapeError
 from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory
 from gvtools.memory.splat.api import SplatOptions
 from gvtools.memory.splat.torch_splatter import TorchSplatter
-from gvtools.memory.store.columns import ATTRIBUTES, Columns
+from gvtools.memory.store.observations import ATTRIBUTES, Columns
 
 SIZE = {"width": 40, "height": 30, "focal": 40}
 

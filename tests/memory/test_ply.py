@@ -6,7 +6,7 @@ from memory_scenes import camera, points, random_memory
 
 from gvtools.cameras import Cameras
 from gvtools.errors import MemoryFileError
-from gvtools.memory.io.ply import export_memory_ply
+from gvtools.memory.ply import export_memory_ply
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.ply import read_ply, write_ply
 

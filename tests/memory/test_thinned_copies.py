@@ -11,7 +11,7 @@ from memory_scenes import camera, plane_view, random_points
 from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory, TiledMemory
 from gvtools.memory.splat.api import SplatOptions
 from gvtools.memory.store import tile_set
-from gvtools.memory.store.thinned_copies import DOUBLINGS, thinned_copy
+from gvtools.memory.store.tile import DOUBLINGS, thinned_copy
 from gvtools.memory.store.tile_set import TileSet
 
 

@@ -12,11 +12,11 @@ from memory_scenes import random_camera, random_points
 
 from gvtools.errors import MemoryFileError, OptionError, ProjectError
 from gvtools.guidance import IMAGES
-from gvtools.memory.io.ply import export_memory_ply
+from gvtools.memory.ply import export_memory_ply
 from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory, TiledMemory
 from gvtools.memory.splat.api import SplatOptions
 from gvtools.memory.store import array_file, tile_set
-from gvtools.memory.store.columns import ATTRIBUTES
+from gvtools.memory.store.observations import ATTRIBUTES
 from gvtools.ply import read_ply
 
 VOXEL, ORIGIN, VIEWS, BUDGET = 0.01, (1.0, 2.0, 3.0), 10, 1_000_000

@@ -14,7 +14,7 @@ from trajectory_writers import write_tum
 
 from gvtools.cameras import concatenate
 from gvtools.errors import OptionError, ProjectError
-from gvtools.memory.io.ply import export_memory_ply
+from gvtools.memory.ply import export_memory_ply
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.runs.layout import file_stems
 from pipelines.bench.procedural_cloud import inside_camera, photograph

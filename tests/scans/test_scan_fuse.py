@@ -5,7 +5,7 @@ import pytest
 from memory_scenes import camera, points
 from scan_files import FAR
 
-from gvtools.memory.io.ply import export_memory_ply
+from gvtools.memory.ply import export_memory_ply
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.scans.fuse import fuse_scan, point_spacing
 from gvtools.scans.points import Scan, Station

@@ -97,7 +97,7 @@ def test_what_a_completer_made_is_no_scan(tmp_path):
     memory = SpatialMemory(0.1)
     memory.fuse(points(surface(50)[0], source=camera()), round=0)
     memory.fuse(points(surface(50)[0] + 20, source=camera(name="b")), round=1, generated=True)
-    from gvtools.memory.io.ply import export_memory_ply
+    from gvtools.memory.ply import export_memory_ply
 
     export_memory_ply(memory, tmp_path / "memory.ply")
     scan = read_scan(tmp_path / "memory.ply")

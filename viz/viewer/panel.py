@@ -227,7 +227,7 @@ class Panel:
         self._note.content = _key_of_cameras() + _small(escape(text))
 
     def _download(self, run: RunView, client: viser.ClientHandle) -> None:
-        from gvtools.memory.io.ply import export_memory_ply
+        from gvtools.memory.ply import export_memory_ply
 
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / f"{run.title}.ply"

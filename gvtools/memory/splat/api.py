@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from gvtools.cameras import Cameras
-from gvtools.memory.store.thinned_copies import DOUBLINGS
+from gvtools.memory.store.tile import DOUBLINGS
 from gvtools.settings import Settings
 
 if TYPE_CHECKING:

@@ -32,11 +32,7 @@ SMALLEST = np.finfo(np.float32).tiny
 
 
 class TargetCamera(NamedTuple):
-    """A target camera: (3 or 4, 4) pose from the memory's frame, and its intrinsics in pixels.
-
-    ``cx`` and ``cy`` have pixel centres at integers. What is nearer than ``z_near`` is not drawn;
-    ``unit`` is a power of two near the typical depth, both scene units.
-    """
+    """A FrameBuffers' camera: pose, and intrinsics in pixels whose centres are at integers."""
 
     M: NDArray[np.float32]
     fx: np.float32
@@ -134,18 +130,10 @@ def splat_segments(
 ):  # fmt: skip
     """Depth pass, then blending inside the depth band, of segments in the order of ``chosen``.
 
-    Args:
-        chosen: (n,) int64 rows of ``segments``.
-        columns: the observations, see SplatColumns.
-        view_weight: (views,) float32.
-        limit: (H x W,) float32, see SplatRequest.
-        reachable: (H x W,) bool, the pixels within REACHABLE pixels of one to be written; empty
-            when most of the image is open.
-        threads: how many share the work.
-        blend: False stops after the depth pass.
-        fresh: False adds to what ``total`` holds.
-        depth: out (H x W,) float32, the nearest depth, or ``limit`` where nothing is nearer.
-        total: out (H x W, CHANNELS) float32; depths are summed in ``lens.unit``.
+    See SplatRequest for ``limit`` (H x W,) and ``blend``. ``reachable`` (H x W,) bool: the pixels
+    within REACHABLE pixels of one to be written; empty when most of the image is open. Out:
+    ``depth`` (H x W,), the nearest, or ``limit`` where nothing is nearer; ``total`` (H x W,
+    CHANNELS), depths in ``lens.unit``, added to what is there if not ``fresh``.
     """
     width, height = lens.width, lens.height
     rect, start, length, view = segments.rect, segments.start, segments.length, segments.view_row

@@ -19,7 +19,7 @@ from gvtools.errors import OptionError
 from gvtools.memory.culling import summed_area
 from gvtools.memory.splat.api import SplatRequest, thinning
 from gvtools.memory.splat.cpu import CHANNELS, FAINTEST, SMALLEST
-from gvtools.memory.store.columns import SplatColumns
+from gvtools.memory.store.observations import SplatColumns
 
 if TYPE_CHECKING:
     from gvtools.memory.splat.api import FrameBuffers, SplatOptions

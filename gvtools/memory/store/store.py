@@ -12,9 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, field_validator
 
 from gvtools.errors import OptionError
-from gvtools.memory.store.columns import Columns
 from gvtools.memory.store.local_frame import LocalFrame
-from gvtools.memory.store.observations import Agreement, Observations
+from gvtools.memory.store.observations import Agreement, Columns, Observations
 from gvtools.memory.store.tile_set import TileSet
 from gvtools.memory.store.views import FreeGrid, ViewTable
 from gvtools.memory.store.voxel_index import MAX_VOXEL, VoxelLevels, check_grid
@@ -195,8 +194,7 @@ class Store:
     @property
     def nbytes(self) -> int:
         """Bytes of everything that is kept, without spare capacity."""
-        grids = sum(self.views[i].free_depth.nbytes for i in range(len(self.views)))
-        return self.stored_bytes + grids
+        return self.stored_bytes + sum(view.free_depth.nbytes for view in self.views)
 
     @property
     def stored_bytes(self) -> int:
@@ -206,17 +204,14 @@ class Store:
     @property
     def generated_count(self) -> int:
         """Number of observations that a completer made."""
-        return self._count_of(self.views.generated)
+        rows = self.segments.rows()
+        return int(rows["length"][self.views.generated[rows["view"]]].sum(dtype=np.int64))
 
     @property
     def scanned_count(self) -> int:
         """Number of observations that a scan brought."""
-        return self._count_of(self.views.scanned)
-
-    def _count_of(self, kind: NDArray[np.bool_]) -> int:
-        """Number of observations of the views that are of a kind, (views,)."""
         rows = self.segments.rows()
-        return int(rows["length"][kind[rows["view"]]].sum(dtype=np.int64))
+        return int(rows["length"][self.views.scanned[rows["view"]]].sum(dtype=np.int64))
 
     def __len__(self) -> int:
         """Number of stored observations."""
@@ -247,13 +242,11 @@ class Store:
         return self.whole.own_confidence()
 
     def forget(self, *, round: int) -> int:
-        """Undo a round: its views, its observations and the confidence it added elsewhere.
+        """Undo a round; returns how many observations were removed.
 
-        After the last round is forgotten, the memory is bit for bit what it was before it. When an
-        earlier round is forgotten, later ones keep what they stored.
-
-        Returns:
-            How many observations were removed.
+        Its views and the confidence it added elsewhere go, too. After the last round is forgotten,
+        the memory is bit for bit what it was before it. When an earlier round is forgotten, later
+        ones keep what they stored.
         """
         if round not in self.rounds:
             raise OptionError(f"round {round} is not in the memory; it has rounds {self.rounds}")
@@ -271,8 +264,7 @@ class Store:
 
     def page_if_large(self) -> None:
         """Move to tiles if half of the budget is used."""
-        if self.tiles.outgrown():
-            self.segments = self.tiles.page()
+        self.segments = self.tiles.page() or self.segments
 
     def compact(self) -> int:
         """Join small neighbouring tiles, as after ``forget``; returns how many fewer there are."""

@@ -1,22 +1,125 @@
-"""One tile of a memory: observations in RAM, or a file of checksummed arrays."""
+"""A tile of a memory: observations in RAM or in a checksummed file, and thinned copies."""
+
+# mypy: no-check-untyped-defs
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.errors import MemoryFileError
+from gvtools.kernels import compiled
 from gvtools.memory.store.array_file import ArrayFile, write_arrays
-from gvtools.memory.store.columns import LAYOUT, Segments, SplatColumns
-from gvtools.memory.store.observations import Agreement, Observations
+from gvtools.memory.store.observations import (
+    LAYOUT,
+    Agreement,
+    Observations,
+    Segments,
+    SplatColumns,
+)
 from gvtools.memory.store.octree import Node
-from gvtools.memory.store.thinned_copies import DOUBLINGS, ThinnedCopy, thinned_copy
 from gvtools.memory.store.views import ViewTable
-from gvtools.memory.store.voxel_index import MOST_LEVEL
+from gvtools.memory.store.voxel_index import LOCAL_MASK, MOST_LEVEL
+
+# In a copy, the observations of a segment that lie in one cube of 2**2, or of 2**4, voxels a side
+# become one, their mean weighted by confidence. So its segments have the same block and view.
+DOUBLINGS = (2, 4)
+
+
+class ThinnedCopy(NamedTuple):
+    """One copy: the observations, and where each segment's begin, (S + 1,) int32."""
+
+    start: NDArray[np.int32]
+    rows: SplatColumns
+
+
+def empty_columns(count: int) -> SplatColumns:
+    """Uninitialised columns for ``count`` observations."""
+    single = np.float32
+    return SplatColumns(
+        np.empty((count, 3), single), np.empty((count, 3), np.uint8),
+        np.empty(count, single), np.empty(count, single),
+    )  # fmt: skip
+
+
+def thinned_copy(observations: Observations, doublings: int) -> ThinnedCopy:
+    """The copy whose cubes are 2**doublings voxels wide."""
+    segments, arrays = observations.segments, observations.columns.arrays
+    rows = empty_columns(len(observations))
+    start = np.zeros(segments.count + 1, np.int32)
+    n = _thin(
+        segments.start[: segments.count], segments.length, *observations.columns.splat,
+        arrays.level, 1.0 / observations.voxel, doublings, start, *rows,
+    )  # fmt: skip
+    return ThinnedCopy(start, SplatColumns(
+        rows.positions[:n].copy(), rows.colors[:n].copy(),
+        rows.confidence[:n].copy(), rows.spacing[:n].copy(),
+    ))  # fmt: skip
+
+
+@compiled()
+def _thin(
+    first, length, positions, colors, confidence, spacing, level, inverse_edge, doublings,
+    start, out_positions, out_colors, out_confidence, out_spacing,
+):  # fmt: skip
+    side = (LOCAL_MASK + 1) >> doublings
+    place = np.full(side * side * side, -1, np.int64)
+    used = np.empty(side * side * side, np.int64)
+    # Weighted position and colour, weight, weighted spacing.
+    total = np.empty((side * side * side, 8), np.float64)
+    n = 0
+    for s in range(len(first)):
+        cubes = 0
+        inverse = inverse_edge / (1 << np.int64(level[first[s]]))
+        for r in range(first[s], first[s] + length[s]):
+            cube = np.int64(0)
+            for k in range(3):
+                voxel = np.int64(np.floor(np.float64(positions[r, k]) * inverse))
+                cube = cube * side + ((voxel & LOCAL_MASK) >> doublings)
+            t = place[cube]
+            if t < 0:
+                t = place[cube] = cubes
+                used[cubes] = cube
+                cubes += 1
+                total[t] = 0
+                out_confidence[n + t] = 0
+            w = np.float64(confidence[r])
+            for k in range(3):
+                total[t, k] += w * positions[r, k]
+                total[t, 3 + k] += w * colors[r, k]
+            total[t, 6] += w
+            total[t, 7] += w * spacing[r]
+            out_confidence[n + t] = max(out_confidence[n + t], confidence[r])
+        for t in range(cubes):
+            weight = total[t, 6]
+            for k in range(3):
+                out_positions[n, k] = total[t, k] / weight
+                out_colors[n, k] = np.uint8(total[t, 3 + k] / weight + 0.5)
+            out_spacing[n] = max(total[t, 7] / weight, (1 << doublings) / inverse)
+            place[used[t]] = -1
+            n += 1
+        start[s + 1] = n
+    return n
+
+
+@compiled()
+def copy_rows(begin, end, which, start, length, source, at, target):
+    """Copy segments ``which[begin:end]`` from ``start`` in ``source`` to ``at`` in ``target``."""
+    for i in range(begin, end):
+        j = which[i]
+        a, b, n = start[j], at[j], length[j]
+        for r in range(n):
+            for k in range(3):
+                target.positions[b + r, k] = source.positions[a + r, k]
+                target.colors[b + r, k] = source.colors[a + r, k]
+            target.confidence[b + r] = source.confidence[a + r]
+            target.spacing[b + r] = source.spacing[a + r]
+
 
 # ``round`` and ``generated`` follow from the view, ``next`` from the voxels.
 COLUMNS = ("positions", "colors", "confidence", "spacing", "view", "level")
@@ -73,20 +176,17 @@ class Tile:
         """All observations, as splatting reads them."""
         if self.store is not None:
             return self.store.columns.splat
-        file = self._open()
-        rows = SplatColumns(*(file.array(name) for name in SplatColumns._fields))
-        check(file, _finite(rows))
-        return rows
+        return _splat_columns(self._open())
 
     def thinned(self, doublings: int) -> ThinnedCopy:
         """The thinned copy whose cubes are 2**doublings voxels wide."""
         if self.store is None:
             file, head = self._open(), f"thinned{doublings}_"
-            rows = SplatColumns(*(file.array(f"{head}{name}") for name in SplatColumns._fields))
             start = file.array(f"{head}start")
-            check(file, len(start) == len(self.segments) + 1 and _alike(file, head, rows))
-            check(file, start[0] == 0 and start[-1] == len(rows.spacing))
-            check(file, bool((np.diff(start) >= 0).all()) and _finite(rows))
+            rows = _splat_columns(file, head, rows=len(file.array(f"{head}spacing")))
+            ends = len(start) == len(self.segments) + 1 and start[-1] == len(rows.spacing)
+            if not ends or start[0] != 0 or not (np.diff(start) >= 0).all():
+                raise _misfit(file, f"{head}start")
             return ThinnedCopy(start, rows)
         if doublings not in self._copies:
             self._copies[doublings] = thinned_copy(self.store, doublings)
@@ -98,7 +198,8 @@ class Tile:
             return np.asarray(getattr(self.store.columns, name))
         file = self._open()
         column = file.array(name)
-        check(file, column.dtype.kind != "f" or bool(np.isfinite(column).all()))
+        if column.dtype.kind == "f" and not np.isfinite(column).all():
+            raise _misfit(file, name)
         return column
 
     def agreements(self) -> list[tuple[int, Agreement]]:
@@ -130,9 +231,11 @@ class Tile:
         if self.file is not None:
             file = self._open()
             self.mapped = None
-            _check(file, len(views))
-            arrays = {name: file.array(name) for name in COLUMNS}
-            arrays |= {f"segment_{name}": file.array(f"segment_{name}") for name in Segments.LAYOUT}
+            arrays = {name: file.array(name) for name in observation_arrays(empty)}
+            try:
+                check_observations(arrays, len(views))
+            except ValueError as error:
+                raise _misfit(file, error) from None
             fill(empty, arrays, views)
             for number, entry in read_agreements(file):
                 empty.agreements.setdefault(number, []).append(entry)
@@ -142,8 +245,13 @@ class Tile:
     def _open(self) -> ArrayFile:
         assert self.file is not None
         if self.mapped is None:
-            self.mapped = ArrayFile(self.file)
-            check_shapes(self.mapped)
+            self.mapped = file = ArrayFile(self.file)
+            count = file.meta.get("count")
+            for name in COLUMNS:
+                kind, width = LAYOUT[name]
+                shape = (count, width) if width > 1 else (count,)
+                if file.shape(name) != shape or file.kind(name) != np.dtype(kind):
+                    raise _misfit(file, name)
         return self.mapped
 
 
@@ -190,69 +298,78 @@ def read_agreements(file: ArrayFile) -> list[tuple[int, Agreement]]:
     ]
 
 
-def read_segments(file: ArrayFile) -> Segments:
-    """The segments of a tile's file."""
+def read_segments(file: ArrayFile, views: int) -> Segments:
+    """The segments of a tile's file, checked."""
+    arrays = {f"segment_{name}": file.array(f"segment_{name}") for name in Segments.LAYOUT}
+    try:
+        _check_segments(arrays, views, file.meta.get("count"))
+    except ValueError as error:
+        raise _misfit(file, error) from None
     segments = Segments()
-    start, length, view, box = (file.array(f"segment_{name}") for name in Segments.LAYOUT)
+    start, length, view, box = arrays.values()
     segments.append(start, length, view, box=box)
     return segments
 
 
-def check(file: ArrayFile, fits: bool) -> None:
-    """Refuse a file whose arrays contradict each other."""
-    if not fits:
-        raise MemoryFileError(f"{file.path}: the tile's parts do not fit together; run again")
-
-
-def check_shapes(file: ArrayFile) -> None:
-    """Whether the columns have as many rows as the file says."""
-    count = file.meta.get("count")
+def check_observations(arrays: Mapping[str, NDArray[Any]], views: int) -> None:
+    """Refuse arrays of ``observation_arrays`` that contradict each other, by a ValueError."""
+    count = len(arrays["view"])
     for name in COLUMNS:
-        kind, width = LAYOUT[name]
-        check(file, file.shape(name) == ((count, width) if width > 1 else (count,)))
-        check(file, file.kind(name) == np.dtype(kind))
+        width, shape = LAYOUT[name][1], arrays[name].shape
+        if shape != ((count, width) if width > 1 else (count,)):
+            raise ValueError(f"{name} has shape {shape} beside {count} views")
+    level, row = arrays["level"], arrays["agreement_row"]
+    _require(_within(arrays["view"], views), "an observation names a view that is not there")
+    known = level.dtype == np.uint8 and _within(level, MOST_LEVEL + 1)
+    _require(known, "an observation is of a level that is not there")
+    for name in ("spacing", "confidence"):
+        _require(not (arrays[name] < 0).any(), f"{name} is negative in places")
+    _check_segments(arrays, views, count)
+    start = arrays["agreement_start"]
+    _require(_within(row, count), "an agreement names an observation that is not there")
+    cover = len(start) == len(arrays["agreement_round"]) + 1 and (np.diff(start) >= 0).all()
+    _require(cover and start[0] == 0 and start[-1] == len(row), "agreements do not fill their log")
+    for name, array in arrays.items():
+        if name in ("agreement_weight", "agreement_before"):
+            _require(array.shape == row.shape, f"{name} has shape {array.shape}, not {row.shape}")
+        # A box of nothing is infinite.
+        finite = array.dtype.kind != "f" or name == "segment_box" or np.isfinite(array).all()
+        _require(finite, f"{name} holds numbers that are not finite")
 
 
-def check_segments(file: ArrayFile, segments: Segments, views: int) -> None:
-    """Whether segments cover the observations, one behind the other."""
-    start, length, view, box = segments.rows().values()
+def _check_segments(arrays: Mapping[str, NDArray[Any]], views: int, count: Any) -> None:
+    """Refuse segments that do not cover ``count`` observations, one behind the other."""
+    start, length, view, box = (arrays[f"segment_{name}"] for name in Segments.LAYOUT)
     ends = np.cumsum(length, dtype=np.int64)
-    check(file, bool((length > 0).all()) and np.array_equal(start, ends - length))
-    check(file, segments.observations == file.meta.get("count"))
-    # A box of nothing is infinite.
-    check(file, not np.isnan(box).any())
-    check(file, not len(view) or bool(0 <= view.min() <= view.max() < views))
+    behind = bool((length > 0).all()) and np.array_equal(start, ends - length)
+    _require(behind, "segments are not contiguous")
+    _require(length.sum(dtype=np.int64) == count, "segments do not cover the observations")
+    _require(_within(view, views), "a segment names a view that is not there")
+    _require(not np.isnan(box).any(), "segment_box holds numbers that are not finite")
 
 
-def _check(file: ArrayFile, views: int) -> None:
-    """Whether the values of a tile's file fit together."""
-    view, level, row = (file.array(name) for name in ("view", "level", "agreement_row"))
-    count = len(view)
-    check(file, not count or bool(0 <= view.min() <= view.max() < views))
-    check(file, int(level.max(initial=0)) <= MOST_LEVEL)
-    check(file, not len(row) or bool(0 <= row.min() <= row.max() < count))
-    check_segments(file, read_segments(file), views)
-    splat = SplatColumns(*(file.array(name) for name in SplatColumns._fields))
-    check(file, _finite(splat) and bool((splat.confidence >= 0).all()))
-    check(file, bool((splat.spacing >= 0).all()))
-    number, start = file.array("agreement_round"), file.array("agreement_start")
-    check(file, start.shape == (len(number) + 1,) and int(start[0]) == 0)
-    check(file, int(start[-1]) == len(row) and bool((np.diff(start) >= 0).all()))
-    for name in ("weight", "before"):
-        values = file.array(f"agreement_{name}")
-        check(file, values.shape == row.shape and bool(np.isfinite(values).all()))
+def _within(numbers: NDArray[Any], end: int) -> bool:
+    return not len(numbers) or bool(0 <= numbers.min() <= numbers.max() < end)
 
 
-def _finite(rows: SplatColumns) -> bool:
-    """Whether the values of observations are finite."""
-    return bool(all(np.isfinite(column).all() for column in rows if column.dtype.kind == "f"))
+def _require(fits: Any, fault: str) -> None:
+    if not fits:
+        raise ValueError(fault)
 
 
-def _alike(file: ArrayFile, head: str, rows: SplatColumns) -> bool:
-    """Whether a thinned copy's columns have one length and their types."""
-    count = len(rows.spacing)
-    return all(
-        column.shape == ((count, 3) if LAYOUT[name][1] == 3 else (count,))
-        and file.kind(f"{head}{name}") == np.dtype(LAYOUT[name][0])
-        for name, column in rows._asdict().items()
+def _misfit(file: ArrayFile, fault: Exception | str) -> MemoryFileError:
+    return MemoryFileError(
+        f"{file.path}: the tile's parts do not fit together ({fault}); run again"
     )
+
+
+def _splat_columns(file: ArrayFile, head: str = "", *, rows: int | None = None) -> SplatColumns:
+    """The columns of a file that splatting reads; ``rows`` that each must have."""
+    columns = SplatColumns(*(file.array(f"{head}{name}") for name in SplatColumns._fields))
+    for name, column in columns._asdict().items():
+        kind, width = LAYOUT[name]
+        count = len(column) if rows is None else rows
+        fits = column.shape == ((count, width) if width > 1 else (count,)) and column.dtype == kind
+        if not fits or (column.dtype.kind == "f" and not np.isfinite(column).all()):
+            raise _misfit(file, f"{head}{name}")
+    return columns

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from gvtools.errors import ProjectError
 from gvtools.kernels import in_threads
-from gvtools.memory.store.columns import SegmentPlaces, Segments, SplatColumns
-from gvtools.memory.store.observations import Observations
+from gvtools.memory.store.observations import Observations, SegmentPlaces, Segments, SplatColumns
 from gvtools.memory.store.octree import (
     FAR,
     FAR_KEY,
@@ -28,8 +27,7 @@ from gvtools.memory.store.octree import (
     cell_coordinates,
     cell_keys,
 )
-from gvtools.memory.store.thinned_copies import copy_rows, empty_columns
-from gvtools.memory.store.tile import SPLAT_BYTES, Tile
+from gvtools.memory.store.tile import SPLAT_BYTES, Tile, copy_rows, empty_columns
 from gvtools.memory.store.views import ViewTable
 from gvtools.memory.store.voxel_index import VoxelLevels, group_by_block
 
@@ -88,7 +86,8 @@ class TileSet:
         # Bytes of a tile that is being divided, so that its parts find room beside it.
         self.reserved = 0
         self._recent: OrderedDict[int, int] = OrderedDict()
-        self._resident = 0
+        # Bytes that tiles take in RAM.
+        self.resident = 0
         self._folder: Path | None = None
         self._remove: Callable[[], object] = lambda: None
         self._writes = 0
@@ -97,18 +96,11 @@ class TileSet:
         """Begin with no tile, in files."""
         self.whole, self.tiles = None, []
 
-    def outgrown(self) -> bool:
-        """Whether the whole is to be divided."""
-        return (
-            self.budget is not None
-            and self.whole is not None
-            and self.whole.nbytes > IN_RAM * self.budget
-        )
-
-    def page(self) -> Segments:
-        """Divide the whole into tiles; returns the table of all segments, which stays in RAM."""
+    def page(self) -> Segments | None:
+        """Divide a whole that takes half of the budget; returns the table of all segments."""
         whole = self.whole
-        assert whole is not None
+        if whole is None or self.budget is None or whole.nbytes <= IN_RAM * self.budget:
+            return None
         self.clear()
         rows = np.arange(whole.segments.count, dtype=np.int32)
         first = whole.segments.start[: len(rows)]
@@ -155,17 +147,7 @@ class TileSet:
     @property
     def largest(self) -> int:
         """Bytes above which a tile is divided."""
-        return max(SMALLEST, int(LARGEST * self._budget))
-
-    @property
-    def _budget(self) -> int:
-        assert self.budget is not None
-        return self.budget
-
-    @property
-    def resident(self) -> int:
-        """Bytes that tiles take in RAM."""
-        return self._resident
+        return max(SMALLEST, int(LARGEST * (self.budget or 0)))
 
     @property
     def folder(self) -> Path:
@@ -200,27 +182,24 @@ class TileSet:
         """A tile's observations, read into RAM if they are not there."""
         tile = self[number]
         if tile.store is None:
-            tile.load(self._empty(), self.views)
+            tile.load(Observations(self._voxel, self._weight_cap), self.views)
             self.touch(number)
             self.shrink(keep=number)
         assert tile.store is not None
         return tile.store
 
-    def _empty(self) -> Observations:
-        return Observations(self._voxel, self._weight_cap)
-
     def touch(self, number: int) -> None:
         """Note that a tile was used, and how many bytes it takes in RAM now."""
-        self._resident += self[number].resident - self._recent.pop(number, 0)
+        self.resident += self[number].resident - self._recent.pop(number, 0)
         self._recent[number] = self[number].resident
 
     def shrink(self, *, keep: int = -1) -> None:
         """Write tiles, but for ``keep``, to files, the least recently used first, until all fit."""
         if self.whole is not None:
             return
-        limit = CACHE * self._budget - self.reserved - self.places.nbytes
+        limit = CACHE * (self.budget or 0) - self.reserved - self.places.nbytes
         for number in list(self._recent):
-            if self._resident <= max(limit, 0):
+            if self.resident <= max(limit, 0):
                 return
             if number != keep and self._recent[number]:
                 self.evict(number)
@@ -231,7 +210,7 @@ class TileSet:
         if tile.dirty:
             self.write(number)
         tile.release()
-        self._resident -= self._recent.pop(number, 0)
+        self.resident -= self._recent.pop(number, 0)
 
     def write(self, number: int) -> None:
         """Write a changed tile to a file of a new name, and drop the older one."""
@@ -250,7 +229,7 @@ class TileSet:
     def drop(self, number: int) -> None:
         """Remove a tile that was divided or joined."""
         tile = self[number]
-        self._resident -= self._recent.pop(number, 0)
+        self.resident -= self._recent.pop(number, 0)
         if tile.owned and tile.file is not None:
             tile.file.unlink(missing_ok=True)
         self.tiles[number] = None
@@ -261,7 +240,7 @@ class TileSet:
         """Numbers of the tiles that points (N,) belong to, with their points; new ones are made."""
         numbers, nodes = self.octree.tiles_of(positions, spacing, levels, free=len(self.tiles))
         for node in nodes:
-            self.tiles.append(Tile(node, store=self._empty()))
+            self.tiles.append(Tile(node, store=Observations(self._voxel, self._weight_cap)))
             self.touch(len(self.tiles) - 1)
         touched, starts, order = group_by_block(numbers, len(self.tiles))
         return [
@@ -281,7 +260,7 @@ class TileSet:
             return
         length = segments.length[chosen]
         ends = np.cumsum(length, dtype=np.int64)
-        most = int(GATHERED * self._budget) // SPLAT_BYTES
+        most = int(GATHERED * (self.budget or 0)) // SPLAT_BYTES
         first = 0
         while first < len(length) or not first:
             done = int(ends[first - 1]) if first else 0
@@ -443,15 +422,9 @@ def part_levels(
 ) -> tuple[NDArray[np.int64], list[Node]]:
     """Levels of the parts of a cube that is divided until each part is small enough.
 
-    Args:
-        cells: (S, 3) cell coordinates of the segments.
-        weight: (S,) bytes of the segments.
-        level: of the cube, 2**level cells wide.
-        least: smallest level that a part may have.
-        largest: bytes that a part may have.
-
-    Returns:
-        (S,) the level of each segment's part, and the cubes that were divided.
+    The cube is 2**level cells wide and holds segments in ``cells`` (S, 3), of ``weight`` (S,) bytes
+    each; a part has at least level ``least`` and, if it can, at most ``largest`` bytes. Returns the
+    level of each segment's part (S,), and the cubes that were divided.
     """
     levels = np.full(len(cells), level)
     inner: list[Node] = []

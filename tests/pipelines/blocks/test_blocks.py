@@ -99,7 +99,7 @@ def test_every_view_enters_once_and_targets_come_from_their_own_block(walk: Path
 
 
 def test_generated_content_is_that_of_the_blocks_and_stays_out_of_free_space(walk: Path) -> None:
-    from gvtools.memory.occlusion import in_free_space
+    from gvtools.memory.culling import in_free_space
 
     memory = SpatialMemory.load(walk / "merged/memory.npz")
     made = memory.generated

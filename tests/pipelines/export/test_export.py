@@ -13,7 +13,7 @@ from PIL import Image
 from plyfile import PlyData
 
 from gvtools.errors import OptionError, ProjectError
-from gvtools.memory.io.ply import export_memory_ply
+from gvtools.memory.ply import export_memory_ply
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.store.local_frame import LocalFrame
 from gvtools.memory.thinning import thinned

@@ -5,7 +5,7 @@ import pytest
 from memory_scenes import camera, plane_view, random_camera
 
 from gvtools.memory.back_projection import FREE_CELL
-from gvtools.memory.occlusion import FARTHEST, STEP, behind_free_space, in_free_space
+from gvtools.memory.culling import FARTHEST, STEP, behind_free_space, in_free_space
 from gvtools.memory.spatial_memory import SpatialMemory
 
 
