@@ -167,12 +167,11 @@ def posed_scene(
             f"{root}: none of {len(frames)} frames can be read{reasons and f' ({reasons})'}; "
             f"expected at least one with picture and pose; {advice}"
         )
-    for noun, paths in (
-        ("mask", {frame.name: frame.mask for frame in read}),
-        ("depth map", {frame.name: frame.depth for frame in read}),
-    ):
-        missing = [name for name, path in paths.items() if sieve.present(path) is None]
-        if missing and any(paths.values()):
+    measured = any(frame.depth is not None for frame in read)
+    unmasked = [frame.name for frame in read if frame.mask and not sieve.present(frame.mask)]
+    without = [frame.name for frame in read if measured and not sieve.present(frame.depth)]
+    for noun, missing in (("mask", unmasked), ("depth map", without)):
+        if missing:
             line = f"{len(missing)} of {len(read)} frames have no {noun} ({named(missing)})"
             report.append(Finding("warning", line))
     photographs.sort(key=lambda item: natural_key(item.name))

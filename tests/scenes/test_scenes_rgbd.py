@@ -45,7 +45,7 @@ def test_sevenscenes_incomplete_frames_are_dropped_and_counted(tmp_path):
     assert len(scene) == 3
     assert [view.has_depth for view in scene] == [True, False, True]
     assert "1 of 5 frames have no pose: dropped (frame-000001.color.png)" in messages(scene)
-    assert "1 of 5 frames have no picture: dropped (frame-000002.color.png)" in messages(scene)
+    assert "1 of 5 frames have no picture: dropped (frame-000002.color.png; " in messages(scene)
     assert "1 of 3 frames have no depth map (frame-000003.color.png)" in messages(scene)
 
 

@@ -154,7 +154,7 @@ def test_masks_are_given_and_missed_as_those_of_colmap(tmp_path):
     for image in list(reconstruction.images.values())[2:]:
         save(tmp_path / "ignore" / f"{image.name}.png", black)
     for found in (scene, read_colmap(tmp_path / "colmap", masks=tmp_path / "ignore")):
-        assert any("2 of 4 frames have no mask" in message for message in found.findings)
+        assert any("2 of 4 frames have no mask" in item.message for item in found.findings)
     for read in (read_transforms, read_colmap):
         root = tmp_path / "colmap" if read is read_colmap else path
         with pytest.raises(ProjectError, match=r"no such folder \(masks were expected there\)"):
@@ -169,7 +169,7 @@ def test_masks_are_given_and_missed_as_those_of_colmap(tmp_path):
         ({"transform_matrix": [[1, 2], [3]]}, "transform_matrix is no matrix"),
         ({"transform_matrix": (2 * np.eye(4)).tolist()}, "frame 0"),
         ({"transform_matrix": (np.eye(4) * np.nan).tolist()}, "NaN"),
-        ({"file_path": ""}, "no file_path"),
+        ({"file_path": ""}, "file_path is ''"),
     ],
 )
 def test_malformed_frames_say_what_and_where(tmp_path, change, told):
