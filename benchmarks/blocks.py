@@ -15,8 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from gvtools.memory.spatial_memory import SpatialMemory
-from gvtools.runs.memory_file import load_memory
-from gvtools.runs.run import RunTarget, load_run
+from gvtools.runs.run import RunTarget, load_memory, load_run
 from gvtools.scenes.scene import View
 from pipelines.blocks.split import read_blocks
 

@@ -19,7 +19,7 @@ from gvtools.files import replaced_when_written
 from gvtools.guidance import Guidance
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.optional import require
-from gvtools.runs.memory_file import load_appearance, load_memory
+from gvtools.runs.run import load_appearance, load_memory
 from gvtools.trajectories import PATHS, named_path
 from pipelines.reconstruction.rounds import CachedProjection, Clock, complete_targets
 from pipelines.reconstruction.settings import RunSettings

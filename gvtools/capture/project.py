@@ -28,7 +28,7 @@ from gvtools.capture.photographs import CapturedPhotograph, copy_upright, find_p
 from gvtools.capture.placement import WorldPlacement, place
 from gvtools.errors import OptionError, ProjectError
 from gvtools.files import write_json
-from gvtools.runs.folder_lock import folder_lock
+from gvtools.runs.folder import folder_lock
 from gvtools.scenes.faces import picture_of
 from gvtools.scenes.matching import named
 from gvtools.scenes.scene import Finding

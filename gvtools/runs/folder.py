@@ -21,7 +21,6 @@ from gvtools.errors import ProjectError
 from gvtools.files import remove, replaced_when_written, write_json, write_text
 from gvtools.memory.files import copy_tiles
 from gvtools.runs.digests import SUMS, check_sums, versions, write_sums
-from gvtools.runs.folder_lock import folder_lock
 from gvtools.runs.layout import (
     MEMORY,
     METRICS,
@@ -261,3 +260,33 @@ def _clear(part: Path) -> None:
             shutil.rmtree(path)
         elif not fnmatch(path.name, KEPT):
             path.unlink()
+
+
+@contextmanager
+def folder_lock(path: Path) -> Iterator[None]:
+    """Make the folder if need be; as long as the block lasts, other processes are kept out."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        handle = os.open(path, os.O_RDONLY)
+    except OSError as error:
+        raise ProjectError(
+            f"{path}: cannot be made ({error.strerror}); give another --out"
+        ) from None
+    try:
+        _lock(path, handle)
+        yield
+    finally:
+        os.close(handle)
+
+
+def _lock(path: Path, handle: int) -> None:
+    try:
+        import fcntl
+
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise ProjectError(
+            f"{path}: another process is at work there; wait for it, or give another --out"
+        ) from None
+    except (ImportError, OSError):
+        return  # Where the system or the file system knows no locks, the user has to take care.

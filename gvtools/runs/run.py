@@ -13,18 +13,29 @@ import numpy as np
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from gvtools.cameras import Cameras, rigid_transform
-from gvtools.errors import MemoryFileError, ProjectError, ShapeError
+from gvtools.errors import MemoryFileError, OptionError, ProjectError, ShapeError
+from gvtools.memory.files import INDEX
 from gvtools.runs.digests import check_sums
 from gvtools.runs.folder import RunDirectory
-from gvtools.runs.layout import METRICS, RECORD, REPORT, round_folder
-from gvtools.runs.memory_file import load_memory
+from gvtools.runs.layout import (
+    APPEARANCE,
+    MEMORY,
+    METRICS,
+    POINTS,
+    RECORD,
+    REPORT,
+    round_folder,
+    saved_memory,
+)
 from gvtools.runs.poses import refined_poses_of, with_poses
 from gvtools.runs.target_files import TargetFiles, entry_camera, read_target
 from gvtools.untrusted import read_json
 
 if TYPE_CHECKING:
+    from gvtools.appearance.appearance import Appearance
     from gvtools.memory.spatial_memory import SpatialMemory
     from gvtools.scenes.scene import Scene, View
+
 
 # How often a run is read anew whose memory was replaced meanwhile.
 ATTEMPTS = 5
@@ -311,3 +322,57 @@ def read_reports(path: Path) -> tuple[Mapping[str, Any], ...]:
             )
         check_sums(round_folder(path, number), (REPORT,))
     return reports
+
+
+def load_appearance(path: Path) -> Appearance | None:
+    """The Gaussians that a run fitted; None for a file, and for a run without them."""
+    from gvtools.appearance.appearance import Appearance
+
+    file = round_folder(path, 0) / APPEARANCE
+    return Appearance.load(file) if file.exists() else None
+
+
+def load_memory(path: Path, *, up_to: int | None = None) -> SpatialMemory:
+    """The memory in a file or of a run.
+
+    Args:
+        path: a memory file, a folder of tiles, a coloured PLY, or a run's folder; an unfinished run
+            gives that of its last complete round.
+        up_to: forget the rounds after this one; None keeps all.
+    """
+    from gvtools.memory.spatial_memory import SpatialMemory, TiledMemory
+
+    memory: SpatialMemory
+    if path.suffix.lower() == ".ply":
+        # Sums beside a PLY of somebody else's are none of a run.
+        if path.name == POINTS and (path.parent / RECORD).is_file():
+            check_sums(path.parent, (path.name,))
+        memory = SpatialMemory.from_ply(path)
+    else:
+        saved = memory_path(path)
+        memory = TiledMemory.load(saved) if saved.is_dir() else SpatialMemory.load(saved)
+    if up_to is not None:
+        if up_to not in memory.rounds:
+            raise OptionError(
+                f"--round {up_to}: the memory has rounds {', '.join(map(str, memory.rounds))}; "
+                "expected one of them"
+            )
+        for number in reversed(memory.rounds):
+            if number > up_to:
+                memory.forget(round=number)
+    return memory
+
+
+def memory_path(path: Path) -> Path:
+    """The memory that ``path``, a file, a folder of tiles or a run's folder, stands for."""
+    if path.is_file() or (path / INDEX).is_file():
+        return path
+    if not path.is_dir():
+        raise ProjectError(f"{path}: no such file or folder; expected a memory or a run's folder")
+    rounds = sorted(path.glob("round_*"))
+    for candidate in map(saved_memory, (path, *reversed(rounds))):
+        if candidate.exists():
+            return candidate
+    raise ProjectError(
+        f"{path}: holds no {MEMORY} and no round with one; expected a run's folder or a memory file"
+    )

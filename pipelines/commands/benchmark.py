@@ -66,7 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace, console: Console) -> None:
     """Measure what is not measured yet, and write the tables."""
     from gvtools.evaluation.published import load_benchmark
-    from gvtools.runs.folder_lock import folder_lock
+    from gvtools.runs.folder import folder_lock
     from pipelines.scoring.benchmark import measure_apart, measure_cells
     from pipelines.scoring.benchmark_results import PAGE, print_tables, write_results
 

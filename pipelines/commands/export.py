@@ -78,7 +78,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace, console: Console) -> None:
     """Write the export."""
-    from gvtools.runs.memory_file import load_memory
+    from gvtools.runs.run import load_memory
     from pipelines.export.source import ExportSource
 
     form = FORMATS[args.format]

@@ -61,7 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace, console: Console) -> None:
     """Draw and write the film."""
-    from gvtools.runs.memory_file import load_memory
+    from gvtools.runs.run import load_memory
     from pipelines.film import check_suffix, film_cameras, write_film
 
     check_suffix(args.out)

@@ -46,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace, console: Console) -> None:
     """Run what is not finished, and print one table."""
-    from gvtools.runs.folder_lock import folder_lock
+    from gvtools.runs.folder import folder_lock
     from pipelines.fleet.run import jobs_of, report, run_fleet, write_slurm
     from pipelines.fleet.spec import is_url, read_list, tasks_of
 

@@ -72,7 +72,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
     """Project, write pictures, measure."""
     from gvtools.files import write_json
     from gvtools.runs.layout import file_stems
-    from gvtools.runs.memory_file import load_appearance, load_memory
+    from gvtools.runs.run import load_appearance, load_memory
     from gvtools.scenes.selection import select
     from pipelines.rendering import measure, render_view, summary, write_view
 

@@ -63,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace, console: Console) -> None:
     """Sweep, and write table, front and the recommended profile."""
     from gvtools.files import write_json
-    from gvtools.runs.folder_lock import folder_lock
+    from gvtools.runs.folder import folder_lock
     from gvtools.settings import changes
     from pipelines.commands.arguments import reading_of
     from pipelines.reconstruction.plan import run_identity

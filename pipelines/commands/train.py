@@ -90,7 +90,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
     """Train the stages that were asked for."""
     from gvtools.completers.geoverse.weights import WHOLE_FILE
     from gvtools.files import check_parent, make_folder, write_text
-    from gvtools.runs.folder_lock import folder_lock
+    from gvtools.runs.folder import folder_lock
     from gvtools.settings import with_texts
     from gvtools.training.distributed import join_processes
     from gvtools.training.options import shipped_or_read

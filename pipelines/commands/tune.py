@@ -115,7 +115,7 @@ def context_of(scene: Scene, config: RunSettings, folder: Path, *, console: Cons
 
     Targets of ``config`` are not looked at; computed depth goes into ``folder``.
     """
-    from gvtools.runs.depth_cache import DepthCache
+    from gvtools.runs.context_depth import DepthCache
     from gvtools.settings import with_values
     from pipelines.reconstruction.prepare import make_plan, with_depth
 

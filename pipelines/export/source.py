@@ -25,7 +25,7 @@ from gvtools.errors import OptionError, ProjectError
 from gvtools.memory.store.local_frame import LocalFrame
 from gvtools.memory.store.voxel_index import levels_above
 from gvtools.memory.thinning import thinned
-from gvtools.runs.memory_file import load_appearance
+from gvtools.runs.run import load_appearance
 from gvtools.runs.target_files import completed_picture
 
 if TYPE_CHECKING:

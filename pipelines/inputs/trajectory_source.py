@@ -41,7 +41,7 @@ def open_trajectory(path: Path, *, layout: str = "auto", root: Path | None = Non
     if path.is_file() and path.suffix.lower() not in (".json", ".npz"):
         return read_poses(path, layout=layout)
     if path.suffix.lower() == ".npz" or (path / "run.json").is_file():
-        from gvtools.runs.memory_file import load_memory
+        from gvtools.runs.run import load_memory
 
         views = load_memory(path).views
         cameras = views.cameras

@@ -28,7 +28,7 @@ from pipelines.tuning.options import FEWEST_VIEWS
 
 if TYPE_CHECKING:
     from gvtools.depth.source import DepthSource
-    from gvtools.runs.depth_cache import DepthCache
+    from gvtools.runs.context_depth import DepthCache
     from gvtools.runs.folder import RunDirectory
     from gvtools.scans.points import Scan
     from gvtools.scans.registration import Placement, Surface

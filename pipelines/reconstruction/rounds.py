@@ -35,9 +35,10 @@ from gvtools.memory.spatial_memory import FuseReport, SpatialMemory
 from gvtools.memory.splat.api import ONE_PIXEL, SplatOptions
 from gvtools.prefetch import prefetch
 from gvtools.runs.context_depth import (
+    DepthCache,
+    depth_report,
     disagreeing,
 )
-from gvtools.runs.depth_cache import DepthCache, depth_report
 from gvtools.runs.layout import target_stems
 from gvtools.runs.target_files import camera_entry, write_after, write_target
 from gvtools.scenes.scene import Frame, View

@@ -16,9 +16,8 @@ from gvtools.files import folder_replaced_when_written, only_in, recover_folder,
 from gvtools.memory.ply import export_memory_ply
 from gvtools.memory.spatial_memory import SpatialMemory, TiledMemory
 from gvtools.prefetch import prefetch
-from gvtools.runs.depth_cache import DepthCache
-from gvtools.runs.folder import RunDirectory, changed_keys
-from gvtools.runs.folder_lock import folder_lock
+from gvtools.runs.context_depth import DepthCache
+from gvtools.runs.folder import RunDirectory, changed_keys, folder_lock
 from gvtools.runs.layout import (
     APPEARANCE,
     MEMORY,

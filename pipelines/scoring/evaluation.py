@@ -18,8 +18,7 @@ from gvtools.evaluation.splits import protocol_split
 from gvtools.files import write_json
 from gvtools.runs.digests import versions
 from gvtools.runs.layout import RECORD
-from gvtools.runs.memory_file import load_memory
-from gvtools.runs.run import Run, load_run
+from gvtools.runs.run import Run, load_memory, load_run
 from pipelines.console import Console
 from pipelines.report import nested
 from pipelines.scoring.measurement import (

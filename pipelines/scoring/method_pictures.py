@@ -25,9 +25,8 @@ from gvtools.evaluation.picture_sets import (
 )
 from gvtools.evaluation.posed_picture import PosedPicture
 from gvtools.runs.layout import RECORD
-from gvtools.runs.memory_file import load_memory
 from gvtools.runs.poses import refined_poses_of
-from gvtools.runs.run import Run, RunTarget, load_run
+from gvtools.runs.run import Run, RunTarget, load_memory, load_run
 from gvtools.runs.target_files import to_bytes
 from gvtools.scenes.scene import Frame
 from pipelines.console import Console

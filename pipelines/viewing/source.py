@@ -20,8 +20,7 @@ from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.optional import require
 from gvtools.ply import read_header
 from gvtools.runs.layout import RECORD
-from gvtools.runs.memory_file import load_memory
-from gvtools.runs.run import Run, count_rounds, load_growing_run
+from gvtools.runs.run import Run, count_rounds, load_growing_run, load_memory
 from pipelines.export.source import ExportOptions, ExportSource, Splats
 from pipelines.export.splats import is_splat, read_splat_ply, read_spz
 from pipelines.viewing.readers import GREY, load_mesh, read_usd

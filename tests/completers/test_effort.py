@@ -94,15 +94,6 @@ def test_small_holes_go_to_the_cheap_one_and_the_rest_stay_as_they_were():
     assert np.allclose(made.rays[0], guidance.cameras.plucker(0))
 
 
-def test_a_completer_without_views_is_not_called():
-    costly, cheap = Recorder(), Recorder()
-    both = SmallHolesInpainted(costly, 0.05, cheap_one=cheap)
-    both.complete((), guidance_with(2, 3))
-    assert not costly.calls and len(cheap.calls) == 1
-    both.complete((), guidance_with(20))
-    assert len(costly.calls) == 1 and len(cheap.calls) == 1
-
-
 def test_only_costly_completers_leave_views_to_inpaint():
     policy, off = EffortPolicy(inpaint_below=0.02), EffortPolicy(inpaint_below=0)
     costly = Recorder()

@@ -15,9 +15,8 @@ from tiny_scan import write_scan
 
 from gvtools.errors import GvError, ProjectError
 from gvtools.runs.context_depth import UNREADABLE, read_context_depth
-from gvtools.runs.memory_file import load_appearance, load_memory
 from gvtools.runs.poses import RunPoses
-from gvtools.runs.run import load_run
+from gvtools.runs.run import load_appearance, load_memory, load_run
 from pipelines.cli import main
 from pipelines.reconstruction.fitting import Fitted
 

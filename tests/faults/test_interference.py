@@ -15,7 +15,7 @@ from run_files import results
 from gvtools.capture.project import replaced_folder
 from gvtools.errors import ProjectError
 from gvtools.prefetch import prefetch
-from gvtools.runs.folder_lock import folder_lock
+from gvtools.runs.folder import folder_lock
 from gvtools.scenes.colmap_model import CAMERAS
 from pipelines.cli import main
 

@@ -121,6 +121,6 @@ def test_wrong_options_are_refused_and_nothing_is_written(
 
 
 def _memory(run: Path):
-    from gvtools.runs.memory_file import load_memory
+    from gvtools.runs.run import load_memory
 
     return load_memory(run)

@@ -11,7 +11,6 @@ import torch
 
 from gvtools.completers import Completion, ScaleStatus, create
 from gvtools.completers.geoverse.composition import (
-    CERTAIN,
     DOUBTED,
     MOST,
     align_color,
@@ -19,10 +18,9 @@ from gvtools.completers.geoverse.composition import (
     correct_color,
     correct_depth,
     depth_ratios,
-    remove_seams,
     without_seams,
 )
-from gvtools.completers.geoverse.model import Decoded, Generated
+from gvtools.completers.geoverse.model import Decoded
 from gvtools.completers.surface_fill import surface_fill
 from gvtools.errors import OptionError
 
@@ -72,29 +70,6 @@ def test_a_change_of_everything_is_none_and_one_of_the_hole_is_whole():
     grown = correct_depth(depth, torch.where(valid, 1.0, 9.0), torch.ones_like(depth), valid=valid)
     assert torch.allclose(grown, torch.where(valid, depth, MOST * depth), rtol=1e-4)
     assert (correct_depth(torch.zeros_like(depth), depth, depth + 1, valid=valid) == 0).all()
-
-
-def test_a_depth_correction_counts_by_what_exceeds_the_least():
-    """Below it the surface stays as it is; above it, without a step."""
-    depth = torch.full((1, 1, 4, 8), 2.0)
-    valid = torch.zeros(depth.shape, dtype=torch.bool)
-    valid[..., :1] = True
-    hint = torch.ones_like(depth)
-    for change, wanted in (
-        (CERTAIN / 2, 0.0),
-        (-CERTAIN / 2, 0.0),
-        (3 * CERTAIN, 2 * CERTAIN),
-        (-3 * CERTAIN, -2 * CERTAIN),
-    ):
-        made = torch.where(valid, hint, hint * torch.tensor(change).exp())
-        found = correct_depth(depth, made, hint, valid=valid)
-        expected = torch.where(valid, depth, depth * torch.tensor(wanted).exp())
-        assert torch.allclose(found, expected, rtol=1e-5)
-        whole = correct_depth(depth, made, hint, valid=valid, certain=0)
-        assert torch.allclose(whole, torch.where(valid, depth, depth * made), rtol=1e-5)
-    broken = hint.clone()
-    broken[..., 3, 3] = torch.nan
-    assert int(correct_depth(depth, broken, hint, valid=valid).isnan().sum()) == 1
 
 
 def test_every_depth_correction_has_a_gradient_while_training():
@@ -234,12 +209,3 @@ def test_a_broken_pixel_does_not_spread_when_seams_are_taken_away(bad):
     assert int((~smooth.isfinite()).sum()) == 1 and not smooth[0, 1, 7, 8].isfinite()
     picture[0, 0, :6, :6] = bad
     assert int((~without_seams(picture, 6).isfinite()).sum()) == 37
-
-
-def test_a_pass_without_a_hint_is_made_seamless_too():
-    rgb = torch.rand(1, 2, 3, 12, 12, generator=torch.Generator().manual_seed(5))
-    length = torch.ones(1, 2, 12, 12)
-    made = Generated(torch.zeros(1), torch.zeros(1), Decoded(rgb, length, length))
-    joined = remove_seams(made, 6)
-    assert joined.hint is None and joined.decoded.depth is length
-    torch.testing.assert_close(joined.decoded.rgb[0], without_seams(rgb[0], 6))

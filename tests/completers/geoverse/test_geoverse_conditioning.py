@@ -17,7 +17,6 @@ from gvtools.completers.geoverse.conditioning import (
     ViewBatch,
     depth_condition,
     encode_hints,
-    encode_latents,
     feature_mask,
     fill_holes,
 )
@@ -124,17 +123,6 @@ def test_a_token_counts_from_its_share_of_valid_pixels_on():
         assert mask.shape == (1, 1, 1, *micro.GRID) and mask.dtype == torch.float32
         expected = counts >= math.ceil(share * pixels - 1e-9)
         assert torch.equal(mask.flatten() > 0, expected), share
-
-
-@pytest.mark.parametrize("size", [(14, 14), (98, 70), (504, 504)])
-def test_half_of_a_token_is_half_in_every_patch_size(size):
-    """Means of 196 pixels are rounded; half of them is still enough for a share of a half."""
-    valid = torch.zeros(1, 1, 1, *size, dtype=torch.bool)
-    valid[..., ::2, :] = True
-    grid = (size[0] // 14, size[1] // 14)
-    assert feature_mask(valid, grid, 0.5).all()
-    valid[..., 0, 0] = False
-    assert not feature_mask(valid, grid, 0.5)[0, 0, 0, 0, 0]
 
 
 @pytest.mark.parametrize("config", [PAPER, KNOWN_CAMERAS, HintConfig(token="own", mask=0.0)])
@@ -255,18 +243,6 @@ def test_the_context_is_encoded_once_more_only_where_it_is_asked_for(model, monk
         assert sorted(calls, reverse=True) == views, config
 
 
-@torch.no_grad()
-def test_clean_latents_are_hints_of_which_everything_is_known(model):
-    batch = micro.batch(2, share=1.1)
-    batch = with_valid(batch, torch.ones_like(batch.valid[:, 2:]))
-    config = HintConfig(cascade_context="jointly")
-    found = hints(model, batch, config)
-    first, second = model.statistics
-    level0, level1 = encode_latents(model.geometry, first, second, batch=batch, config=HintConfig())
-    close(found.level1, level1)
-    close(found.level0[:, :2], level0[:, :2])
-
-
 def test_depth_is_told_as_its_logarithm_in_the_cameras_unit():
     nan, inf = math.nan, math.inf
     depth = torch.tensor([2.0, nan, inf, -1.0, 0.0, 5.0, 1e9, 1e-9, 1.0]).view(1, 1, 1, 1, 9)
@@ -277,15 +253,6 @@ def test_depth_is_told_as_its_logarithm_in_the_cameras_unit():
     log = [0, 0, 0, 0, 0, 0, limit, -limit, math.log(0.5)]
     torch.testing.assert_close(found[0, 0, 0, 0], torch.tensor(log))
     assert found[0, 0, 1, 0].tolist() == [1, 0, 0, 0, 0, 0, 1, 1, 1]
-
-
-def test_the_depth_condition_of_a_scene_does_not_depend_on_its_unit():
-    batch = micro.batch(2)
-    scale = torch.tensor([0.7, 3.0])
-    expected = depth_condition(batch.depth, batch.valid, scale)
-    found = depth_condition(batch.depth * 1000, batch.valid, scale / 1000)
-    torch.testing.assert_close(found, expected)
-    assert expected[:, :, 0].std() > 0.1
 
 
 @pytest.mark.parametrize("fill", ["none", "push-pull"])

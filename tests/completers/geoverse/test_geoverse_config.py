@@ -65,13 +65,6 @@ def test_wrong_ranges_in_a_file_are_refused():
             from_json(GeoVerseConfig, changed)
 
 
-@pytest.mark.parametrize("name", ["base", "tiny"])
-def test_the_files_say_how_many_views_are_decoded_at_once(name):
-    folder = resources.files("gvtools.completers.geoverse") / "configs"
-    stored = json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
-    assert stored["decode_views"] == named(name).decode_views == 8
-
-
 @pytest.mark.usefixtures("one_thread")
 def test_views_decoded_at_once_change_the_memory_alone(monkeypatch):
     batch = micro.batch(2, context=2, targets=3)

@@ -149,24 +149,6 @@ def test_one_time_a_sample_is_the_same_time_for_its_views():
     assert (net(x, later, known) - expected).abs().max() > 1e-3
 
 
-@torch.no_grad()
-def test_samples_of_a_batch_do_not_see_each_other():
-    net = micro.denoiser().double()
-    x, t, known = micro.conditions(samples=2, dtype=torch.float64)
-    whole = net(x, t, known)
-    for index in range(2):
-        row = slice(index, index + 1)
-        camera = replace(
-            known.camera,
-            map=known.camera.map[row],
-            cam_from_world=known.camera.cam_from_world[row],
-            K=known.camera.K[row],
-        )
-        assert known.depth is not None
-        part = Conditions(known.latents[row], camera, depth=known.depth[row])
-        torch.testing.assert_close(net(x[row], t[row], part), whole[row], rtol=1e-9, atol=1e-9)
-
-
 def permuted(known: Conditions, order: list[int]) -> Conditions:
     assert known.depth is not None
     camera = replace(
@@ -229,13 +211,6 @@ def test_streams_stay_in_full_precision_under_autocast():
     assert seen == [(torch.float32, torch.float32)] * len(net.blocks)
     error = (found.float() - expected).norm() / expected.norm()
     assert 1e-6 < error < 0.03
-
-
-@torch.no_grad()
-def test_all_views_may_be_context_views():
-    net = micro.denoiser()
-    x, t, known = micro.conditions(context=3, targets=0)
-    assert net(x, t, known).shape == x.shape
 
 
 def test_only_the_encoder_is_conditioned_on_the_source():

@@ -199,16 +199,6 @@ def test_without_support_the_next_one_is_asked_and_at_last_none():
             assert bool(found.depth[view].any()) is (method != "none")
 
 
-def test_depth_that_does_not_follow_the_memory_is_no_support():
-    made, truth, valid = scene(views=1)
-    truth = np.random.default_rng(3).uniform(0.1, 10, truth.shape).astype(np.float32)
-    found = scale_depth(made, truth, valid, whole=PassScale(math.nan), alignment="hint")
-    (outcome,) = found.alignment
-    assert outcome.status is ScaleStatus.CONTRADICTED and not found.depth.any()
-    assert outcome.residual > 0.3 and outcome.overlap_px == valid.sum()
-    assert math.isnan(outcome.scale) and not outcome.accepted
-
-
 def test_a_scale_that_contradicts_the_memory_is_not_taken():
     made, truth, valid = scene(views=2, scale=3.0)
     hint = np.where(valid, truth, 0)
@@ -275,13 +265,6 @@ def test_a_plane_stays_a_plane(size):
     rim = max(1, -(-size[0] // 24))
     inner = np.s_[rim:-rim, rim:-rim]
     torch.testing.assert_close(found[inner], plane(*size)[inner], rtol=1e-9, atol=1e-9)
-
-
-def test_depth_at_a_smaller_size_is_that_of_a_pixel():
-    depth = torch.rand(1, 30, 40, generator=torch.Generator().manual_seed(0)) + 1
-    for size in ((7, 9), (30, 39), (60, 20)):
-        found = resample_depth(depth, size)
-        assert torch.isin(found, depth).all()
 
 
 def test_one_scale_a_pass_stands_on_centres_and_on_the_context():

@@ -18,10 +18,9 @@ from gvtools.completers.geoverse.refiner import (
     Refiner,
     RefinerConfig,
     completed_views,
-    crop_views,
     distance_to,
 )
-from gvtools.completers.geoverse.weights import from_pretrained, save_pretrained
+from gvtools.completers.geoverse.weights import save_pretrained
 from gvtools.errors import OptionError
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -118,14 +117,6 @@ def test_any_size_is_taken_and_any_size_refined(size):
     assert picture.shape == large.shape and picture.isfinite().all()
 
 
-def test_a_part_of_the_views_is_cut_out_alike():
-    given = views()
-    part = crop_views(given, (slice(2, 12), slice(4, 20)))
-    assert torch.equal(part.made, given.made[..., 2:12, 4:20])
-    assert torch.equal(part.evidence, given.evidence[..., 2:12, 4:20])
-    assert torch.equal(part.mean, given.mean)
-
-
 def test_the_targets_of_a_batch_are_taken_with_their_contexts_mean():
     batch = fill_holes(micro.batch(2), micro.config(hints={"fill": "push-pull"}).hints)
     made = torch.rand(2, 2, 3, *micro.SIZE)
@@ -162,12 +153,6 @@ def folders(tmp_path_factory):
     save_pretrained(with_one, out / "with")
     save_pretrained(without, out / "without")
     return out
-
-
-def test_it_is_saved_with_the_model_and_absent_from_weights_without(folders):
-    assert from_pretrained(folders / "without").refiner is None
-    found = from_pretrained(folders / "with")
-    assert found.refiner is not None and found.config.refiner == SMALL
 
 
 def test_completions_are_refined_in_holes_alone(folders):

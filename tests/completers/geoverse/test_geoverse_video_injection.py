@@ -78,17 +78,6 @@ def test_the_outputs_learn_first_and_the_rest_of_the_branch_after_them():
     assert gradients(case) == {"adapters": {True}, "blocks": {True}, "outputs": {True}}
 
 
-def test_the_denoiser_itself_learns_as_without_the_branch():
-    case = Case()
-    case.velocity(case.residuals()).square().mean().backward()
-    found = {name: p.grad for name, p in case.net.named_parameters()}
-    case.net.zero_grad(set_to_none=True)
-    case.velocity().square().mean().backward()
-    for name, parameter in case.net.named_parameters():
-        if parameter.requires_grad:
-            assert torch.equal(parameter.grad, found[name]), name
-
-
 def reference(case: Case) -> Tensor:
     """Eqs. 5 and 6, one block after the other."""
     net, branch = case.net, case.branch
@@ -125,16 +114,6 @@ def test_residuals_enter_after_the_configured_blocks_and_no_others(layers):
     for layer in layers:
         rest = {index: value for index, value in residuals.items() if index != layer}
         assert (case.velocity(rest) - expected).abs().max() > 1e-4, layer
-
-
-def test_blocks_are_copies_that_live_on_their_own():
-    case = Case()
-    for copy, layer in zip(case.branch.blocks, LAYERS, strict=True):
-        for (name, own), other in zip(
-            copy.named_parameters(), case.net.blocks[layer].parameters(), strict=True
-        ):
-            assert torch.equal(own, other), name
-            assert own.data_ptr() != other.data_ptr()
 
 
 @torch.no_grad()
@@ -273,32 +252,6 @@ def test_video_tokens_stand_where_the_geometric_ones_stand():
     alone = attention(x, case.positions.encoder)
     torch.testing.assert_close(found, alone, rtol=1e-9, atol=1e-9)
     assert alone.std() > 0.05
-
-
-@torch.no_grad()
-def test_a_finer_video_grid_has_its_tokens_between_the_coarser_ones():
-    model = micro.model(micro.config(injection="shared"))
-    prepared = model.prepare(micro.batch(1), video=micro.video_features(1, 4, grid=micro.GRID))
-    fine = (3 * micro.GRID[0], 3 * micro.GRID[1])
-    features = micro.video_features(1, 4, grid=fine)
-    for level, coarse in zip(features.tensors, prepared.video.tensors, strict=True):
-        level[..., 1::3, 1::3] = coarse
-    found = model.with_video(prepared, features).keys[0].key.unflatten(2, (4, *fine))
-    expected = prepared.keys[0].key.unflatten(2, (4, *micro.GRID))
-    torch.testing.assert_close(found[:, :, :, 1::3, 1::3], expected, rtol=1e-5, atol=1e-5)
-
-
-@torch.no_grad()
-def test_only_coupled_blocks_and_all_of_them_see_the_video():
-    case = SharedCase(gated=False)
-    keys = case.keys()
-    whole, alone = case.velocity(keys), case.velocity(None)
-    assert (whole - alone).abs().max() > 0.01
-    for layer in LAYERS:
-        rest = {index: value for index, value in keys.items() if index != layer}
-        assert (case.velocity(rest) - whole).abs().max() > 1e-4, layer
-    with pytest.raises(KeyError):
-        keys[2]
 
 
 @torch.no_grad()

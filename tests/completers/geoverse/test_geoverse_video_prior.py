@@ -151,35 +151,6 @@ def test_layouts_say_which_latent_holds_which_view() -> None:
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
-def test_a_view_reaches_its_latent_and_no_earlier_one(network: Any, name: str) -> None:
-    prior = tiny.prior(network, layout=name)
-    layout = view_layout(name, 6)
-    images = tiny.views(6, size=(16, 16))[0]
-    with torch.no_grad():
-        before = prior._encoded(images, layout)
-        assert before.shape[2] == len(layout.views_of_latent)
-        for view in range(6):
-            changed = images.clone()
-            changed[:, view] = 1 - changed[:, view]
-            moved = (prior._encoded(changed, layout) - before).abs().amax(dim=(0, 1, 3, 4))
-            where = layout.latent_of_view[view]
-            assert moved[where] > 1e-5
-            assert (moved[:where] == 0).all()
-            if name == "per_view":
-                assert (moved[where + 1 :] == 0).all()
-
-
-def test_a_view_encoded_alone_has_the_latent_it_has_in_company(network: Any) -> None:
-    prior = tiny.prior(network)
-    images = tiny.views(4, batch=2, size=(32, 32))[0]
-    with torch.no_grad():
-        together = prior._encoded(images, view_layout("per_view", 4))
-        for view in range(4):
-            alone = prior._encoded(images[1:, view : view + 1], view_layout("per_view", 1))
-            assert torch.equal(alone[:, :, 0], together[1:, :, view])
-
-
-@pytest.mark.parametrize("name", LAYOUTS)
 def test_views_in_one_latent_share_features_and_others_do_not(network: Any, name: str) -> None:
     images, valid = tiny.views(6)
     features = tiny.prior(network, layout=name).features(images, valid, 1)
@@ -305,15 +276,6 @@ def test_the_zero_latent_is_computed_once_a_resolution(network: Any) -> None:
         assert len(spy.clips) == encoded
 
 
-def test_autocast_around_the_call_changes_nothing(network: Any) -> None:
-    prior = tiny.prior(network)
-    images, valid = tiny.views(2)
-    plain = prior.features(images, valid, 1)
-    with torch.autocast("cpu", dtype=torch.bfloat16):
-        mixed = prior.features(images, valid, 1)
-    assert all(map(torch.equal, plain.tensors, mixed.tensors))
-
-
 def test_sizes_are_multiples_near_the_one_that_is_wanted() -> None:
     assert VideoPriorConfig().size(502, 506) == (496, 512)
     assert VideoPriorConfig(resolution=(576, 576)).size(504, 504) == (576, 576)
@@ -344,14 +306,6 @@ def test_resizing_looks_at_no_invalid_pixel(size: tuple[int, int]) -> None:
     whole = resize_views(images, torch.ones_like(valid), size)[0]
     plain = F.interpolate(images[0], size=size, mode="bilinear", antialias=True)
     torch.testing.assert_close(whole[0], plain)
-
-
-def test_features_move_between_dtypes(network: Any) -> None:
-    features = tiny.prior(network).features(*tiny.views(2), 1)
-    half = features.to(dtype=torch.bfloat16)
-    assert [t.dtype for t in half.tensors] == [torch.bfloat16] * 4
-    assert half.latent_of_view == features.latent_of_view
-    assert features.tensors[0].dtype == torch.float32
 
 
 def test_the_empty_prompt_is_not_zeros(network: Any) -> None:

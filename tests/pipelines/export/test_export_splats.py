@@ -17,7 +17,7 @@ from gvtools.errors import OptionError
 from gvtools.memory.splat.api import SplatOptions
 from gvtools.memory.store.local_frame import LocalFrame
 from gvtools.memory.thinning import thinned
-from gvtools.runs.memory_file import load_appearance
+from gvtools.runs.run import load_appearance
 from pipelines.rendering import render_view
 
 ORIGIN = (431_000.0, 5_650_000.0, 120.0)

@@ -16,7 +16,7 @@ import pytest
 from command_line import refused
 
 from gvtools.errors import OptionError
-from gvtools.runs.folder_lock import folder_lock
+from gvtools.runs.folder import folder_lock
 from pipelines.cli import main
 from pipelines.console import Console
 from pipelines.fleet.run import (

@@ -14,8 +14,7 @@ from tiny_scan import render, world_from_cam, write_colmap_scan, write_scan
 from gvtools.depth import choice
 from gvtools.depth.source import DepthMap
 from gvtools.errors import DegenerateError
-from gvtools.runs.context_depth import off_scale
-from gvtools.runs.depth_cache import colored
+from gvtools.runs.context_depth import colored, off_scale
 from gvtools.scenes.scene import Frame, Scene, View
 from pipelines.cli import main
 

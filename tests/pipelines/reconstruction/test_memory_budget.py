@@ -13,8 +13,7 @@ from tiny_scan import write_scan
 from gvtools.errors import ProjectError
 from gvtools.memory.spatial_memory import TiledMemory
 from gvtools.memory.store import tile_set
-from gvtools.runs.memory_file import load_memory
-from gvtools.runs.run import load_run
+from gvtools.runs.run import load_memory, load_run
 from gvtools.scenes.project import open_project
 from gvtools.settings import with_texts
 from pipelines.cli import main

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from tiny_scan import write_scan
 
-from gvtools.runs.folder_lock import folder_lock
+from gvtools.runs.folder import folder_lock
 from gvtools.settings import changes, with_texts, with_values
 from pipelines.cli import build_parser, main
 from pipelines.commands.tradeoff import asked_for
