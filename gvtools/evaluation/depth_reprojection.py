@@ -30,9 +30,16 @@ from gvtools.evaluation.posed_picture import (
     correspond,
     known_depth,
 )
+from gvtools.evaluation.statistics import mean_of, median_of, share
 
 # What a pair's distribution is kept as, to pool the medians of many pairs.
 QUANTILES = 200
+SHARES = {
+    "covisible_share": Seen.COVISIBLE,
+    "occluded_share": Seen.OCCLUDED,
+    "contradicting_share": Seen.CONTRADICTING,
+    "unknown_share": Seen.UNKNOWN,
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,14 +50,15 @@ class _Figures:
     covisible: int  # pixels that fall inside the second picture, on the surface that second sees
     # Forward-backward distance over the co-visible pixels, pixels of the first view.
     mean_pixels: float | None
-    median_pixels: float | None  # likewise
+    median_pixels: float | None
     mean_relative_depth: float | None  # |z − d₂| / d₂ over the co-visible pixels (0.01 = 1 %)
-    median_relative_depth: float | None  # likewise
-    covisible_share: float | None  # of the pixels inside
-    occluded_share: float | None  # of the pixels inside: behind second's surface
-    # Of the pixels inside: in front of it, in space that second saw free.
+    median_relative_depth: float | None
+    # Of the pixels inside: on second's surface, behind it, in front of it (in space that second
+    # saw free), and where second has no depth.
+    covisible_share: float | None
+    occluded_share: float | None
     contradicting_share: float | None
-    unknown_share: float | None  # of the pixels inside: where second has no depth
+    unknown_share: float | None
 
     @property
     def ok(self) -> bool:
@@ -75,10 +83,8 @@ class DepthReprojectionOfViews(_Figures):
     The medians' ranks are right to half a percent of the pixels.
     """
 
-    # Every pair that was compared, those without overlap included.
-    pairs: tuple[DepthReprojection, ...]
-    # (first, second) names of the pairs that have no co-visible pixel.
-    without_overlap: tuple[tuple[str, str], ...]
+    pairs: tuple[DepthReprojection, ...]  # that were compared, those without overlap included
+    without_overlap: tuple[tuple[str, str], ...]  # names of the pairs without a co-visible pixel
 
 
 def depth_reprojection(
@@ -95,98 +101,75 @@ def depth_reprojection_of_views(
     pictures: Sequence[PosedPicture], *, occlusion: float = 0.05
 ) -> DepthReprojectionOfViews:
     """Depth reprojection of each view into its successor along the path."""
-    found, pixels, relative = [], [], []
-    for first, second in pairwise(pictures):
-        figures, distances, differences = _compare(first, second, occlusion)
-        found.append(figures)
-        pixels.append(_quantiles(distances))
-        relative.append(_quantiles(differences))
-    covisible = np.array([pair.covisible for pair in found], np.int64)
-    inside = np.array([pair.inside for pair in found], np.int64)
-    if not found:
+    compared = [_compare(first, second, occlusion) for first, second in pairwise(pictures)]
+    pairs = [pair for pair, _, _ in compared]
+    covisible = np.array([pair.covisible for pair in pairs], np.int64)
+    inside = np.array([pair.inside for pair in pairs], np.int64)
+    if not pairs:
         status = f"empty: {len(pictures)} view(s); at least 2 are needed"
     elif not covisible.any():
-        status = f"empty: none of the {len(found)} pairs has a co-visible pixel"
+        status = f"empty: none of the {len(pairs)} pairs has a co-visible pixel"
     else:
         status = "measured"
+
+    def pooled(name: str, weights: NDArray[np.int64]) -> float | None:
+        weighed = zip([getattr(pair, name) for pair in pairs], weights.tolist(), strict=True)
+        return share(sum(v * w for v, w in weighed if v is not None), int(weights.sum()))
+
     return DepthReprojectionOfViews(
         status=status,
-        pairs=tuple(found),
-        without_overlap=tuple((pair.first, pair.second) for pair in found if not pair.covisible),
+        pairs=tuple(pairs),
+        without_overlap=tuple((pair.first, pair.second) for pair in pairs if not pair.covisible),
         covisible=int(covisible.sum()),
-        mean_pixels=_weighted_mean([p.mean_pixels for p in found], covisible),
-        median_pixels=_pooled_median(pixels, covisible),
-        mean_relative_depth=_weighted_mean([p.mean_relative_depth for p in found], covisible),
-        median_relative_depth=_pooled_median(relative, covisible),
-        covisible_share=_weighted_mean([p.covisible_share for p in found], inside),
-        occluded_share=_weighted_mean([p.occluded_share for p in found], inside),
-        contradicting_share=_weighted_mean([p.contradicting_share for p in found], inside),
-        unknown_share=_weighted_mean([p.unknown_share for p in found], inside),
+        mean_pixels=pooled("mean_pixels", covisible),
+        median_pixels=_pooled_median([pixels for _, pixels, _ in compared], covisible),
+        mean_relative_depth=pooled("mean_relative_depth", covisible),
+        median_relative_depth=_pooled_median([relative for *_, relative in compared], covisible),
+        **{name: pooled(name, inside) for name in SHARES},
     )
 
 
 def _compare(
     first: PosedPicture, second: PosedPicture, occlusion: float
 ) -> tuple[DepthReprojection, Float64, Float64]:
-    """The figures of a pair, and the distances and relative differences behind them."""
-    found = correspond(first, second, occlusion=occlusion)
-    on = found.seen == Seen.COVISIBLE
-    inside = len(found.seen) - found.count(Seen.OUTSIDE)
-    pixels = np.linalg.norm(found.back[on] - found.start[on], axis=-1)
-    relative = np.abs(found.z[on] / found.depth[on] - 1)
-
-    def share(kind: Seen) -> float | None:
-        return found.count(kind) / inside if inside else None
-
+    """The figures of a pair, and quantiles of its distances and of its relative differences."""
+    seen = correspond(first, second, occlusion=occlusion)
+    on = seen.seen == Seen.COVISIBLE
+    inside = len(seen.seen) - seen.count(Seen.OUTSIDE)
+    pixels = np.linalg.norm(seen.back[on] - seen.start[on], axis=-1)
+    relative = np.abs(seen.z[on] / seen.depth[on] - 1)
     figures = DepthReprojection(
         first=first.name,
         second=second.name,
-        status=_status(first, second, found),
-        known=len(found.seen),
+        status=_status(first, second, seen),
+        known=len(seen.seen),
         inside=inside,
         covisible=int(on.sum()),
-        mean_pixels=_mean(pixels),
-        median_pixels=_median(pixels),
-        mean_relative_depth=_mean(relative),
-        median_relative_depth=_median(relative),
-        covisible_share=share(Seen.COVISIBLE),
-        occluded_share=share(Seen.OCCLUDED),
-        contradicting_share=share(Seen.CONTRADICTING),
-        unknown_share=share(Seen.UNKNOWN),
+        mean_pixels=mean_of(pixels),
+        median_pixels=median_of(pixels),
+        mean_relative_depth=mean_of(relative),
+        median_relative_depth=median_of(relative),
+        **{name: share(seen.count(kind), inside) for name, kind in SHARES.items()},
     )
-    return figures, pixels, relative
+    return figures, _quantiles(pixels), _quantiles(relative)
 
 
-def _status(first: PosedPicture, second: PosedPicture, found: Correspondence) -> str:
-    if found.count(Seen.COVISIBLE):
+def _status(first: PosedPicture, second: PosedPicture, seen: Correspondence) -> str:
+    if seen.count(Seen.COVISIBLE):
         return "measured"
-    if not len(found.seen):
+    if not len(seen.seen):
         return f"empty: {first.name} has no pixel with depth"
-    if found.count(Seen.OUTSIDE) == len(found.seen):
+    if seen.count(Seen.OUTSIDE) == len(seen.seen):
         return f"empty: nothing of {first.name} falls inside {second.name}"
     if not known_depth(second)[0].any():
         return f"empty: {second.name} has no pixel with depth"
     return f"empty: {first.name} and {second.name} see no common surface"
 
 
-def _mean(values: Float64) -> float | None:
-    return float(values.mean()) if values.size else None
-
-
-def _median(values: Float64) -> float | None:
-    return float(np.median(values)) if values.size else None
-
-
 def _quantiles(values: Float64) -> Float64:
     """Values that stand for equal parts of the distribution; none of none."""
     parts = (np.arange(QUANTILES) + 0.5) / QUANTILES
     return np.quantile(values, parts) if values.size else np.zeros(0)
-
-
-def _weighted_mean(values: Sequence[float | None], weights: NDArray[np.int64]) -> float | None:
-    total = int(weights.sum())
-    pairs = zip(values, weights.tolist(), strict=True)
-    return sum(v * w for v, w in pairs if v is not None) / total if total else None
 
 
 def _pooled_median(quantiles: Sequence[Float64], weights: NDArray[np.int64]) -> float | None:

@@ -2,10 +2,10 @@
 
 In the manner of MEt3R (M. Asim et al., "MEt3R: Measuring Multi-View Consistency in Generated
 Images", CVPR 2025): the mean of 1 - cosine over the overlap; lower is better. MEt3R takes DINO
-features and a geometry that MASt3R guesses from the two pictures; here both are the caller's: a
-`FeatureNetwork`, and the depth and cameras of the pictures. Features are taken from where each
-place of the first view falls in the second, with the occlusion test of `correspond`. The numbers
-are on another scale than MEt3R's, which `met3r_score` calls as it is.
+features and a geometry that MASt3R guesses from the two pictures; here features need no weights,
+and depth and cameras are those of the pictures. Features are taken from where each place of the
+first view falls in the second, with the occlusion test of `correspond`. The numbers are on another
+scale than MEt3R's, which `met3r_score` calls as it is.
 
 A score alone says little: pictures of nothing are consistent, and so are repeats. Beside it stands
 what the same network and geometry give for content that does not belong there.
@@ -23,7 +23,6 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter
 
 from gvtools.cameras import Float64
-from gvtools.errors import ShapeError
 from gvtools.evaluation.posed_picture import PosedPicture, Seen, correspond
 
 Float32 = NDArray[np.float32]
@@ -113,11 +112,9 @@ def _neighbours(cells: Float32) -> Float32:
 
 
 class FeatureNetwork(Protocol):
-    """What turns a picture into features."""
+    """Turns a picture into features."""
 
-    @property
-    def name(self) -> str:
-        """What the score is reported under."""
+    name: str  # what the score is reported under
 
     def features(self, rgb: NDArray[np.uint8]) -> Float32:
         """(C, h, w) features of an (H, W, 3) picture, whose h x w cells cover it evenly."""
@@ -129,7 +126,7 @@ class FeatureConsistency:
 
     first: str  # name of the view whose places were compared
     second: str  # name of the view whose features were carried there
-    network: str  # name of the feature network
+    network: str
     # "measured", "empty: ..." where nothing could be compared, or "degenerate: ..." where the
     # network tells no content from any other.
     status: str
@@ -147,17 +144,6 @@ class FeatureConsistency:
         return self.status == "measured"
 
 
-@dataclass(frozen=True)
-class Met3rScore:
-    """What the original MEt3R says of two pictures."""
-
-    first: str  # name of a view
-    second: str  # name of the other
-    status: str  # "measured", or "empty: ..." where MEt3R finds no overlap
-    score: float | None  # MEt3R, lower is better; None unless measured
-    overlap: float  # share of the first picture that MEt3R compares
-
-
 def feature_consistency(
     first: PosedPicture,
     second: PosedPicture,
@@ -167,16 +153,11 @@ def feature_consistency(
 ) -> FeatureConsistency:
     """Compare second's features, carried into first by depth and cameras, with first's.
 
-    Both pictures need depth, second for the occlusion test. Without a network, features are those
-    of `DenseGradient`, which needs no weights.
+    Both pictures need depth, second for the occlusion test. The network is `DenseGradient` unless
+    another is given.
     """
     network = network or DenseGradient()
-    ours, theirs = _features(network, first), _features(network, second)
-    if len(ours) != len(theirs):
-        raise ShapeError(
-            f"{network.name}: {len(ours)} and {len(theirs)} feature channels; expected one number "
-            "for all pictures"
-        )
+    ours, theirs = network.features(first.rgb), network.features(second.rgb)
     where = _places(first, ours)
     found = correspond(first, second, occlusion=occlusion, where=where)
     on = found.seen == Seen.COVISIBLE
@@ -185,9 +166,19 @@ def feature_consistency(
     own = _sample(ours, here)
     score, undefined = _dissimilarity(own, _sample(theirs, there))
     rolled = np.roll(theirs, [n // 2 for n in theirs.shape[1:]], (1, 2))
-    reference, _ = _dissimilarity(own, _sample(rolled, there))
+    unrelated, _ = _dissimilarity(own, _sample(rolled, there))
+    if score is None and first.depth is not None and second.depth is not None:
+        status = f"empty: {first.name} and {second.name} have no co-visible place with features"
+    elif score is None:
+        status = f"empty: {first.name if first.depth is None else second.name} has no depth"
+    elif unrelated is not None and unrelated < LEAST_SCALE:
+        status = (
+            f"degenerate: {network.name} gives unrelated content {unrelated:.3g}; it tells nothing "
+            "apart here"
+        )
+    else:
+        status = "measured"
     compared = len(here) - undefined
-    status = _status(first, second, network.name, score=score, reference=reference)
     return FeatureConsistency(
         first=first.name,
         second=second.name,
@@ -197,29 +188,19 @@ def feature_consistency(
         overlap=compared / int(where.sum()),
         places=compared,
         undefined=undefined,
-        unrelated=reference,
+        unrelated=unrelated,
     )
 
 
-def _status(
-    first: PosedPicture,
-    second: PosedPicture,
-    network: str,
-    *,
-    score: float | None,
-    reference: float | None,
-) -> str:
-    """What the scores of second and of unrelated content stand for."""
-    if score is None and first.depth is not None and second.depth is not None:
-        return f"empty: {first.name} and {second.name} have no co-visible place with features"
-    if score is None:
-        return f"empty: {first.name if first.depth is None else second.name} has no depth"
-    if reference is not None and reference < LEAST_SCALE:
-        return (
-            f"degenerate: {network} gives unrelated content {reference:.3g}; it tells nothing "
-            "apart here"
-        )
-    return "measured"
+@dataclass(frozen=True)
+class Met3rScore:
+    """What the original MEt3R says of two pictures."""
+
+    first: str  # name of a view
+    second: str  # name of the other
+    status: str  # "measured", or "empty: ..." where MEt3R finds no overlap
+    score: float | None  # lower is better; None unless measured
+    overlap: float  # share of the first picture that MEt3R compares
 
 
 def load_met3r(size: int = 256) -> tuple[Callable[..., Any] | None, str]:
@@ -266,21 +247,10 @@ def met3r_score(
             return_projections=False,
         )
     overlap = float(mask.float().mean())
-    if overlap == 0:
-        status = "empty: MEt3R finds no overlap"
-        return Met3rScore(first.name, second.name, status, None, overlap)
-    return Met3rScore(first.name, second.name, "measured", float(score.mean()), overlap)
-
-
-def _features(network: FeatureNetwork, picture: PosedPicture) -> Float32:
-    features = np.asarray(network.features(picture.rgb))
-    if features.ndim != 3 or not features.size or not np.isfinite(features).all():
-        raise ShapeError(
-            f"{network.name}: features of {picture.name} have shape {features.shape}"
-            f"{'' if np.isfinite(features).all() else ' and are not finite'}; expected finite "
-            "(C, h, w)"
-        )
-    return features
+    empty = overlap == 0
+    status = "empty: MEt3R finds no overlap" if empty else "measured"
+    value = None if empty else float(score.mean())
+    return Met3rScore(first.name, second.name, status, value, overlap)
 
 
 def _places(picture: PosedPicture, features: Float32) -> NDArray[np.bool_]:

@@ -34,8 +34,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras, Float64, concatenate, invert_rigid
-from gvtools.errors import ProjectError, ShapeError
+from gvtools.errors import ShapeError
 from gvtools.evaluation.posed_picture import PosedPicture
+from gvtools.evaluation.statistics import median_of, share
 from gvtools.features import quiet_colmap
 from gvtools.poses.colmap import posed_model, row_of, set_intrinsics, write_pictures
 
@@ -55,118 +56,6 @@ EPIPOLAR_LIMIT = 4.0
 # rounding moves them by, have no epipolar geometry.
 COINCIDENT = 1e-6
 ROUNDING = 1e-12
-
-
-@dataclass(frozen=True, eq=False)
-class VerifiedMatches:
-    """Matches between two pictures that a two-view geometry estimated from them agrees with."""
-
-    i: int  # number of a picture
-    j: int  # number of the other, above i
-    rows: NDArray[np.uint32]  # (M, 2) uint32, the features' numbers in picture i and in picture j
-
-
-@dataclass(frozen=True, eq=False)
-class Matched:
-    """Features and matches of a set of pictures."""
-
-    keypoints: tuple[Float64, ...]  # per picture (N, 2) float64, places of its features, pixels
-    # Those with at least ``MIN_MATCHES`` verified matches, in order.
-    pairs: tuple[VerifiedMatches, ...] = ()
-
-
-def match_pictures(pictures: Sequence[PosedPicture], folder: Path, *, seed: int) -> Matched:
-    """Extract features, where no mask is False, and match every pair; the poses play no part.
-
-    The empty folder receives the pictures, masks and ``database.db``.
-    """
-    import pycolmap
-
-    names = write_pictures(((picture.rgb, picture.mask) for picture in pictures), folder)
-    (folder / "model").mkdir()
-    database = folder / "database.db"
-    reader = pycolmap.ImageReaderOptions(camera_model="PINHOLE", mask_path=folder / "masks")
-    pycolmap.extract_features(
-        database,
-        folder / "images",
-        image_names=names,
-        camera_mode=pycolmap.CameraMode.PER_IMAGE,
-        reader_options=reader,
-        extraction_options=pycolmap.FeatureExtractionOptions(use_gpu=False, num_threads=1),
-        device=pycolmap.Device.cpu,
-    )
-    set_intrinsics(database, np.concatenate([picture.camera.K for picture in pictures]))
-    verification = pycolmap.TwoViewGeometryOptions(min_num_inliers=MIN_MATCHES)
-    verification.ransac.random_seed = seed
-    pycolmap.set_random_seed(seed)
-    pycolmap.match_exhaustive(
-        database,
-        matching_options=pycolmap.FeatureMatchingOptions(use_gpu=False, num_threads=1),
-        verification_options=verification,
-        device=pycolmap.Device.cpu,
-    )
-    return _read_matches(database, len(pictures))
-
-
-def triangulate(
-    pictures: Sequence[PosedPicture], matched: Matched, folder: Path, *, limit: float, seed: int
-) -> pycolmap.Reconstruction:
-    """Triangulate the verified matches of at least one pair; poses and intrinsics stay as they are.
-
-    The folder is that of the matching and receives the model; ``limit`` is the largest reprojection
-    error of an observation, pixels.
-    """
-    import pycolmap
-
-    poses = np.concatenate([picture.camera.cam_from_world for picture in pictures])
-    model = posed_model(folder / "database.db", poses)
-    focal = min(float(picture.camera.K[0, 0, 0]) for picture in pictures)
-    angle = float(np.degrees(np.arctan(limit / focal)))
-    options = pycolmap.IncrementalPipelineOptions(
-        num_threads=1, random_seed=seed, min_num_matches=MIN_MATCHES, extract_colors=False
-    )
-    options.mapper.filter_max_reproj_error = limit
-    options.mapper.filter_min_tri_angle = MIN_TRIANGULATION_ANGLE
-    options.triangulation.ignore_two_view_tracks = False
-    options.triangulation.min_angle = MIN_TRIANGULATION_ANGLE
-    options.triangulation.create_max_angle_error = angle
-    options.triangulation.continue_max_angle_error = angle
-    options.triangulation.merge_max_reproj_error = limit
-    options.triangulation.complete_max_reproj_error = limit
-    options.triangulation.random_seed = seed
-    return pycolmap.triangulate_points(
-        model, folder / "database.db", folder / "images", folder / "model", options=options
-    )
-
-
-def observed_points(
-    model: pycolmap.Reconstruction | None, matched: Matched
-) -> list[NDArray[np.int64]]:
-    """Per picture, for each of its features the point that it observes, -1 for none."""
-    observed = [np.full(len(places), -1) for places in matched.keypoints]
-    for image in model.images.values() if model else ():
-        for row in image.get_observation_point2D_idxs():
-            observed[row_of(image)][row] = image.points2D[row].point3D_id
-    return observed
-
-
-def _read_matches(database: Path, count: int) -> Matched:
-    import pycolmap
-
-    keypoints = [np.zeros((0, 2)) for _ in range(count)]
-    pairs = []
-    with pycolmap.Database.open(database) as opened:
-        number = {image.image_id: row_of(image) for image in opened.read_all_images()}
-        for image, row in number.items():
-            keypoints[row] = opened.read_keypoints(image)[:, :2].astype(np.float64)
-        for pair, geometry in zip(*opened.read_two_view_geometries(), strict=True):
-            i, j = (number[image] for image in pycolmap.pair_id_to_image_pair(pair))
-            rows = np.asarray(geometry.inlier_matches)
-            if len(rows) >= MIN_MATCHES:
-                pairs.append(
-                    VerifiedMatches(i, j, rows) if i < j else VerifiedMatches(j, i, rows[:, ::-1])
-                )
-    return Matched(tuple(keypoints), tuple(sorted(pairs, key=lambda pair: (pair.i, pair.j))))
 
 
 @dataclass(frozen=True)
@@ -218,7 +107,7 @@ def verify_geometry(
     """Match the pictures with one another and triangulate with their poses fixed.
 
     Equal pictures and seed give equal figures. Time grows with the number of pairs. Features where
-    a picture's mask is False are not used. A new or empty ``workspace`` keeps the pictures, the
+    a picture's mask is False are not used. An empty folder, ``workspace``, keeps the pictures, the
     database and the model.
     """
     for picture in pictures:
@@ -228,13 +117,101 @@ def verify_geometry(
                 f"picture {picture.name}: a camera with skew {skew:.6g}; expected 0, COLMAP's "
                 "PINHOLE has none; resample the picture"
             )
-    if workspace is None:
-        with tempfile.TemporaryDirectory(prefix="gvtools-") as folder:
-            return _verify(pictures, Path(folder), seed)
-    workspace.mkdir(parents=True, exist_ok=True)
-    if any(workspace.iterdir()):
-        raise ProjectError(f"{workspace} is not empty; expected a new folder; name another")
-    return _verify(pictures, workspace, seed)
+    if workspace is not None:
+        return _verify(pictures, workspace, seed)
+    with tempfile.TemporaryDirectory(prefix="gvtools-") as folder:
+        return _verify(pictures, Path(folder), seed)
+
+
+def _verify(pictures: Sequence[PosedPicture], folder: Path, seed: int) -> GeometricVerification:
+    limit = REPROJECTION_LIMIT * max((max(p.rgb.shape[:2]) for p in pictures), default=0)
+    matched = _Matched([np.zeros((0, 2)) for _ in pictures], [])
+    distances: list[Float64] = []
+    model = None
+    if len(pictures) > 1:
+        with quiet_colmap():
+            matched = _match(pictures, folder, seed)
+            distances = _distances(pictures, matched)
+            if any(map(len, distances)):
+                model = _triangulate(pictures, folder, limit=limit, seed=seed)
+    return _summary(pictures, matched, distances, model=model, limit=limit)
+
+
+@dataclass(frozen=True, eq=False)
+class _Pair:
+    """Matches between two pictures that a two-view geometry estimated from them agrees with."""
+
+    i: int  # number of a picture
+    j: int  # number of the other, above i
+    rows: NDArray[np.uint32]  # (M, 2) uint32, the features' numbers in picture i and in picture j
+
+
+@dataclass(frozen=True, eq=False)
+class _Matched:
+    """Features and matches of a set of pictures."""
+
+    keypoints: list[Float64]  # per picture (N, 2) float64, places of its features, pixels
+    pairs: list[_Pair]  # those with at least ``MIN_MATCHES`` verified matches, in order
+
+
+def _match(pictures: Sequence[PosedPicture], folder: Path, seed: int) -> _Matched:
+    """Extract features, where no mask is False, and match every pair; the poses play no part."""
+    import pycolmap
+
+    names = write_pictures(((picture.rgb, picture.mask) for picture in pictures), folder)
+    (folder / "model").mkdir()
+    database = folder / "database.db"
+    reader = pycolmap.ImageReaderOptions(camera_model="PINHOLE", mask_path=folder / "masks")
+    pycolmap.extract_features(
+        database,
+        folder / "images",
+        image_names=names,
+        camera_mode=pycolmap.CameraMode.PER_IMAGE,
+        reader_options=reader,
+        extraction_options=pycolmap.FeatureExtractionOptions(use_gpu=False, num_threads=1),
+        device=pycolmap.Device.cpu,
+    )
+    set_intrinsics(database, np.concatenate([picture.camera.K for picture in pictures]))
+    verification = pycolmap.TwoViewGeometryOptions(min_num_inliers=MIN_MATCHES)
+    verification.ransac.random_seed = seed
+    pycolmap.set_random_seed(seed)
+    pycolmap.match_exhaustive(
+        database,
+        matching_options=pycolmap.FeatureMatchingOptions(use_gpu=False, num_threads=1),
+        verification_options=verification,
+        device=pycolmap.Device.cpu,
+    )
+    keypoints = [np.zeros((0, 2)) for _ in pictures]
+    pairs = []
+    with pycolmap.Database.open(database) as opened:
+        number = {image.image_id: row_of(image) for image in opened.read_all_images()}
+        for image, row in number.items():
+            keypoints[row] = opened.read_keypoints(image)[:, :2].astype(np.float64)
+        for pair, geometry in zip(*opened.read_two_view_geometries(), strict=True):
+            i, j = (number[image] for image in pycolmap.pair_id_to_image_pair(pair))
+            rows = np.asarray(geometry.inlier_matches)
+            if len(rows) >= MIN_MATCHES:
+                pairs.append(_Pair(i, j, rows) if i < j else _Pair(j, i, rows[:, ::-1]))
+    return _Matched(keypoints, sorted(pairs, key=lambda pair: (pair.i, pair.j)))
+
+
+def _distances(pictures: Sequence[PosedPicture], matched: _Matched) -> list[Float64]:
+    """Per pair the epipolar distances of its matches; none where both centres are one."""
+    if not matched.pairs:
+        return []
+    centers = concatenate([picture.camera for picture in pictures]).centers
+    extent = np.linalg.norm(np.ptp(centers, axis=0))
+    near = max(COINCIDENT * extent, ROUNDING * np.abs(centers).max())
+    distances = []
+    for pair in matched.pairs:
+        if np.linalg.norm(centers[pair.i] - centers[pair.j]) <= near:
+            distances.append(np.zeros(0))
+            continue
+        first, second = matched.keypoints[pair.i], matched.keypoints[pair.j]
+        places = first[pair.rows[:, 0]], second[pair.rows[:, 1]]
+        cameras = pictures[pair.i].camera, pictures[pair.j].camera
+        distances.append(epipolar_distances(*cameras, places))
+    return distances
 
 
 def epipolar_distances(first: Cameras, second: Cameras, places: tuple[Float64, Float64]) -> Float64:
@@ -260,56 +237,72 @@ def epipolar_distances(first: Cameras, second: Cameras, places: tuple[Float64, F
     return distance
 
 
-def _verify(pictures: Sequence[PosedPicture], folder: Path, seed: int) -> GeometricVerification:
-    side = max((max(picture.rgb.shape[:2]) for picture in pictures), default=0)
-    limit = REPROJECTION_LIMIT * side
-    matched = Matched(tuple(np.zeros((0, 2)) for _ in pictures))
-    distances: list[Float64] = []
-    model = None
-    if len(pictures) > 1:
-        with quiet_colmap():
-            matched = match_pictures(pictures, folder, seed=seed)
-            distances = _distances(pictures, matched)
-            if any(map(len, distances)):
-                model = triangulate(pictures, matched, folder, limit=limit, seed=seed)
-    return _summary(pictures, matched, distances, model=model, limit=limit)
+def _triangulate(
+    pictures: Sequence[PosedPicture], folder: Path, *, limit: float, seed: int
+) -> pycolmap.Reconstruction:
+    """Triangulate the verified matches; poses and intrinsics stay as they are."""
+    import pycolmap
+
+    poses = np.concatenate([picture.camera.cam_from_world for picture in pictures])
+    model = posed_model(folder / "database.db", poses)
+    focal = min(float(picture.camera.K[0, 0, 0]) for picture in pictures)
+    angle = float(np.degrees(np.arctan(limit / focal)))
+    options = pycolmap.IncrementalPipelineOptions(
+        num_threads=1, random_seed=seed, min_num_matches=MIN_MATCHES, extract_colors=False
+    )
+    options.mapper.filter_max_reproj_error = limit
+    options.mapper.filter_min_tri_angle = MIN_TRIANGULATION_ANGLE
+    options.triangulation.ignore_two_view_tracks = False
+    options.triangulation.min_angle = MIN_TRIANGULATION_ANGLE
+    options.triangulation.create_max_angle_error = angle
+    options.triangulation.continue_max_angle_error = angle
+    options.triangulation.merge_max_reproj_error = limit
+    options.triangulation.complete_max_reproj_error = limit
+    options.triangulation.random_seed = seed
+    return pycolmap.triangulate_points(
+        model, folder / "database.db", folder / "images", folder / "model", options=options
+    )
 
 
 def _summary(
     pictures: Sequence[PosedPicture],
-    matched: Matched,
+    matched: _Matched,
     distances: Sequence[Float64],
     *,
     model: pycolmap.Reconstruction | None,
     limit: float,
 ) -> GeometricVerification:
-    count = len(pictures)
-    possible = count * (count - 1) // 2
-    observed = observed_points(model, matched)
+    # Per picture, for each of its features the point that it observes, -1 for none.
+    observed = [np.full(len(places), -1) for places in matched.keypoints]
+    for image in model.images.values() if model else ():
+        for row in image.get_observation_point2D_idxs():
+            observed[row_of(image)][row] = image.points2D[row].point3D_id
     pairs = []
     for pair, distance in zip(matched.pairs, distances, strict=True):
         point = observed[pair.i][pair.rows[:, 0]]
         common = (point >= 0) & (point == observed[pair.j][pair.rows[:, 1]])
         first, second = pictures[pair.i].name, pictures[pair.j].name
-        pairs.append(
-            PairVerification(first, second, len(pair.rows), int(common.sum()), _median(distance))
-        )
+        epipolar = median_of(distance)
+        pairs.append(PairVerification(first, second, len(common), int(common.sum()), epipolar))
     verified = sum(pair.verified for pair in pairs)
     connected = {number for pair in matched.pairs for number in (pair.i, pair.j)}
     registered = [bool((points >= 0).any()) for points in observed]
     every = np.concatenate([np.zeros(0), *distances])
     points = model.num_points3D() if model else 0
+    # A single picture has no figures.
+    possible = len(pictures) * (len(pictures) - 1) // 2
+    count = len(pictures) if possible else 0
     return GeometricVerification(
-        status=_status(count, matched, points=points, apart=bool(every.size)),
-        images=count,
+        status=_status(matched, verified, points=points, apart=bool(every.size)),
+        images=len(pictures),
         pairs=tuple(pairs),
-        mean_features=_share(sum(map(len, matched.keypoints)), count if possible else 0),
-        mean_verified=_share(verified, possible),
-        verified_share=_share(len(connected), count if possible else 0),
-        epipolar=_median(every),
-        epipolar_inlier_share=_share(int((every <= EPIPOLAR_LIMIT).sum()), len(every)),
-        triangulated_share=_share(sum(pair.triangulated for pair in pairs), verified),
-        registered_share=_share(sum(registered), count if possible else 0),
+        mean_features=share(sum(map(len, matched.keypoints)), count),
+        mean_verified=share(verified, possible),
+        verified_share=share(len(connected), count),
+        epipolar=median_of(every),
+        epipolar_inlier_share=share(int((every <= EPIPOLAR_LIMIT).sum()), len(every)),
+        triangulated_share=share(sum(pair.triangulated for pair in pairs), verified),
+        registered_share=share(sum(registered), count),
         unregistered=tuple(
             picture.name for picture, seen in zip(pictures, registered, strict=True) if not seen
         ),
@@ -320,47 +313,18 @@ def _summary(
     )
 
 
-def _distances(pictures: Sequence[PosedPicture], matched: Matched) -> list[Float64]:
-    """Per pair the epipolar distances of its matches; none where both centres are one."""
-    if not matched.pairs:
-        return []
-    centers = concatenate([picture.camera for picture in pictures]).centers
-    extent = np.linalg.norm(np.ptp(centers, axis=0))
-    near = max(COINCIDENT * extent, ROUNDING * np.abs(centers).max())
-    distances = []
-    for pair in matched.pairs:
-        if np.linalg.norm(centers[pair.i] - centers[pair.j]) <= near:
-            distances.append(np.zeros(0))
-            continue
-        places = (
-            matched.keypoints[pair.i][pair.rows[:, 0]],
-            matched.keypoints[pair.j][pair.rows[:, 1]],
-        )
-        cameras = pictures[pair.i].camera, pictures[pair.j].camera
-        distances.append(epipolar_distances(*cameras, places))
-    return distances
-
-
-def _status(count: int, matched: Matched, *, points: int, apart: bool) -> str:
+def _status(matched: _Matched, verified: int, *, points: int, apart: bool) -> str:
+    count = len(matched.keypoints)
     if points:
         return "triangulated"
     if count < 2:
         return f"empty: {count} picture(s); at least 2 are needed"
-    if not matched.pairs:
+    if not verified:
         features = sum(map(len, matched.keypoints))
         return (
             f"empty: no pair of the {count} pictures ({features} features) has {MIN_MATCHES} "
             "verified matches"
         )
-    verified = sum(len(pair.rows) for pair in matched.pairs)
     if not apart:
         return f"empty: {verified} verified matches, but none between cameras with two centres"
     return f"empty: none of the {verified} verified matches could be triangulated at the poses"
-
-
-def _share(part: int, whole: int) -> float | None:
-    return part / whole if whole else None
-
-
-def _median(values: Float64) -> float | None:
-    return float(np.median(values)) if values.size else None

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gvtools.errors import ShapeError
+from gvtools.evaluation.statistics import mean_of, median_of
 
 if TYPE_CHECKING:
     from gvtools.evaluation.lpips_distance import Lpips
@@ -24,8 +25,17 @@ SIGMA, SIDE = 1.5, 11
 K1, K2 = 0.01, 0.03
 # Nearer to the border, windows would see pixels that are not there.
 SSIM_BORDER = SIDE // 2
+INNER = (slice(SSIM_BORDER, -SSIM_BORDER),) * 2
 # Colours may lie outside [0, 1], as noise does, but not by more than the data range.
 LOWEST, HIGHEST = -1.0, 2.0
+SMALLEST = 32  # pixels a side, of a picture that LPIPS can be taken of
+# Of each: the whole picture, what stands on observations, what a completer made.
+REGIONS = ("", "_valid", "_generated")
+FIGURES = (
+    *(f"{figure}{region}" for region in REGIONS for figure in ("psnr", "ssim", "lpips")),
+    "depth_rel_valid",
+    "depth_rel_generated",
+)
 
 
 def psnr(image: ArrayLike, truth: ArrayLike, *, mask: ArrayLike | None = None) -> float | None:
@@ -71,15 +81,12 @@ def image_figures(
     """
     first, second, _ = _pair(image, truth, None)
     square = ((first - second) ** 2).mean(axis=-1)
-    similarity = None
-    if min(first.shape[:2]) >= SIDE:
-        similarity = ssim_map(first, second)
+    similarity = ssim_map(first, second) if min(first.shape[:2]) >= SIDE else None
     out = {}
     for name, mask in regions.items():
         where = _mask(mask, first.shape[:2])
-        compared = square if where is None else square[where]
         out[name] = {
-            "psnr": _decibels(compared),
+            "psnr": _decibels(square if where is None else square[where]),
             "ssim": None if similarity is None else _mean(similarity, where),
         }
     return out
@@ -94,11 +101,9 @@ def ssim_map(
     """
     import cv2
 
-    inner = (slice(SSIM_BORDER, -SSIM_BORDER),) * 2
-
     def mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
         blurred = cv2.GaussianBlur(values, (SIDE, SIDE), SIGMA).reshape(values.shape)
-        return np.asarray(blurred[inner])
+        return np.asarray(blurred[INNER])
 
     norm = SIDE**2 / (SIDE**2 - 1) if sample_covariance else 1.0
     x, y = mean(image), mean(truth)
@@ -106,20 +111,6 @@ def ssim_map(
     product = norm * (mean(image * truth) - x * y)
     top = (2 * x * y + K1**2) * (2 * product + K2**2)
     return np.asarray((top / ((x**2 + y**2 + K1**2) * (squares + K2**2))).mean(axis=-1))
-
-
-def _mean(similarity: NDArray[np.float64], where: NDArray[np.bool_] | None) -> float | None:
-    """Mean of an SSIM map over a mask of the whole image."""
-    inner = (slice(SSIM_BORDER, -SSIM_BORDER),) * 2
-    chosen = similarity if where is None else similarity[where[inner]]
-    return float(chosen.mean()) if chosen.size else None
-
-
-def _decibels(squares: NDArray[np.float64]) -> float | None:
-    if not squares.size:
-        return None
-    error = float(squares.mean())
-    return float("inf") if error == 0 else float(-10 * np.log10(error))
 
 
 def relative_depth_error(
@@ -137,9 +128,59 @@ def relative_depth_error(
     where = _mask(mask, first.shape)
     if where is not None:
         both &= where
-    if not both.any():
-        return None
-    return float(np.median(np.abs(first[both] - second[both]) / second[both]))
+    return median_of(np.abs(first[both] - second[both]) / second[both])
+
+
+def view_figures(
+    picture: NDArray[Any],
+    truth: Frame,
+    *,
+    observed: NDArray[np.bool_],
+    generated: NDArray[np.bool_],
+    others: Mapping[str, NDArray[np.bool_]] | None = None,
+    depth: ArrayLike | None = None,
+    lpips: Lpips | None = None,
+) -> dict[str, float | None]:
+    """FIGURES of one picture, and those of ``others``; None where there is nothing to compare.
+
+    The picture is uint8, or floats in [0, 1]; holes are black, and count so on the whole picture.
+    The truth's mask limits every comparison. Regions are (H, W) bool: ``observed`` stands on
+    observations, ``generated`` a completer made, and figures of ``others`` end in ``_NAME``. Depth
+    is z-depth, scene units, 0 = none. LPIPS of a region is the mean of the distance's map, which
+    has no meaning for regions much smaller than the network's view; pictures below 32 x 32 pixels
+    have none.
+    """
+    use = np.ones(picture.shape[:2], np.bool_) if truth.mask is None else truth.mask
+    regions = {"": use, "_valid": observed & use, "_generated": generated & ~observed & use}
+    regions |= {f"_{name}": mask & use for name, mask in (others or {}).items()}
+    out: dict[str, float | None] = dict.fromkeys(FIGURES)
+    for region, figures in image_figures(picture, truth.rgb, regions).items():
+        out |= {f"{name}{region}": value for name, value in figures.items()}
+    if lpips is not None and min(use.shape) >= SMALLEST:
+        if picture.dtype != np.uint8:
+            picture = np.rint(np.clip(picture, 0, 1) * 255).astype(np.uint8)
+        whole, spread = lpips.distance(picture, truth.rgb)
+        for region, mask in regions.items():
+            out[f"lpips{region}"] = float(spread[mask].mean()) if mask.any() else None
+        if use.all():
+            out["lpips"] = whole
+    if depth is not None and truth.depth is not None:
+        for region in ("_valid", "_generated"):
+            error = relative_depth_error(depth, truth.depth, mask=regions[region])
+            out[f"depth_rel{region}"] = error
+    return out
+
+
+def _mean(similarity: NDArray[np.float64], where: NDArray[np.bool_] | None) -> float | None:
+    """Mean of an SSIM map over a mask of the whole image."""
+    return mean_of(similarity if where is None else similarity[where[INNER]])
+
+
+def _decibels(squares: NDArray[np.float64]) -> float | None:
+    error = mean_of(squares)
+    if not error:
+        return None if error is None else float("inf")
+    return float(-10 * np.log10(error))
 
 
 def _pair(
@@ -171,58 +212,3 @@ def _mask(mask: ArrayLike | None, shape: tuple[int, ...]) -> NDArray[np.bool_] |
     if array.shape != shape or array.dtype != np.bool_:
         raise ShapeError(f"a mask of {array.dtype} {array.shape}; expected bool {shape}")
     return array
-
-
-# Of each: the whole picture, what stands on observations, what a completer made.
-SMALLEST = 32  # pixels a side, of a picture that LPIPS can be taken of
-REGIONS = {"": "whole", "_valid": "observed", "_generated": "generated"}
-FIGURES = (
-    *(f"{figure}{region}" for region in REGIONS for figure in ("psnr", "ssim", "lpips")),
-    "depth_rel_valid",
-    "depth_rel_generated",
-)
-
-
-def view_figures(
-    picture: NDArray[Any],
-    truth: Frame,
-    *,
-    observed: NDArray[np.bool_],
-    generated: NDArray[np.bool_],
-    others: Mapping[str, NDArray[np.bool_]] | None = None,
-    depth: ArrayLike | None = None,
-    lpips: Lpips | None = None,
-) -> dict[str, float | None]:
-    """FIGURES of one picture, and those of ``others``; None where there is nothing to compare.
-
-    The picture is uint8, or floats in [0, 1]; holes are black, and count so on the whole picture.
-    The truth's mask limits every comparison. Regions are (H, W) bool: ``observed`` stands on
-    observations, ``generated`` a completer made, and figures of ``others`` end in ``_NAME``. Depth
-    is z-depth, scene units, 0 = none. LPIPS of a region is the mean of the distance's map, which
-    has no meaning for regions much smaller than the network's view; pictures below 32 x 32 pixels
-    have none.
-    """
-    if picture.shape != truth.rgb.shape:
-        raise ShapeError(f"the picture is {picture.shape}; its truth is {truth.rgb.shape}")
-    shape = picture.shape[:2]
-    use = np.ones(shape, np.bool_) if truth.mask is None else truth.mask
-    generated = generated & ~observed
-    regions = {"": use, "_valid": observed & use, "_generated": generated & use}
-    regions |= {f"_{name}": mask & use for name, mask in (others or {}).items()}
-    out: dict[str, float | None] = dict.fromkeys(FIGURES)
-    found = image_figures(picture, truth.rgb, regions)
-    for region, figures in found.items():
-        out |= {f"{name}{region}": value for name, value in figures.items()}
-    if lpips is not None and min(shape) >= SMALLEST:
-        if picture.dtype != np.uint8:
-            picture = np.rint(np.clip(picture, 0, 1) * 255).astype(np.uint8)
-        whole, spread = lpips.distance(picture, truth.rgb)
-        for region, mask in regions.items():
-            out[f"lpips{region}"] = float(spread[mask].mean()) if mask.any() else None
-        if use.all():
-            out["lpips"] = whole
-    if depth is not None and truth.depth is not None:
-        for region in ("_valid", "_generated"):
-            error = relative_depth_error(depth, truth.depth, mask=regions[region])
-            out[f"depth_rel{region}"] = error
-    return out

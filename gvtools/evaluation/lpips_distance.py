@@ -12,7 +12,7 @@ weird trick for parallelizing convolutional neural networks" (AlexNet).
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,59 +21,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.errors import CheckpointError, OptionError, ShapeError
+from gvtools.evaluation.images import SMALLEST
 from gvtools.optional import package_folder
 
 if TYPE_CHECKING:
     from torch import Tensor, nn
 
-# Below this, the networks' deepest layers have no pixels.
-SMALLEST = 32
 # Mean and spread of the colours, in [-1, 1], that the networks were trained with.
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
-# Channels of VGG-16's convolutions, "M" for a halving of the resolution.
-_VGG16 = (64, 64, "M", 128, 128, "M", 256, 256, 256, "M", 512, 512, 512, "M", 512, 512, 512)
-
-
-def vgg16() -> nn.Sequential:
-    """VGG-16's convolutional layers."""
-    from torch import nn
-
-    layers: list[nn.Module] = []
-    channels = 3
-    for width in _VGG16:
-        if isinstance(width, str):
-            layers.append(nn.MaxPool2d(2, 2))
-            continue
-        layers += [nn.Conv2d(channels, width, 3, padding=1), nn.ReLU(inplace=True)]
-        channels = width
-    return nn.Sequential(*layers)
-
-
-def alexnet() -> nn.Sequential:
-    """AlexNet's convolutional layers."""
-    from torch import nn
-
-    return nn.Sequential(
-        nn.Conv2d(3, 64, 11, stride=4, padding=2),
-        nn.ReLU(inplace=True),
-        nn.MaxPool2d(3, 2),
-        nn.Conv2d(64, 192, 5, padding=2),
-        nn.ReLU(inplace=True),
-        nn.MaxPool2d(3, 2),
-        nn.Conv2d(192, 384, 3, padding=1),
-        nn.ReLU(inplace=True),
-        nn.Conv2d(384, 256, 3, padding=1),
-        nn.ReLU(inplace=True),
-        nn.Conv2d(256, 256, 3, padding=1),
-        nn.ReLU(inplace=True),
-    )
+# Channels of VGG-16's convolutions, 0 for a halving of the resolution.
+_VGG16 = (64, 64, 0, 128, 128, 0, 256, 256, 256, 0, 512, 512, 512, 0, 512, 512, 512)
 
 
 @dataclass(frozen=True)
 class LpipsBackbone:
     """One network that LPIPS is defined on."""
 
-    build: Callable[[], nn.Sequential]  # makes its layers
+    # Channels, kernel, stride and padding of its convolutions; of a pooling its kernel alone.
+    stages: tuple[tuple[int, int, int, int] | int, ...]
     compared: tuple[int, ...]  # numbers of the layers whose output is compared
     file: str  # the published weights; the name ends with the first digits of the file's SHA-256
 
@@ -82,25 +47,33 @@ class LpipsBackbone:
         """Where the weights are published."""
         return f"https://download.pytorch.org/models/{self.file}"
 
-    @property
-    def digest(self) -> str:
-        """How the SHA-256 of the published file begins."""
-        return self.file.rsplit("-", 1)[1].split(".")[0]
+    def build(self) -> nn.Sequential:
+        """Its convolutional layers."""
+        from torch import nn
+
+        layers: list[nn.Module] = []
+        channels = 3
+        for stage in self.stages:
+            if isinstance(stage, int):
+                layers.append(nn.MaxPool2d(stage, 2))
+            else:
+                layers += [nn.Conv2d(channels, *stage), nn.ReLU(inplace=True)]
+                channels = stage[0]
+        return nn.Sequential(*layers)
 
 
 BACKBONES = {
-    "vgg": LpipsBackbone(vgg16, (3, 8, 15, 22, 29), "vgg16-397923af.pth"),
-    "alex": LpipsBackbone(alexnet, (1, 4, 7, 9, 11), "alexnet-owt-7be5be79.pth"),
+    "vgg": LpipsBackbone(
+        tuple((width, 3, 1, 1) if width else 2 for width in _VGG16),
+        (3, 8, 15, 22, 29),
+        "vgg16-397923af.pth",
+    ),
+    "alex": LpipsBackbone(
+        ((64, 11, 4, 2), 3, (192, 5, 1, 2), 3, *((width, 3, 1, 1) for width in (384, 256, 256))),
+        (1, 4, 7, 9, 11),
+        "alexnet-owt-7be5be79.pth",
+    ),
 }
-
-
-@dataclass(frozen=True, eq=False)
-class LpipsModel:
-    """A network with its weights."""
-
-    layers: nn.Sequential  # the convolutional ones
-    compared: tuple[int, ...]  # numbers of those whose output is compared
-    heads: Sequence[Tensor]  # (1, C, 1, 1) for each of these, what its channels weigh
 
 
 class Lpips:
@@ -111,22 +84,37 @@ class Lpips:
     """
 
     def __init__(self, net: str = "vgg", *, folder: Path | None = None) -> None:
+        import torch
+
         if net not in BACKBONES:
             raise OptionError(f"LPIPS network {net!r}; expected one of {', '.join(BACKBONES)}")
-        self.net = net
-        file = find_weights(net, folder)
-        digest = hashlib.sha256(file.read_bytes()).hexdigest()
-        if not digest.startswith(BACKBONES[net].digest):
+        backbone = BACKBONES[net]
+        place = Path(folder) if folder is not None else Path(torch.hub.get_dir()) / "checkpoints"
+        file = place / backbone.file
+        if not file.is_file():
             raise CheckpointError(
-                f"{file}: its SHA-256 begins with {digest[:8]}, the published file's with "
-                f"{BACKBONES[net].digest}; download {BACKBONES[net].url} again"
+                f"LPIPS ({net}): {file} is absent; download {backbone.url} there"
+                + ("" if folder is not None else ", or name its folder with --lpips-weights")
             )
-        self._model = load_model(net, file)
+        found = hashlib.sha256(file.read_bytes()).hexdigest()
+        expected = backbone.file.rsplit("-", 1)[1].split(".")[0]
+        if not found.startswith(expected):
+            raise CheckpointError(
+                f"{file}: its SHA-256 begins with {found[:8]}, the published file's with "
+                f"{expected}; download {backbone.url} again"
+            )
+        self.net, self._compared = net, backbone.compared
+        self.layers = _load_layers(net, file)
+        package = package_folder("lpips", extra="lpips", purpose="LPIPS", error=CheckpointError)
+        calibrated = package / "weights" / "v0.1" / f"{net}.pth"
+        heads = torch.load(calibrated, map_location="cpu", weights_only=True)
+        # (1, C, 1, 1) for each compared layer, what its channels weigh.
+        self._heads = [heads[f"lin{i}.model.1.weight"] for i in range(len(backbone.compared))]
 
     def distance(
         self, image: NDArray[np.uint8], truth: NDArray[np.uint8]
     ) -> tuple[float, NDArray[np.float32]]:
-        """The distance, and where it comes from.
+        """The distance of two pictures, and where it comes from.
 
         Args:
             image: (H, W, 3) uint8, at least 32 x 32 pixels.
@@ -136,82 +124,50 @@ class Lpips:
             The package's distance, and its map (H, W) float32: the layers' maps, upsampled. The
             map's mean differs from the distance by what upsampling changes at the border.
         """
-        return distance(self._model, image, truth)
+        import torch
+        from torch.nn.functional import conv2d, interpolate
+
+        if image.shape != truth.shape or image.ndim != 3 or image.shape[2] != 3:
+            raise ShapeError(f"LPIPS of {image.shape} and {truth.shape}; expected equal (H, W, 3)")
+        if min(image.shape[:2]) < SMALLEST or image.dtype != np.uint8 or truth.dtype != np.uint8:
+            raise ShapeError(
+                f"LPIPS of {image.dtype} {image.shape}; expected uint8, at least "
+                f"{SMALLEST}x{SMALLEST} pixels"
+            )
+        with torch.inference_mode():
+            features = zip(self._heads, self._features(image), self._features(truth), strict=True)
+            maps = [conv2d((first - second) ** 2, head) for head, first, second in features]
+            total = sum(float(layer.mean()) for layer in maps)
+            size = image.shape[:2]
+            spread = [interpolate(layer, size=size, mode="bilinear")[0, 0] for layer in maps]
+        return total, np.sum([layer.numpy() for layer in spread], axis=0)
+
+    def _features(self, picture: NDArray[np.uint8]) -> Iterator[Tensor]:
+        """(1, C, h, w) of each compared layer, of length 1 at every pixel."""
+        import torch
+
+        x = torch.from_numpy(picture.copy()).permute(2, 0, 1)[None].float() / 127.5 - 1
+        x = (x - torch.tensor(SHIFT)[:, None, None]) / torch.tensor(SCALE)[:, None, None]
+        for number, layer in enumerate(self.layers):
+            x = layer(x)
+            if number in self._compared:
+                yield x / ((x**2).sum(dim=1, keepdim=True).sqrt() + 1e-10)
 
 
-def find_weights(net: str, folder: Path | None = None) -> Path:
-    """The file with the weights of a network below LPIPS."""
+def _load_layers(net: str, file: Path) -> nn.Sequential:
+    """The convolutional layers with their published weights."""
     import torch
 
-    backbone = BACKBONES[net]
-    place = Path(folder) if folder is not None else Path(torch.hub.get_dir()) / "checkpoints"
-    file = place / backbone.file
-    if not file.is_file():
-        raise CheckpointError(
-            f"LPIPS ({net}): {file} is absent; download {backbone.url} there"
-            + ("" if folder is not None else ", or name its folder with --lpips-weights")
-        )
-    return file
-
-
-def load_model(net: str, file: Path) -> LpipsModel:
-    """The network on the weights of ``file``, with the package's last layers."""
-    import torch
-
-    backbone = BACKBONES[net]
+    backbone, prefix = BACKBONES[net], "features."
     try:
         stored = torch.load(file, map_location="cpu", weights_only=True)
         layers = backbone.build().requires_grad_(False).eval()
-        prefix = "features."
         own = {k[len(prefix) :]: v for k, v in stored.items() if k.startswith(prefix)}
         layers.load_state_dict(own)
     except Exception as error:
-        first = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+        first = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise CheckpointError(
             f"{file}: does not hold the weights of LPIPS's network {net} ({first}); download "
             f"{backbone.url} again"
         ) from error
-    package = package_folder("lpips", extra="lpips", purpose="LPIPS", error=CheckpointError)
-    calibrated = package / "weights" / "v0.1" / f"{net}.pth"
-    heads = torch.load(calibrated, map_location="cpu", weights_only=True)
-    names = [f"lin{number}.model.1.weight" for number in range(len(backbone.compared))]
-    return LpipsModel(layers, backbone.compared, [heads[name] for name in names])
-
-
-def distance(
-    model: LpipsModel, image: NDArray[np.uint8], truth: NDArray[np.uint8]
-) -> tuple[float, NDArray[np.float32]]:
-    """See ``Lpips.distance``; ``model`` is from ``load_model``."""
-    import torch
-    from torch.nn.functional import conv2d, interpolate
-
-    if image.shape != truth.shape or image.ndim != 3 or image.shape[2] != 3:
-        raise ShapeError(f"LPIPS of {image.shape} and {truth.shape}; expected equal (H, W, 3)")
-    if min(image.shape[:2]) < SMALLEST or image.dtype != np.uint8 or truth.dtype != np.uint8:
-        raise ShapeError(
-            f"LPIPS of {image.dtype} {image.shape}; expected uint8, at least "
-            f"{SMALLEST}x{SMALLEST} pixels"
-        )
-    with torch.inference_mode():
-        maps = [
-            conv2d((first - second) ** 2, head)
-            for head, first, second in zip(
-                model.heads, _features(model, image), _features(model, truth), strict=True
-            )
-        ]
-        total = sum(float(layer.mean()) for layer in maps)
-        size = image.shape[:2]
-        spread = [interpolate(layer, size=size, mode="bilinear")[0, 0] for layer in maps]
-    return total, np.sum([layer.numpy() for layer in spread], axis=0)
-
-
-def _features(model: LpipsModel, picture: NDArray[np.uint8]) -> Iterator[Tensor]:
-    """(1, C, h, w) of each compared layer, of length 1 at every pixel."""
-    import torch
-
-    x = torch.from_numpy(picture.copy()).permute(2, 0, 1)[None].float() / 127.5 - 1
-    x = (x - torch.tensor(SHIFT)[:, None, None]) / torch.tensor(SCALE)[:, None, None]
-    for number, layer in enumerate(model.layers):
-        x = layer(x)
-        if number in model.compared:
-            yield x / ((x**2).sum(dim=1, keepdim=True).sqrt() + 1e-10)
+    return layers

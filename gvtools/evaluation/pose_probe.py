@@ -7,7 +7,7 @@ the context views to match are chosen by the picture's own features.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,8 @@ from pydantic import Field
 from gvtools.cameras import Cameras, Float64, concatenate
 from gvtools.errors import DegenerateError, OptionError
 from gvtools.evaluation.posed_picture import PosedPicture
-from gvtools.evaluation.trajectories import AUC_THRESHOLDS, ErrorStatistics, area_under_recall
+from gvtools.evaluation.statistics import ErrorStatistics, share
+from gvtools.evaluation.trajectories import AUC_THRESHOLDS, area_under_recall, center_extent
 from gvtools.features import FeatureMatcher, Features, SiftMatcher, mutual_nearest
 from gvtools.settings import Settings
 
@@ -93,15 +94,15 @@ def rival_pose(
     *,
     pose: AbsolutePose,
     max_error: float,
-    share: float,
+    least_share: float,
     seed: int = 0,
 ) -> AbsolutePose | None:
-    """The best pose that contradicts ``pose``, if about ``share`` of its inliers support one.
+    """The best pose that contradicts ``pose``, if about that share of its inliers support one.
 
     Repeated and symmetric things give such poses: a rug that looks the same from both ends, two
     chairs of one kind, pictures put together from pieces. Matches are as of ``absolute_pose``.
     """
-    wanted = share * int(pose.inliers.sum())
+    wanted = least_share * int(pose.inliers.sum())
     depth = float(np.median((points[pose.inliers] @ pose.cam_from_world[:3, :3].T)[:, 2]))
     depth += pose.cam_from_world[2, 3]
     known, rest = pose, np.ones(len(xy), np.bool_)
@@ -123,7 +124,9 @@ def rival_pose(
         inliers = np.zeros(len(xy), np.bool_)
         inliers[rest] = found.inliers
         known = AbsolutePose(found.cam_from_world, inliers, found.rms)
-        if _contradicts(known.cam_from_world, pose.cam_from_world, depth):
+        turn = angle_deg(known.cam_from_world[:3, :3], pose.cam_from_world[:3, :3])
+        distance = center_distance(known.cam_from_world, pose.cam_from_world)
+        if turn > ROTATION_DEG or distance > DEPTH_SHARE * depth:
             return known
     return None
 
@@ -138,11 +141,6 @@ def center_distance(first: Float64, second: Float64) -> float:
     """Distance between the centres of two (4, 4) cam_from_world, scene units."""
     centers = [-pose[:3, :3].T @ pose[:3, 3] for pose in (first, second)]
     return float(np.linalg.norm(centers[0] - centers[1]))
-
-
-def _contradicts(first: Float64, second: Float64, depth: float) -> bool:
-    turned = angle_deg(first[:3, :3], second[:3, :3]) > ROTATION_DEG
-    return turned or center_distance(first, second) > DEPTH_SHARE * depth
 
 
 def _reprojection_errors(pose: Float64, xy: Float64, points: Float64, *, K: Float64) -> Float64:
@@ -182,30 +180,36 @@ def lift_keypoints(
     return points, ok
 
 
-@dataclass(frozen=True, eq=False)
-class Located:
-    """Where one picture looks from, and how far that is from where it was meant to."""
+@dataclass(frozen=True, kw_only=True)
+class _Counts:
+    """How many matches speak for a pose."""
 
-    name: str  # the picture's
-    status: str  # "located", or "failed: ..." with the reason; then pose and errors are None
-    cam_from_world: Float64 | None  # (4, 4) float64, rigid, scene units
     keypoints: int  # found in the picture (within its mask)
     # Places in the picture that match a context keypoint with a 3D point. A place counts once,
     # however many context views it matches.
     matches: int
-    inliers: int  # those that the best pose explains; reported of failed pictures as well
+    inliers: int = 0  # those that the best pose explains; reported of failed pictures as well
     # How many of the picture's cells hold an inlier; a cell's side is 1/16 of the longer side of
     # the picture.
-    cells: int
+    cells: int = 0
     # Places that agree on another pose, which contradicts the best one; 0 when no pose with a
     # comparable number was met.
-    rival: int
-    residual: float | None  # root mean square of the inliers' reprojection errors, pixels
+    rival: int = 0
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Located(_Counts):
+    """Where one picture looks from, and how far that is from where it was meant to."""
+
+    name: str  # the picture's
+    status: str  # "located", or "failed: ..." with the reason; then pose and errors are None
+    cam_from_world: Float64 | None = None  # (4, 4) float64, rigid, scene units
+    residual: float | None = None  # root mean square of the inliers' reprojection errors, pixels
     views: tuple[str, ...]  # names of the context views that were matched, the most promising first
-    rotation_error_deg: float | None  # angle between the found and the requested orientation
-    center_error: float | None  # distance of the found from the requested centre, scene units
+    rotation_error_deg: float | None = None  # between the estimated and the requested orientation
+    center_error: float | None = None  # distance from the requested centre, scene units
     # That, divided by the extent of the context's centres; None also when the extent is 0.
-    center_error_share: float | None
+    center_error_share: float | None = None
 
     @property
     def ok(self) -> bool:
@@ -215,56 +219,56 @@ class Located:
     @property
     def inlier_share(self) -> float | None:
         """Inliers per match; None without matches."""
-        return self.inliers / self.matches if self.matches else None
+        return share(self.inliers, self.matches)
 
 
 @dataclass(frozen=True)
 class PoseSummary:
     """The probe's findings over a set of pictures.
 
-    Statistics are over the located pictures alone and say how many those are; they flatter a set
-    whose hard pictures fail, and are to be read beside ``success_share``. ``rotation_auc`` counts
-    failures as wrong.
+    Statistics are over the located pictures alone, None without any, and say how many those are;
+    they flatter a set whose hard pictures fail, and are to be read beside ``success_share``.
+    ``rotation_auc`` counts failures as wrong.
     """
 
     pictures: int  # how many were probed
     located: int  # how many of them were located
     success_share: float | None  # located per picture; None without pictures
     failures: tuple[tuple[str, str], ...]  # name and status of every picture that was not
-    rotation_error_deg: ErrorStatistics | None  # over the located; None when there are none
-    center_error: ErrorStatistics | None  # likewise, scene units
-    # Likewise, divided by the extent of the context's centres.
-    center_error_share: ErrorStatistics | None
+    rotation_error_deg: ErrorStatistics | None
+    center_error: ErrorStatistics | None  # scene units
+    center_error_share: ErrorStatistics | None  # of the extent of the context's centres
     # By threshold in degrees, the area under the share of *all* pictures that are located with a
     # rotation error below x, for x up to the threshold; None without pictures.
     rotation_auc: dict[float, float | None]
-    inliers: ErrorStatistics | None  # over the located, places that agree with the pose
-    inlier_share: ErrorStatistics | None  # over the located, those per match
+    inliers: ErrorStatistics | None  # places that agree with the pose
+    inlier_share: ErrorStatistics | None  # those per match
 
 
 def summarise(found: Sequence[Located]) -> PoseSummary:
     """The findings of all probed pictures; leave none out, failures least of all."""
     ok = [one for one in found if one.ok]
     angles = [np.inf if one.rotation_error_deg is None else one.rotation_error_deg for one in found]
+
+    def statistics(name: str) -> ErrorStatistics | None:
+        values = [getattr(one, name) for one in ok]
+        return ErrorStatistics.of([value for value in values if value is not None])
+
     return PoseSummary(
         pictures=len(found),
         located=len(ok),
-        success_share=len(ok) / len(found) if found else None,
+        success_share=share(len(ok), len(found)),
         failures=tuple((one.name, one.status) for one in found if not one.ok),
-        rotation_error_deg=_statistics([one.rotation_error_deg for one in ok]),
-        center_error=_statistics([one.center_error for one in ok]),
-        center_error_share=_statistics([one.center_error_share for one in ok]),
+        rotation_error_deg=statistics("rotation_error_deg"),
+        center_error=statistics("center_error"),
+        center_error_share=statistics("center_error_share"),
         rotation_auc={
             threshold: area_under_recall(angles, threshold) if found else None
             for threshold in AUC_THRESHOLDS
         },
-        inliers=_statistics([one.inliers for one in ok]),
-        inlier_share=_statistics([one.inlier_share for one in ok]),
+        inliers=statistics("inliers"),
+        inlier_share=statistics("inlier_share"),
     )
-
-
-def _statistics(values: Sequence[float | None]) -> ErrorStatistics | None:
-    return ErrorStatistics.of([value for value in values if value is not None])
 
 
 class PoseProbeOptions(Settings):
@@ -305,17 +309,6 @@ class _ContextView:
     points: Float64
 
 
-@dataclass(frozen=True)
-class _Counts:
-    """Of one picture, as in ``Located``."""
-
-    keypoints: int
-    matches: int
-    inliers: int
-    cells: int
-    rival: int
-
-
 class PoseProbe:
     """Locates pictures against posed context views with depth.
 
@@ -343,7 +336,9 @@ class PoseProbe:
                 f"pose probe: none of {len(self._context)} context views has keypoints with depth; "
                 "give views with texture and depth"
             )
-        self.extent = _extent([picture.camera for picture in self._context])
+        self.extent = center_extent(
+            concatenate([picture.camera for picture in self._context]).world_from_cam
+        )
 
     def locate(self, picture: PosedPicture, *, leave_out: Collection[str] = ()) -> Located:
         """Where a picture looks from, by its pixels alone.
@@ -351,18 +346,28 @@ class PoseProbe:
         Its mask limits the keypoints; its camera's pose is only compared with. Context views whose
         names are left out are not matched.
         """
-        features = self._matcher.extract(picture.rgb)
-        features = features[_inside(features.xy, picture.mask)]
+        features = self._features(picture)
         views = self._promising(features, leave_out)
-        keypoint, points = self._correspondences(features, views)
-        pose, counts = self._solved(features, keypoint, points, K=picture.camera.K[0])
+        pose, counts = self._solved(features, views, picture.camera.K[0])
         reason = self._reason(counts)
-        return self._located(
-            picture,
-            None if reason else pose,
-            status=f"failed: {reason}" if reason else LOCATED,
-            counts=counts,
+        status = f"failed: {reason}" if reason else LOCATED
+        located = Located(
+            name=picture.name,
+            status=status,
             views=tuple(view.name for view in views),
+            **asdict(counts),
+        )
+        if pose is None or reason:
+            return located
+        requested = picture.camera.cam_from_world[0]
+        distance = center_distance(pose.cam_from_world, requested)
+        return replace(
+            located,
+            cam_from_world=pose.cam_from_world,
+            residual=pose.rms,
+            rotation_error_deg=angle_deg(pose.cam_from_world[:3, :3], requested[:3, :3]),
+            center_error=distance,
+            center_error_share=share(distance, self.extent),
         )
 
     def leave_one_out(self, count: int | None = None) -> list[Located]:
@@ -375,9 +380,18 @@ class PoseProbe:
         pictures = [self._context[int(i)] for i in chosen]
         return [self.locate(picture, leave_out=(picture.name,)) for picture in pictures]
 
-    def _lifted(self, picture: PosedPicture) -> _ContextView:
+    def _features(self, picture: PosedPicture) -> Features:
+        """The picture's keypoints in pixels that its mask does not leave out."""
         features = self._matcher.extract(picture.rgb)
-        features = features[_inside(features.xy, picture.mask)]
+        if picture.mask is None:
+            return features
+        height, width = picture.mask.shape
+        pixels = np.floor(features.xy).astype(np.int64)
+        x, y = np.clip(pixels, 0, [width - 1, height - 1]).T
+        return features[picture.mask[y, x]]
+
+    def _lifted(self, picture: PosedPicture) -> _ContextView:
+        features = self._features(picture)
         if picture.depth is None:
             return _ContextView(picture.name, features[:0], np.zeros((0, 3)))
         edge = self.options.edge
@@ -397,30 +411,22 @@ class PoseProbe:
         order = np.argsort(-np.asarray(votes), kind="stable")[: self.options.views]
         return [views[i] for i in order]
 
-    def _correspondences(
-        self, features: Features, views: Sequence[_ContextView]
-    ) -> tuple[NDArray[np.int64], Float64]:
-        """Keypoint numbers (M,) and their 3D partners (M, 3), over all views."""
-        keypoints, points = [np.zeros(0, np.int64)], [np.zeros((0, 3))]
-        for view in views:
-            pairs = self._matcher.match(features, view.features)
-            keypoints.append(pairs[:, 0])
-            points.append(view.points[pairs[:, 1]])
-        return np.concatenate(keypoints), np.concatenate(points)
-
     def _solved(
-        self, features: Features, keypoint: NDArray[np.int64], points: Float64, *, K: Float64
+        self, features: Features, views: Sequence[_ContextView], K: Float64
     ) -> tuple[AbsolutePose | None, _Counts]:
-        """The best pose, and what speaks for and against it."""
-        xy = features.xy[keypoint]
+        """The best pose by the matches with all views, and what speaks for and against it."""
+        pairs = [self._matcher.match(features, view.features) for view in views]
+        xy = np.concatenate([features.xy[:0], *(features.xy[rows[:, 0]] for rows in pairs)])
+        matched = [view.points[rows[:, 1]] for view, rows in zip(views, pairs, strict=True)]
+        points = np.concatenate([np.zeros((0, 3)), *matched])
         # A keypoint may have several orientations: places are counted, not keypoints.
         places, place = np.unique(xy, axis=0, return_inverse=True)
         place = place.reshape(-1)
-        size = {"width": features.width, "height": features.height}
-        error = self.options.max_error or max(2.0, max(size.values()) / 160)
+        side = max(features.width, features.height)
+        error = self.options.max_error or max(2.0, side / 160)
         pose = absolute_pose(xy, points, K, max_error=error, seed=self.seed)
         if pose is None:
-            return None, _Counts(len(features), len(places), 0, 0, 0)
+            return None, _Counts(keypoints=len(features), matches=len(places))
         agreed = np.unique(place[pose.inliers])
         rival = rival_pose(
             xy,
@@ -428,34 +434,29 @@ class PoseProbe:
             K,
             pose=pose,
             max_error=error,
-            share=self.options.max_rival,
+            least_share=self.options.max_rival,
             seed=self.seed,
         )
         return pose, _Counts(
             keypoints=len(features),
             matches=len(places),
             inliers=len(agreed),
-            cells=_cells(places[agreed], **size),
+            cells=len(np.unique(np.floor(places[agreed] / (side / CELLS)), axis=0)),
             rival=0 if rival is None else len(np.unique(place[rival.inliers])),
         )
 
     def _reason(self, counts: _Counts) -> str:
         """Why a picture does not count as located; empty when it does."""
-        options = self.options
+        options, inliers = self.options, f"{counts.inliers} inliers"
+        least = f"at least {options.min_inliers} are needed"
         if counts.matches < options.min_inliers:
-            return (
-                f"{counts.matches} matches of {counts.keypoints} keypoints, at least "
-                f"{options.min_inliers} are needed"
-            )
+            return f"{counts.matches} matches of {counts.keypoints} keypoints, {least}"
         if counts.inliers < options.min_inliers:
-            return (
-                f"{counts.inliers} inliers of {counts.matches} matches, at least "
-                f"{options.min_inliers} are needed"
-            )
+            return f"{inliers} of {counts.matches} matches, {least}"
         if counts.cells < options.min_cells:
             return (
-                f"{counts.inliers} inliers in {counts.cells} cells of the picture, at least "
-                f"{options.min_cells} are needed"
+                f"{inliers} in {counts.cells} cells of the picture, at least {options.min_cells} "
+                "are needed"
             )
         if counts.rival >= options.max_rival * counts.inliers:
             return (
@@ -463,51 +464,3 @@ class PoseProbe:
                 "another that contradicts it"
             )
         return ""
-
-    def _located(
-        self,
-        picture: PosedPicture,
-        pose: AbsolutePose | None,
-        *,
-        status: str,
-        counts: _Counts,
-        views: tuple[str, ...],
-    ) -> Located:
-        requested = picture.camera.cam_from_world[0]
-        found = None if pose is None else pose.cam_from_world
-        distance = None if found is None else center_distance(found, requested)
-        angle = None if found is None else angle_deg(found[:3, :3], requested[:3, :3])
-        return Located(
-            name=picture.name,
-            status=status,
-            cam_from_world=found,
-            residual=None if pose is None else pose.rms,
-            views=views,
-            rotation_error_deg=angle,
-            center_error=distance,
-            center_error_share=None if distance is None else _share(distance, self.extent),
-            **asdict(counts),
-        )
-
-
-def _share(part: float, whole: float) -> float | None:
-    return part / whole if whole > 0 else None
-
-
-def _inside(xy: Float64, mask: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
-    """(N,) bool: whether the pixel that a keypoint lies in is to be used."""
-    if mask is None:
-        return np.ones(len(xy), np.bool_)
-    height, width = mask.shape
-    x, y = np.clip(np.floor(xy).astype(np.int64), 0, [width - 1, height - 1]).T
-    return mask[y, x]
-
-
-def _cells(xy: Float64, *, width: int, height: int) -> int:
-    """How many cells of the picture hold one of the places."""
-    return len(np.unique(np.floor(xy / (max(width, height) / CELLS)), axis=0))
-
-
-def _extent(cameras: Sequence[Cameras]) -> float:
-    centers = concatenate(cameras).centers
-    return float(2 * np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras, Float64, invert_rigid
-from gvtools.errors import OptionError, ShapeError
+from gvtools.errors import ShapeError
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,8 +36,6 @@ class PosedPicture:
                 raise ShapeError(
                     f"picture {self.name}: {what} {value.shape}; expected {size} like rgb"
                 )
-        if self.mask is not None and self.mask.dtype != np.bool_:
-            raise ShapeError(f"picture {self.name}: mask {self.mask.dtype}; expected bool")
 
 
 class Seen(IntEnum):
@@ -54,19 +52,19 @@ class Seen(IntEnum):
 class Correspondence:
     """Where N pixels of the first view lie in the second."""
 
-    rows: NDArray[np.int64]  # (N,) int64, of the first view's pixels
-    columns: NDArray[np.int64]  # (N,) int64
-    xy: Float64  # (N, 2) float64, their places in the second view, pixels; NaN where OUTSIDE
-    z: Float64  # (N,) float64, their depth in the second view, scene units
-    depth: Float64  # (N,) float64, second's own depth at these places, scene units; 0 where none
-    # (N, 2) float64, where the first view sees what second's depth puts at these places, pixels of
-    # the first view; NaN where second has no depth, or where that lies behind the first camera.
+    rows: NDArray[np.int64]  # (N,) of the first view's pixels
+    columns: NDArray[np.int64]  # (N,)
+    xy: Float64  # (N, 2) their places in the second view, pixels; NaN where OUTSIDE
+    z: Float64  # (N,) their depth in the second view, scene units
+    depth: Float64  # (N,) second's own depth at these places, scene units; 0 where none
+    # (N, 2) where the first view sees what second's depth puts at these places, pixels of the first
+    # view; NaN where second has no depth, or where that lies behind the first camera.
     back: Float64
-    seen: NDArray[np.uint8]  # (N,) uint8, values of `Seen`
+    seen: NDArray[np.uint8]  # (N,) values of `Seen`
 
     @property
     def start(self) -> Float64:
-        """(N, 2) float64, centres of the first view's pixels, pixels."""
+        """(N, 2) centres of the first view's pixels, pixels."""
         return _centers(self.rows, self.columns)
 
     def count(self, kind: Seen) -> int:
@@ -88,15 +86,8 @@ def correspond(
     differ by no more than ``occlusion``, |z / depth - 1|. Elsewhere it is that of the nearest
     pixel. The pixels of first may be limited by an (H, W) mask, ``where``.
     """
-    if not 0 < occlusion < 1:
-        raise OptionError(
-            f"occlusion {occlusion}; expected a relative depth difference between 0 and 1, "
-            "such as 0.05"
-        )
     wanted, depth = known_depth(first)
     if where is not None:
-        if where.shape != wanted.shape:
-            raise ShapeError(f"pixels to follow {where.shape}; expected {wanted.shape} like rgb")
         wanted = wanted & where
     rows, columns = np.nonzero(wanted)
     start = _centers(rows, columns)

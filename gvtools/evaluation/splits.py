@@ -15,8 +15,8 @@ chosen, so this is a rule of our own, and every split is written beside its scor
 from __future__ import annotations
 
 import random
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, Literal
 
@@ -70,16 +70,24 @@ class SplitRule(SpecRecord):
 
 @dataclass(frozen=True)
 class SceneSplit:
-    """Views of one scene."""
+    """Views of one scene that are given, and those that are completed."""
 
-    context: tuple[str, ...]  # names of those that are given, in the scene's order
+    context: tuple[str, ...]  # names of the given views, in the scene's order
     # Names of the targets, round by round; one round where their number is open.
     rounds: tuple[tuple[str, ...], ...]
+    # Of the protocol's: layout ("ends" or "first"), stride and start of the window in the scene's
+    # views, how many views the scene has, and the seed that the start was drawn from.
+    window: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def targets(self) -> tuple[str, ...]:
         """The targets of all rounds, in order."""
         return tuple(name for names in self.rounds for name in names)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data for JSON."""
+        rounds = [list(names) for names in self.rounds]
+        return {"context": list(self.context), "rounds": rounds, **self.window}
 
 
 def split_scene(
@@ -101,12 +109,20 @@ def split_scene(
     (('01', '10', '19'), ('00', '08', '16'))
     """
     if rule.kind == "protocol":
-        chosen = protocol_split(
+        return protocol_split(
             names, context=views, targets=targets or 6, rounds=rounds, stride=rule.stride
         )
-        return SceneSplit(chosen.context, chosen.rounds)
     if rule.kind == "every":
-        given, held = _every(len(names), rule.every or 8, views)
+        step = rule.every or 8
+        others = [i for i in range(len(names)) if i % step]
+        if views > len(others):
+            raise OptionError(
+                f"{len(names)} views, of which {len(others)} are no targets; expected at least "
+                f"{views}; give fewer --views"
+            )
+        # Halves are rounded to even numbers, as in the code that the split is cited from.
+        rows = [round(place) for place in np.linspace(0, len(others) - 1, views).tolist()]
+        given, held = [others[row] for row in rows], list(range(0, len(names), step))
     elif rule.kind == "listed":
         given, held = sorted(rule.context[:views]), list(rule.targets)
     else:
@@ -119,33 +135,20 @@ def split_scene(
     return SceneSplit(tuple(names[i] for i in given), (tuple(names[i] for i in held),))
 
 
-def _every(count: int, step: int, views: int) -> tuple[list[int], list[int]]:
-    """Numbers of the context and of the targets."""
-    others = [i for i in range(count) if i % step]
-    if views > len(others):
-        raise OptionError(
-            f"{count} views, of which {len(others)} are no targets; expected at least {views}; "
-            "give fewer --views"
-        )
-    # Halves are rounded to even numbers, as in the code that the split is cited from.
-    rows = [round(place) for place in np.linspace(0, len(others) - 1, views).tolist()]
-    return [others[row] for row in rows], list(range(0, count, step))
-
-
 def _from_file(
     rule: SplitRule, names: Sequence[str], *, views: int, folder: Path | None
 ) -> SceneSplit:
     if folder is None:
         raise ProjectError(f"{rule.file}: no folder to look for it in")
     path = folder / rule.file.format(views=views)
-    split, frames = _json(path), _json(folder / "transforms.json").get("frames")
     by_name = {PurePosixPath(name).name: name for name in names}
     try:
+        split, frames = _json(path), _json(folder / "transforms.json").get("frames")
         files = [PurePosixPath(frame["file_path"]).name for frame in frames]
         given, held = (
             tuple(by_name[files[i]] for i in split[key]) for key in ("train_ids", "test_ids")
         )
-    except (KeyError, IndexError, TypeError) as error:
+    except (AttributeError, KeyError, IndexError, TypeError) as error:
         raise ProjectError(
             f"{path}: train_ids and test_ids do not fit the views ({error}); expected numbers of "
             "the frames of transforms.json, whose pictures are there"
@@ -160,31 +163,6 @@ def _json(path: Path) -> Any:
         raise ProjectError(f"{path}: unreadable ({error}); expected the released file") from None
 
 
-@dataclass(frozen=True, kw_only=True)
-class Split:
-    """The views of one scene that are given, and those that are completed."""
-
-    context: tuple[str, ...]  # names of the given views, in the scene's order
-    rounds: tuple[tuple[str, ...], ...]  # per round the names of its targets, in the scene's order
-    layout: str  # "ends" or "first"
-    stride: int  # views from one of the window to the next
-    start: int  # index of the window's first view in the scene
-    views: int  # how many views the scene has
-    seed: int  # what ``start`` was drawn from
-
-    @property
-    def targets(self) -> tuple[str, ...]:
-        """The targets of all rounds, in order."""
-        return tuple(name for names in self.rounds for name in names)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain data for JSON."""
-        return asdict(self) | {
-            "context": list(self.context),
-            "rounds": [list(names) for names in self.rounds],
-        }
-
-
 def protocol_split(
     names: Sequence[str],
     *,
@@ -193,7 +171,7 @@ def protocol_split(
     rounds: int = 1,
     stride: int | None = None,
     seed: int = 0,
-) -> Split:
+) -> SceneSplit:
     """The split of a scene by the protocol's rule; the targets are those of a round.
 
     Without a stride, it is as wide as the scene allows. In a video's many frames that leaves the
@@ -223,12 +201,14 @@ def protocol_split(
     else:
         given = [i * (window - 1) // (context - 1) for i in range(context)]
     left = [name for i, name in enumerate(chosen) if i not in given]
-    return Split(
+    return SceneSplit(
         context=tuple(chosen[i] for i in given),
         rounds=tuple(tuple(left[r * targets : (r + 1) * targets]) for r in range(rounds)),
-        layout=layout,
-        stride=stride,
-        start=start,
-        views=len(names),
-        seed=seed,
+        window={
+            "layout": layout,
+            "stride": stride,
+            "start": start,
+            "views": len(names),
+            "seed": seed,
+        },
     )

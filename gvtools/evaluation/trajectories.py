@@ -10,7 +10,7 @@ number.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import combinations
 from pathlib import PurePosixPath
 
@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gvtools.cameras import ROTATION_TOLERANCE
 from gvtools.errors import DegenerateError, OptionError, ShapeError
+from gvtools.evaluation.statistics import ErrorStatistics
 from gvtools.similarity import COINCIDENT, SimilarityFit, fit_similarity
 
 Float64 = NDArray[np.float64]
@@ -32,50 +33,21 @@ UNALIGNED = "not aligned"
 STILL = 1e-12
 
 
-@dataclass(frozen=True)
-class ErrorStatistics:
-    """What a set of errors sums up to; the unit is that of the errors."""
-
-    rmse: float  # root of the mean square
-    mean: float
-    median: float
-    std: float  # standard deviation of the population
-    min: float  # smallest
-    max: float  # largest
-    n: int  # how many
-
-    @staticmethod
-    def of(errors: ArrayLike) -> ErrorStatistics | None:
-        """Of (N,) errors; None when there are none."""
-        values = np.asarray(errors, np.float64)
-        if not values.size:
-            return None
-        return ErrorStatistics(
-            float(np.sqrt(np.mean(values**2))),
-            float(values.mean()),
-            float(np.median(values)),
-            float(values.std()),
-            float(values.min()),
-            float(values.max()),
-            int(values.size),
-        )
-
-
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class PoseErrors:
-    """Errors of an estimated trajectory."""
+    """Errors of an estimated trajectory; without figures they are None."""
 
-    # "aligned", "not aligned" (none was asked for), or "degenerate: ..." with the reason; then
-    # every figure is None.
+    # "aligned", "not aligned" (none was asked for), or "degenerate: ..." with the reason why there
+    # are no figures.
     status: str
-    translation: ErrorStatistics | None  # scene units of the reference
+    translation: ErrorStatistics | None = None  # scene units of the reference
     # The same, divided by ``extent``; None also when the extent is 0.
-    translation_share: ErrorStatistics | None
-    rotation_deg: ErrorStatistics | None  # degrees
-    scale: float | None  # reference units per unit of the estimate; 1 when it was not fitted
+    translation_share: ErrorStatistics | None = None
+    rotation_deg: ErrorStatistics | None = None  # degrees
+    scale: float | None = None  # reference units per unit of the estimate; 1 where not fitted
     extent: float  # twice the largest distance of a reference centre from their mean, scene units
-    translation_errors: Float64  # (N,) float64 of each pose or pair; empty without figures
-    rotation_errors_deg: Float64  # (N,) float64, likewise
+    translation_errors: Float64 = field(default_factory=lambda: np.zeros(0))  # (N,), pose or pair
+    rotation_errors_deg: Float64 = field(default_factory=lambda: np.zeros(0))  # (N,), likewise
 
     @property
     def ok(self) -> bool:
@@ -114,9 +86,9 @@ def absolute_errors(
     """
     first, second = _poses(reference, estimate)
     status, fit = _aligned(first, second, align, refuse_mirrored=refuse_mirrored)
-    extent = _extent(first)
+    extent = center_extent(first)
     if not (status in (ALIGNED, UNALIGNED) and len(first)):
-        return _none(status, extent)
+        return PoseErrors(status=status, extent=extent)
     centers, rotations = second[:, :3, 3], second[:, :3, :3]
     if fit is not None:
         # Residuals are taken about the centroids, so that great offsets keep their digits.
@@ -165,12 +137,13 @@ def relative_errors(
         raise OptionError(f"RPE delta {delta}; expected 1 frame or more")
     first, second = _poses(reference, estimate)
     status, fit = _aligned(first, second, align, refuse_mirrored=refuse_mirrored)
-    extent = _extent(first)
+    extent = center_extent(first)
     start = np.arange(0, max(len(first) - delta, 0), 1 if all_pairs else delta)
     if status not in (ALIGNED, UNALIGNED):
-        return _none(status, extent)
+        return PoseErrors(status=status, extent=extent)
     if not len(start):
-        return _none(f"degenerate: {len(first)} poses, no pair is {delta} frames apart", extent)
+        status = f"degenerate: {len(first)} poses, no pair is {delta} frames apart"
+        return PoseErrors(status=status, extent=extent)
     scale = 1.0 if fit is None else fit.scale
     motion, rotation = _motions(first, start, start + delta)
     other_motion, other_rotation = _motions(second, start, start + delta)
@@ -247,22 +220,18 @@ def _poses(reference: ArrayLike, estimate: ArrayLike) -> tuple[Float64, Float64]
     if not (np.isfinite(first).all() and np.isfinite(second).all()):
         raise ShapeError("poses: NaN or infinity; leave those frames out and say so")
     for name, poses in (("reference", first), ("estimate", second)):
-        _check_poses(name, poses)
+        rotation = poses[:, :3, :3]
+        with np.errstate(over="ignore", invalid="ignore"):
+            defect = np.abs(rotation @ np.swapaxes(rotation, 1, 2) - np.eye(3)).max(axis=(1, 2))
+            determinant = np.linalg.det(rotation)
+        wrong = np.flatnonzero(~(defect <= ROTATION_TOLERANCE) | (determinant < 0))
+        if len(wrong):
+            raise ShapeError(
+                f"poses: the 3x3 part of {name} pose {wrong[0]} is no rotation (R Rᵀ is off I by "
+                f"{defect[wrong[0]]:.3g}, determinant {determinant[wrong[0]]:.3g}); divide a scale "
+                "out, mend a mirror, or leave the frame out"
+            )
     return first, second
-
-
-def _check_poses(name: str, poses: Float64) -> None:
-    rotation = poses[:, :3, :3]
-    with np.errstate(over="ignore", invalid="ignore"):
-        defect = np.abs(rotation @ np.swapaxes(rotation, 1, 2) - np.eye(3)).max(axis=(1, 2))
-        determinant = np.linalg.det(rotation)
-    wrong = np.flatnonzero(~(defect <= ROTATION_TOLERANCE) | (determinant < 0))
-    if len(wrong):
-        raise ShapeError(
-            f"poses: the 3x3 part of {name} pose {wrong[0]} is no rotation (R Rᵀ is off I by "
-            f"{defect[wrong[0]]:.3g}, determinant {determinant[wrong[0]]:.3g}); divide a scale "
-            "out, mend a mirror, or leave the frame out"
-        )
 
 
 def _aligned(
@@ -280,7 +249,8 @@ def _aligned(
     return (ALIGNED, fit) if fit.ok else (fit.status, None)
 
 
-def _extent(poses: Float64) -> float:
+def center_extent(poses: Float64) -> float:
+    """Twice the largest distance of a centre of (N, 4, 4) world_from_cam from their mean."""
     if not len(poses):
         return 0.0
     centered = poses[:, :3, 3] - poses[0, :3, 3]
@@ -290,7 +260,7 @@ def _extent(poses: Float64) -> float:
 def _moves(poses: Float64, motion: Float64) -> NDArray[np.bool_]:
     """(P,) whether motions (P, 3) are more than the rounding of the centres."""
     rounding = COINCIDENT * float(np.abs(poses[:, :3, 3]).max())
-    return np.linalg.norm(motion, axis=1) > max(STILL * _extent(poses), rounding)
+    return np.linalg.norm(motion, axis=1) > max(STILL * center_extent(poses), rounding)
 
 
 def _motions(poses: Float64, i: NDArray[np.int64], j: NDArray[np.int64]) -> tuple[Float64, Float64]:
@@ -324,20 +294,15 @@ def _figures(
     fit: SimilarityFit | None,
 ) -> PoseErrors:
     return PoseErrors(
-        status,
-        ErrorStatistics.of(translation),
-        ErrorStatistics.of(translation / extent) if extent > 0 else None,
-        ErrorStatistics.of(rotation),
-        1.0 if fit is None else fit.scale,
-        extent,
-        translation,
-        rotation,
+        status=status,
+        translation=ErrorStatistics.of(translation),
+        translation_share=ErrorStatistics.of(translation / extent) if extent > 0 else None,
+        rotation_deg=ErrorStatistics.of(rotation),
+        scale=1.0 if fit is None else fit.scale,
+        extent=extent,
+        translation_errors=translation,
+        rotation_errors_deg=rotation,
     )
-
-
-def _none(status: str, extent: float) -> PoseErrors:
-    empty = np.zeros(0)
-    return PoseErrors(status, None, None, None, None, extent, empty, empty)
 
 
 Rows = NDArray[np.int64]

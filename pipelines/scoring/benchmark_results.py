@@ -8,7 +8,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gvtools.evaluation.intervals import Interval, mean_interval
 from gvtools.evaluation.published import Benchmark
 from gvtools.evaluation.ranking import (
     MEASURED,
@@ -18,6 +17,7 @@ from gvtools.evaluation.ranking import (
     comparison_notes,
     side_by_side,
 )
+from gvtools.evaluation.statistics import Interval, mean_interval
 from gvtools.evaluation.tables import Column, Ranked, Table, Value, markdown
 from gvtools.files import write_json, write_text
 from pipelines.console import Console

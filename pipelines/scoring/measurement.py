@@ -17,13 +17,14 @@ from numpy.typing import NDArray
 
 from gvtools.errors import DegenerateError
 from gvtools.evaluation.images import FIGURES, view_figures
-from gvtools.evaluation.intervals import mean_interval
 from gvtools.evaluation.posed_picture import PosedPicture
+from gvtools.evaluation.statistics import mean_interval
 
 if TYPE_CHECKING:
     from gvtools.evaluation.lpips_distance import Lpips
     from gvtools.evaluation.pose_probe import Located, PoseProbe
-    from gvtools.evaluation.trajectories import ErrorStatistics, PoseAuc, PoseErrors
+    from gvtools.evaluation.statistics import ErrorStatistics
+    from gvtools.evaluation.trajectories import PoseAuc, PoseErrors
     from gvtools.features import FeatureMatcher
     from gvtools.memory.spatial_memory import SpatialMemory
     from gvtools.runs.run import Run

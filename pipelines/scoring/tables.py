@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gvtools.evaluation.images import FIGURES
-from gvtools.evaluation.intervals import mean_interval
 from gvtools.evaluation.ranking import MeasuredRow, Setting
+from gvtools.evaluation.statistics import mean_interval
 from gvtools.evaluation.tables import Column, Ranked, Table, Value, markdown, render
 from gvtools.files import write_text
 from pipelines.report import nested

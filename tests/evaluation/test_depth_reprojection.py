@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from consistency_scene import HALF, SLANT, SQUARE, WALL, camera, moved, picture
 
-from gvtools.errors import OptionError, ShapeError
 from gvtools.evaluation.depth_reprojection import (
     depth_reprojection,
     depth_reprojection_of_views,
@@ -245,14 +244,6 @@ def test_too_few_views_give_a_status(pair: tuple[PosedPicture, PosedPicture]) ->
     apart = depth_reprojection_of_views([pair[0], moved(pair[1], turn=(0, 180, 0))])
     assert apart.status == "empty: none of the 1 pairs has a co-visible pixel"
     assert apart.median_pixels is None and len(apart.without_overlap) == 1
-
-
-def test_wrong_options_are_errors(pair: tuple[PosedPicture, PosedPicture]) -> None:
-    for limit in (0, 1, -0.1, float("nan")):
-        with pytest.raises(OptionError, match="occlusion"):
-            depth_reprojection(*pair, occlusion=limit)
-    with pytest.raises(ShapeError, match="pixels to follow"):
-        correspond(*pair, where=np.ones((3, 3), bool))
 
 
 @pytest.mark.data

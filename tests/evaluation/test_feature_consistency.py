@@ -12,7 +12,6 @@ import pytest
 import torch
 from consistency_scene import blurred, camera, moved, noisy, picture
 
-from gvtools.errors import OptionError, ShapeError
 from gvtools.evaluation.feature_consistency import (
     DenseGradient,
     feature_consistency,
@@ -166,21 +165,6 @@ def test_views_without_overlap_or_depth_give_a_status(
         result = feature_consistency(*views)
         assert result.status == status and not result.ok
         assert result.score is None and result.unrelated is None and result.overlap == 0
-
-
-def test_what_is_not_a_feature_map_is_an_error(pair: tuple[PosedPicture, PosedPicture]) -> None:
-    wrong: list[Callable[[np.ndarray], Any]] = [
-        lambda rgb: np.zeros((3, 4)),
-        lambda rgb: np.zeros((0, 4, 4)),
-        lambda rgb: np.full((1, 4, 4), np.nan),
-    ]
-    for function in wrong:
-        with pytest.raises(ShapeError, match="given: features of left"):
-            feature_consistency(*pair, network=Network(function))
-    with pytest.raises(ShapeError, match="channels"):
-        feature_consistency(*pair, network=Network(lambda rgb: np.ones((1 + rgb[0, 0, 0], 2, 2))))
-    with pytest.raises(OptionError, match="occlusion"):
-        feature_consistency(*pair, occlusion=2)
 
 
 def test_dense_gradients_cover_pictures_of_any_size() -> None:

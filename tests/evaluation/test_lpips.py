@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib.util
 import sys
+from dataclasses import replace
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
@@ -11,13 +13,7 @@ import numpy as np
 import pytest
 
 from gvtools.errors import CheckpointError, OptionError, ShapeError
-from gvtools.evaluation.lpips_distance import (
-    BACKBONES,
-    Lpips,
-    distance,
-    find_weights,
-    load_model,
-)
+from gvtools.evaluation.lpips_distance import BACKBONES, Lpips
 
 needs_package = pytest.mark.skipif(
     importlib.util.find_spec("lpips") is None, reason="needs the package lpips"
@@ -38,6 +34,19 @@ def alex(tmp_path_factory):
     return path
 
 
+@pytest.fixture
+def take(tmp_path, monkeypatch):
+    """Makes a file's content the published weights of a network, and opens that."""
+
+    def opened(net: str, content: bytes) -> Lpips:
+        file = f"{net}-{hashlib.sha256(content).hexdigest()[:8]}.pth"
+        (tmp_path / file).write_bytes(content)
+        monkeypatch.setitem(BACKBONES, net, replace(BACKBONES[net], file=file))
+        return Lpips(net, folder=tmp_path)
+
+    return opened
+
+
 def pictures(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
     image = (rng.random((64, 80, 3)) * 255).astype(np.uint8)
@@ -46,24 +55,24 @@ def pictures(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
 
 
 @needs_package
-def test_it_is_the_packages_own_forward(alex, monkeypatch):
+def test_it_is_the_packages_own_forward(alex, take, monkeypatch):
     import torch
 
-    model = load_model("alex", alex)
+    lpips = take("alex", alex.read_bytes())
     # Imported without torchvision, which need not fit the installed torch, on our layers.
     layers = BACKBONES["alex"].build()
-    layers.load_state_dict(model.layers.state_dict())
+    layers.load_state_dict(lpips.layers.state_dict())
     models = ModuleType("torchvision.models")
     models.alexnet = lambda **_: SimpleNamespace(features=layers)  # type: ignore[attr-defined]
     torchvision = ModuleType("torchvision")
     torchvision.models = models  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "torchvision", torchvision)
     monkeypatch.setitem(sys.modules, "torchvision.models", models)
-    import lpips
+    from lpips import LPIPS
 
-    package: Any = lpips.LPIPS(net="alex", pnet_rand=True, verbose=False)
+    package: Any = LPIPS(net="alex", pnet_rand=True, verbose=False)
     image, truth = pictures()
-    value, spread = distance(model, image, truth)
+    value, spread = lpips.distance(image, truth)
     first, second = (
         torch.from_numpy(x).permute(2, 0, 1)[None].float() / 127.5 - 1 for x in (image, truth)
     )
@@ -76,58 +85,44 @@ def test_it_is_the_packages_own_forward(alex, monkeypatch):
 
 
 @needs_package
-def test_equal_pictures_have_no_distance_and_noise_adds_to_it(alex):
-    model = load_model("alex", alex)
-    image, _ = pictures()
+def test_equal_pictures_have_no_distance_noise_adds_to_it_and_shapes_are_checked(alex, take):
+    distance = take("alex", alex.read_bytes()).distance
+    image, truth = pictures()
     rng = np.random.default_rng(1)
     values = [
-        distance(model, np.clip(image + rng.normal(0, s, image.shape), 0, 255).astype("u1"), image)
+        distance(np.clip(image + rng.normal(0, s, image.shape), 0, 255).astype("u1"), image)[0]
         for s in (0, 5, 40)
     ]
-    assert values[0][0] == 0
-    assert values[0][0] < values[1][0] < values[2][0]
+    assert 0 == values[0] < values[1] < values[2]
+    wrongs: list[Any] = [truth[:-1], truth.astype(np.float32), truth[..., 0]]
+    for wrong in wrongs:
+        with pytest.raises(ShapeError):
+            distance(image, wrong)
+    with pytest.raises(ShapeError, match="at least 32"):
+        distance(image[:20], truth[:20])
 
 
-@pytest.mark.parametrize("net", list(BACKBONES))
-def test_backbones_have_the_published_shapes(net):
-    """Parameter counts of torchvision's feature layers."""
-    count = sum(p.numel() for p in BACKBONES[net].build().parameters())
-    assert count == {"vgg": 14_714_688, "alex": 2_469_696}[net]
+@pytest.mark.parametrize(("net", "count"), [("vgg", 14_714_688), ("alex", 2_469_696)])
+def test_backbones_have_the_parameters_of_torchvisions(net, count):
+    assert sum(p.numel() for p in BACKBONES[net].build().parameters()) == count
 
 
-def test_absent_weights_name_the_file_and_its_place(tmp_path):
+def test_absent_weights_name_the_file_and_its_place(tmp_path, monkeypatch, alex):
     with pytest.raises(CheckpointError, match=r"vgg16-397923af\.pth is absent; download https"):
         Lpips("vgg", folder=tmp_path)
     with pytest.raises(OptionError, match="vgg, alex"):
         Lpips("resnet")
-
-
-def test_torchs_cache_is_where_no_folder_is_named(tmp_path, monkeypatch, alex):
+    # Without a folder torch's cache is looked at.
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     with pytest.raises(CheckpointError, match="--lpips-weights"):
-        find_weights("alex")
+        Lpips("alex")
     (tmp_path / "hub/checkpoints").mkdir(parents=True)
     (tmp_path / "hub/checkpoints" / alex.name).write_bytes(alex.read_bytes())
-    assert find_weights("alex").is_file()
-
-
-def test_another_network_is_never_called_lpips(alex, tmp_path):
     with pytest.raises(CheckpointError, match="SHA-256"):
-        Lpips("alex", folder=alex.parent)
-    (tmp_path / "weights.pth").write_bytes(b"nothing")
-    with pytest.raises(CheckpointError, match="does not hold the weights"):
-        load_model("alex", tmp_path / "weights.pth")
-    with pytest.raises(CheckpointError, match="does not hold the weights"):
-        load_model("vgg", alex)
+        Lpips("alex")
 
 
-@needs_package
-def test_shapes_are_checked(alex):
-    model = load_model("alex", alex)
-    image, truth = pictures()
-    wrongs: list[Any] = [truth[:-1], truth.astype(np.float32), truth[..., 0]]
-    for wrong in wrongs:
-        with pytest.raises(ShapeError):
-            distance(model, image, wrong)
-    with pytest.raises(ShapeError, match="at least 32"):
-        distance(model, image[:20], truth[:20])
+def test_another_network_is_never_called_lpips(alex, take):
+    for net, content in (("alex", b"nothing"), ("vgg", alex.read_bytes())):
+        with pytest.raises(CheckpointError, match="does not hold the weights"):
+            take(net, content)

@@ -142,19 +142,20 @@ def test_any_split_is_a_window_of_the_scene_cut_as_asked(chosen, spare):
     # Evenly spaced, inside the scene, from the recorded start with the recorded stride.
     window = sorted(context + targets)
     size = chosen["context"] + chosen["targets"] * chosen["rounds"]
-    assert window == list(range(split.start, split.start + size * split.stride, split.stride))
-    assert split.start >= 0 and window[-1] < split.views == count
+    start, stride = split.window["start"], split.window["stride"]
+    assert window == list(range(start, start + size * stride, stride))
+    assert start >= 0 and window[-1] < split.window["views"] == count
     if chosen["stride"] is None:
-        assert (size - 1) * (split.stride + 1) >= count, "not as wide as the scene allows"
+        assert (size - 1) * (stride + 1) >= count, "not as wide as the scene allows"
     else:
-        assert split.stride == chosen["stride"]
+        assert stride == chosen["stride"]
     layout = "ends" if chosen["rounds"] == 1 else "first"
-    assert split.layout == layout
+    assert split.window["layout"] == layout
     if layout == "first":
         assert max(context) < min(targets)
     elif len(context) > 1:
         assert (context[0], context[-1]) == (window[0], window[-1])
-        gaps = [(b - a) // split.stride for a, b in pairwise(context)]
+        gaps = [(b - a) // stride for a, b in pairwise(context)]
         assert max(gaps) - min(gaps) <= 1
 
 
@@ -164,28 +165,28 @@ def test_the_same_question_has_the_same_answer(chosen, spare):
     split = protocol_split(names, **chosen)
     assert protocol_split(tuple(names), **chosen) == split
     stored = json.loads(json.dumps(split.to_dict()))
-    assert stored["context"] == list(split.context) and stored["start"] == split.start
+    assert stored["context"] == list(split.context) and stored["start"] == split.window["start"]
 
 
 @given(settings)
 def test_one_view_less_than_needed_is_refused(chosen):
     needed = _needed(chosen)
     names = [f"v{i}" for i in range(needed)]
-    assert protocol_split(names, **chosen).start == 0
+    assert protocol_split(names, **chosen).window["start"] == 0
     assume(needed > 1)
     with pytest.raises(OptionError, match=f"{needed - 1} views; expected at least {needed} "):
         protocol_split(names[:-1], **chosen)
 
 
 def test_seeds_reach_every_start_and_no_other():
-    drawn = [protocol_split(NAMES, stride=12, seed=seed).start for seed in range(500)]
+    drawn = [protocol_split(NAMES, stride=12, seed=seed).window["start"] for seed in range(500)]
     assert set(drawn) == set(range(100 - 7 * 12))
     assert max(map(drawn.count, set(drawn))) < 3 * min(map(drawn.count, set(drawn)))
 
 
 def test_a_seed_means_the_same_window_in_every_version():
     """The first draws of Python's generator, which its documentation promises to keep."""
-    assert [protocol_split(NAMES, stride=5, seed=seed).start for seed in range(4)] == [
+    assert [protocol_split(NAMES, stride=5, seed=seed).window["start"] for seed in range(4)] == [
         54,
         8,
         62,
@@ -199,9 +200,9 @@ def test_the_two_layouts():
     long = protocol_split(NAMES[:20], rounds=3)
     assert long.context == NAMES[:2]
     assert long.rounds == (NAMES[2:8], NAMES[8:14], NAMES[14:20])
-    assert (ends.layout, long.layout) == ("ends", "first")
+    assert (ends.window["layout"], long.window["layout"]) == ("ends", "first")
     widest = protocol_split(NAMES)
-    assert (widest.stride, widest.start) == (14, 1)
+    assert (widest.window["stride"], widest.window["start"]) == (14, 1)
     three = protocol_split(NAMES[:9], context=3)
     assert three.context == (NAMES[0], NAMES[4], NAMES[8])
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from gvtools.errors import ShapeError
 from gvtools.evaluation.images import image_figures, psnr, relative_depth_error, ssim
-from gvtools.evaluation.intervals import mean_interval
+from gvtools.evaluation.statistics import mean_interval
 
 pytestmark = pytest.mark.filterwarnings("error")
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from oracle import ABSENT, ORACLE, arrays, expected_values
 
+from gvtools.evaluation.statistics import ErrorStatistics
 from gvtools.evaluation.trajectories import (
-    ErrorStatistics,
     absolute_errors,
     by_index,
     by_time,

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gvtools.evaluation.intervals import mean_interval
+from gvtools.evaluation.statistics import mean_interval
 
 
 def test_the_interval_holds_the_mean_of_the_population_about_as_often_as_it_says():
