@@ -15,6 +15,9 @@ OWN_PIPE = {"gvtools/kernels.py"}
 # Its exceptions are caught by name; torch itself unpickles, weights only.
 ERRORS_ALONE = {"gvtools/networks/tensors.py"}
 MODULES = {"pickle", "cPickle", "dill", "cloudpickle", "joblib", "shelve", "marshal", "jsonpickle"}
+CALLS = {"load", "loads", "eval", "exec", "unsafe_load", "full_load", "read_pickle", "safe_load",
+         "safe_load_all"}  # fmt: skip
+OPTIONS = {"allow_pickle", "weights_only"}
 
 
 def complaints(source: str, name: str = "x.py") -> list[str]:
@@ -30,8 +33,10 @@ def complaints(source: str, name: str = "x.py") -> list[str]:
                 found.append(f"{name}:{node.lineno} imports {bad}")
         if not isinstance(node, ast.Call):
             continue
-        called, words = ast.unparse(node.func), {k.arg: k.value for k in node.keywords}
-        said = {key: ast.unparse(value) for key, value in words.items() if key}
+        said = {k.arg: ast.unparse(k.value) for k in node.keywords if k.arg in OPTIONS}
+        if not said and getattr(node.func, "attr", getattr(node.func, "id", "")) not in CALLS:
+            continue
+        called = ast.unparse(node.func)
         where = f"{name}:{node.lineno} {called}"
         if called in ("np.load", "numpy.load") and said.get("allow_pickle") != "False":
             found.append(f"{where} without allow_pickle=False")

@@ -7,7 +7,7 @@ import shutil
 
 import pytest
 from hostile import samples
-from hostile.run_samples import indexed_tensors, run, shards
+from hostile.samples import indexed_tensors, run, shards
 
 from gvtools.errors import CheckpointError, GvError, ProjectError
 from gvtools.networks.tensors import TensorFiles
@@ -124,7 +124,9 @@ def test_stems_of_a_run(tmp_path, secret):
     run(tmp_path)
     (tmp_path / "run" / "round_001" / "generated_x").mkdir()
     file = tmp_path / "run" / "round_001" / "report.json"
-    file.write_text(file.read_text().replace('"stem": "a"', '"stem": "x/../../../outside/secret"'))
+    report = json.loads(file.read_text())
+    report["views"][0]["stem"] = "x/../../../outside/secret"
+    file.write_text(json.dumps(report))
     target = load_run(tmp_path / "run").views[0]
     with pytest.raises(GvError, match="outside"):
         target.read()

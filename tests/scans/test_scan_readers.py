@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scan_files import FAR, surface, write_e57, write_las
+from scan_files import FAR, PAGE, e57_content, sealed_pages, surface, write_e57, write_las
 from scipy.spatial.transform import Rotation
 
 from gvtools.errors import GvError, MemoryFileError, OptionError
@@ -237,15 +237,10 @@ def test_lzf_copies_reach_far_back():
 
 def sealed(xml):
     """An E57 of an XML part alone, its pages with sound checksums where these are few."""
-    from hostile.sealed import PAGE, crc32c
-
-    step = PAGE - 4
-    pages = -(-(48 + len(xml)) // step)
+    pages = -(-(48 + len(xml)) // (PAGE - 4))
     head = b"ASTM-E57" + np.array([1, 0], "<u4").tobytes()
     head += np.array([pages * PAGE, 48, len(xml), PAGE], "<u8").tobytes()
-    whole = (head + xml).ljust(pages * step, b"\0")
-    parts = [whole[k : k + step] for k in range(0, len(whole), step)]
-    return b"".join(p + crc32c(p).to_bytes(4, "big") for p in parts)
+    return sealed_pages(head + xml)
 
 
 @pytest.mark.parametrize(
@@ -295,17 +290,12 @@ def test_errors_of_libraries_are_told_in_plain_words(tmp_path):
 
 def test_e57_with_a_count_beyond_its_bytes_is_refused(tmp_path):
     pytest.importorskip("pye57")
-    from hostile.sealed import PAGE, crc32c
-
     positions, _ = surface(300)
     columns = dict(zip(("cartesianX", "cartesianY", "cartesianZ"), positions.T, strict=True))
     path = write_e57(tmp_path / "scan.e57", [columns])
-    data = path.read_bytes()
-    whole = b"".join(data[k : k + PAGE - 4] for k in range(0, len(data), PAGE))
+    whole = e57_content(path.read_bytes())
     assert whole.count(b'recordCount="300"') == 1
-    whole = whole.replace(b'recordCount="300"', b'recordCount="999"')
-    pages = [whole[k : k + PAGE - 4] for k in range(0, len(whole), PAGE - 4)]
-    path.write_bytes(b"".join(page + crc32c(page).to_bytes(4, "big") for page in pages))
+    path.write_bytes(sealed_pages(whole.replace(b'recordCount="300"', b'recordCount="999"')))
     assert "its header says 999 points" in refused(path)
 
 
