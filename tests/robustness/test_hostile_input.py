@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 from hostile import judge
-from hostile.__main__ import CORPUS, ONE_THREAD, corpus, entries, figures, slug
+from hostile.__main__ import CORPUS, FFMPEG, corpus, entries, figures, slug
 from hostile.judge import FAILED, OTHER, REFUSED, SAME, Bench, limited
 from hostile.mutations import Mutation, Special, mutated
 from hostile.readers import READERS, Reader, data_sets
@@ -29,7 +29,7 @@ A_FEW = 2
 
 
 def replayed(reader: Reader, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, value in ONE_THREAD.items():
+    for name, value in FFMPEG.items():
         monkeypatch.setenv(name, value)
     bench = Bench(reader, folder)
     with limited():
