@@ -13,8 +13,9 @@ import gvtools
 from gvtools.errors import GvError
 from gvtools.system_libraries import advice, missing_libraries
 from pipelines.console import Console
+from pipelines.options import add_actions, add_command
 
-# Each module has SUMMARY, EXAMPLES, add_arguments(parser) and run(args, console).
+# Each module has SUMMARY, EXAMPLES, and ACTIONS or NameArguments with run(arguments, console).
 COMMANDS = {
     "demo": "pipelines.commands.demo",
     "capture": "pipelines.commands.capture",
@@ -55,7 +56,8 @@ def build_parser(
     """The parser of all commands, given as name and module.
 
     Args:
-        only: name of the one whose options are added, which may take a second; None adds all.
+        only: name of the one that is loaded, which may take a second; None loads all, and "" all
+            but their options.
     """
     parser = _Parser(
         prog="gvtools",
@@ -66,20 +68,21 @@ def build_parser(
     parser.add_argument("--version", action="version", version=f"gvtools {gvtools.__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", parser_class=_Parser)
     for name, path in modules.items():
+        if only in modules and name != only:
+            commands.add_parser(name)
+            continue
         module = import_module(path)
-        examples = "\n".join(f"  {line}" for line in module.EXAMPLES)
-        command = commands.add_parser(
-            name,
-            help=module.SUMMARY,
-            description=f"examples:\n{examples}\n\n{module.SUMMARY}.",
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-            allow_abbrev=False,
-        )
-        if only in (None, name):
-            module.add_arguments(command)
+        command = add_command(commands, name, summary=module.SUMMARY, examples=module.EXAMPLES)
         command.add_argument("--quiet", action="store_true", help="print nothing but warnings")
         command.add_argument("--debug", action="store_true", help="show tracebacks of errors")
-        command.set_defaults(module=module)
+        if only not in (None, name):
+            continue
+        if hasattr(module, "ACTIONS"):
+            add_actions(command, name, module.ACTIONS)
+        else:
+            arguments = getattr(module, f"{name.capitalize()}Arguments")
+            command.set_defaults(job=(module.run, arguments))
+            arguments.add(command)
     return parser
 
 
@@ -93,14 +96,15 @@ def main(argv: Sequence[str] | None = None, *, modules: Mapping[str, str] = COMM
     # Waiting threads that spin would take the cores that other programs need, and with them ours.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     words = sys.argv[1:] if argv is None else argv
-    parser = build_parser(modules, only=next((w for w in words if not w.startswith("-")), ""))
+    parser = build_parser(modules, only=words[0] if words and words[0][:1] != "-" else "")
     args = argparse.Namespace(debug=False)
     try:
         args = parser.parse_args(argv)
         if args.command is None:
             parser.print_help()
             return 2
-        args.module.run(args, Console(quiet=args.quiet))
+        run, arguments = args.job
+        run(arguments.read(args), Console(quiet=args.quiet))
     except BrokenPipeError:
         # The reader of the output, such as ``head``, has seen enough; nothing is left to flush.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -56,7 +56,7 @@ DOCTESTED = (
     "gvtools.untrusted",
     "pipelines.blocks.appearance",
     "pipelines.blocks.block",
-    "pipelines.commands.options",
+    "pipelines.options",
     "pipelines.data_sets.log_histogram",
 )
 

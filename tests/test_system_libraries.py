@@ -14,6 +14,7 @@ from command_line import refused
 
 from gvtools.system_libraries import LIBRARIES, advice, missing_libraries
 from pipelines import cli
+from pipelines.options import Arguments
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -48,7 +49,7 @@ def test_a_command_names_the_libraries_that_it_lacks(bare, monkeypatch, capsys, 
     def run(args: object, console: object) -> None:
         raise error
 
-    module = SimpleNamespace(SUMMARY="", EXAMPLES=(), add_arguments=lambda _: None, run=run)
+    module = SimpleNamespace(SUMMARY="", EXAMPLES=(), LackingArguments=Arguments, run=run)
     monkeypatch.setitem(sys.modules, "lacking", module)
     status = cli.main(["lacking"], modules={"lacking": "lacking"})
     said = capsys.readouterr().err

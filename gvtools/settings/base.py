@@ -65,6 +65,11 @@ class Settings(BaseModel):
     # Without this mark pydantic would call __init__ for nested models and lose their path.
     __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]
 
+    @classmethod
+    def key(cls, path: str) -> str:
+        """What messages call the field at a dotted path."""
+        return f"{cls.section}.{path}" if cls.section else path
+
     def replaced(self: S, **changes: Any) -> S:
         """A copy with some fields changed, checked again."""
         values = {name: getattr(self, name) for name in type(self).model_fields}
@@ -132,7 +137,7 @@ def describe(error: ValidationError, kind: type[Settings]) -> str:
     """The first complaint of pydantic as one line: the setting, what was found and expected."""
     first = error.errors()[0]
     path = ".".join(part for part in first["loc"] if isinstance(part, str))
-    key = f"{kind.section}.{path}" if kind.section else path
+    key = kind.key(path)
     if first["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
         return unknown(key, keys(kind))
     entry = _entry_at(kind, path.split("."))

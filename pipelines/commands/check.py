@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gvtools.errors import GvError, ProjectError
-from pipelines.commands.arguments import add_scene_arguments, open_scene
+from pipelines.commands.arguments import SceneArguments
 
 if TYPE_CHECKING:
     from gvtools.scenes.inspection import SceneReport
@@ -19,33 +18,32 @@ EXAMPLES = ("gvtools check my_colmap_workspace", "gvtools check scans/kitchen --
 LEVELS = ("error", "warning", "info")
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
-    parser.add_argument(
-        "project",
-        type=Path,
-        metavar="PROJECT",
-        help="a folder, a transforms.json or spec:NAME:SCENE",
-    )
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the report there")
-    add_scene_arguments(parser)
+class CheckArguments(SceneArguments):
+    """The command's arguments."""
+
+    positional = ("project",)
+
+    project: Path
+    """A folder, a transforms.json or spec:NAME:SCENE. [PROJECT]"""
+    json_: Path | None = None
+    """Write the report there. [FILE]"""
 
 
-def run(args: argparse.Namespace, console: Console) -> None:
+def run(args: CheckArguments, console: Console) -> None:
     """Open every file of the project and report."""
     from gvtools.files import write_json
     from gvtools.scenes.inspection import inspect
 
     try:
-        result = inspect(open_scene(args.project, args))
+        result = inspect(args.open_scene(args.project))
     except GvError as error:
-        if args.json is not None:
+        if args.json_ is not None:
             finding = {"level": "error", "message": str(error)}
-            write_json(args.json, {"root": str(args.project), "ok": False, "findings": [finding]})
+            write_json(args.json_, {"root": str(args.project), "ok": False, "findings": [finding]})
         raise
-    if args.json is not None:
-        write_json(args.json, result.to_dict())
-        console.line(f"report written to {args.json}")
+    if args.json_ is not None:
+        write_json(args.json_, result.to_dict())
+        console.line(f"report written to {args.json_}")
     else:
         _print(result, console)
     errors = [finding.message for finding in result.findings if finding.level == "error"]

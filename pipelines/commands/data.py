@@ -5,12 +5,12 @@ The actions: list, check, stats, shards, verify.
 
 from __future__ import annotations
 
-import argparse
+from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from pipelines.commands.arguments import Action, AddOption, add_actions
-from pipelines.data_sets.shards import shards, shards_options, verify, verify_options
+from pipelines.options import Action, Arguments
 
 if TYPE_CHECKING:
     from pipelines.console import Console
@@ -23,60 +23,92 @@ EXAMPLES = (
 )
 
 
-def _list_options(option: AddOption) -> None:
-    option("name", nargs="?", metavar="NAME", help="print all that is known of this one")
-    option("--json", type=Path, metavar="FILE", help="write what is known there, with its weight")
+class ListDataArguments(Arguments):
+    """Of ``data list``."""
+
+    positional = ("name",)
+
+    name: str | None = None
+    """Print all that is known of this one. [NAME]"""
+    json_: Path | None = None
+    """Write what is known there, with its weight. [FILE]"""
 
 
-def _download_options(option: AddOption) -> None:
-    option("name", metavar="NAME", help="of the data set; gvtools data list has them")
-    option("root", type=Path, metavar="ROOT", help="the folder of its download, or of a part")
-    option(
-        "--scene", action="append", default=[], metavar="S", help="this one alone; may be repeated"
-    )
-    option("--json", type=Path, metavar="FILE", help="write the figures there as well")
+class DownloadArguments(Arguments):
+    """Of ``data check`` and ``data stats``."""
+
+    positional = ("name", "root")
+
+    name: str
+    """Of the data set; gvtools data list has them. [NAME]"""
+    root: Path
+    """The folder of its download, or of a part. [ROOT]"""
+    scene: tuple[str, ...] = ()
+    """This one alone; may be repeated. [S]"""
+    json_: Path | None = None
+    """Write the figures there as well. [FILE]"""
 
 
-def _list(args: argparse.Namespace, console: Console) -> None:
-    from pipelines.data_sets.downloads import list_data_sets
+class ShardsArguments(Arguments):
+    """Of ``data shards``."""
 
-    list_data_sets(args, console)
+    positional = ("scenes_of",)
+
+    scenes_of: str
+    """A data set's name with --root, spec:NAME:SCENE with --root, or a project's folder.
+    [NAME|PROJECT]"""
+    root: Path | None = None
+    """The folder of the data set's download. [DIR]"""
+    out: Path
+    """The folder of the shards. [DIR]"""
+    scenes: tuple[str, ...] = ()
+    """Of the data set, by name (all). [SCENE ...]"""
+    size: float = 256
+    """Of a shard. [MB]"""
+    max_side: int | None = None
+    """Reduce pictures to this length of their longer side (as they are). [px]"""
 
 
-def _check(args: argparse.Namespace, console: Console) -> None:
-    from pipelines.data_sets.downloads import check_data_set
+class VerifyArguments(Arguments):
+    """Of ``data verify``."""
 
-    check_data_set(args, console)
+    positional = ("folder",)
 
-
-def _stats(args: argparse.Namespace, console: Console) -> None:
-    from pipelines.data_sets.downloads import statistics_of_data_set
-
-    statistics_of_data_set(args, console)
+    folder: Path
+    """A folder of shards. [DIR]"""
 
 
-_ACTIONS = {
+def _of(module: str, function: str) -> Callable[[Any, Console], None]:
+    """A function of ``pipelines.data_sets`` that is imported when it is called."""
+
+    def run(args: Any, console: Console) -> None:
+        getattr(import_module(f"pipelines.data_sets.{module}"), function)(args, console)
+
+    return run
+
+
+ACTIONS = {
     "list": Action(
-        _list,
-        _list_options,
+        _of("downloads", "list_data_sets"),
+        ListDataArguments,
         "data sets there is a spec of, or all that is known of one",
         ("", "hypersim", "--json data_sets.json"),
     ),
     "check": Action(
-        _check,
-        _download_options,
+        _of("downloads", "check_data_set"),
+        DownloadArguments,
         "what of a download can be read, scene by scene; a few views of each are decoded",
         ("7-Scenes data/7scenes", "dl3dv data/dl3dv --scene 1K/0a1b --json check.json"),
     ),
     "stats": Action(
-        _stats,
-        _download_options,
+        _of("downloads", "statistics_of_data_set"),
+        DownloadArguments,
         "views, baselines, focal lengths and depths of a download",
         ("7-Scenes data/7scenes", "7-Scenes data/7scenes --scene chess/seq-01"),
     ),
     "shards": Action(
-        shards,
-        shards_options,
+        _of("shards", "shards"),
+        ShardsArguments,
         "write scenes as WebDataset shards; goes on where it was stopped",
         (
             "7-Scenes --root data/7scenes --out shards/7scenes --max-side 320",
@@ -84,19 +116,9 @@ _ACTIONS = {
         ),
     ),
     "verify": Action(
-        verify,
-        verify_options,
+        _of("shards", "verify"),
+        VerifyArguments,
         "compare shards with their checksums",
         ("shards/7scenes",),
     ),
 }
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's actions and their options."""
-    add_actions(parser, "data", _ACTIONS)
-
-
-def run(args: argparse.Namespace, console: Console) -> None:
-    """Do what the action says."""
-    args.act(args, console)

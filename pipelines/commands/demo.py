@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
+from typing import Literal
 
-from pipelines.commands.reconstruct import add_run_arguments, config_from, copy_figures
+from pipelines.commands.reconstruct import RunArguments, copy_figures, run_settings
 from pipelines.console import Console
 
 SUMMARY = "run the main job on a sample that needs no download"
@@ -14,28 +14,22 @@ EXAMPLES = (
     "gvtools demo --sample motorcycle --out runs/motorcycle",
     "gvtools demo --sample noisy-room",
 )
-SAMPLES = ("room", "noisy-room", "motorcycle")
 # Steps of the fit unless told otherwise: a first look takes seconds and is the same every time.
 FIT_STEPS = 300
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The options of ``demo``: the sample, and every option of ``reconstruct``.
+class DemoArguments(RunArguments):
+    """The sample, which also --dry-run writes and opens, and every option of ``reconstruct``."""
 
-    The sample is written beside the run also with ``--dry-run``, which opens it.
-    """
-    parser.add_argument(
-        "--sample",
-        choices=SAMPLES,
-        default="room",
-        help="default room; noisy-room is the same as a cheap RGB-D camera records it",
-    )
-    add_run_arguments(parser, out_required=False)
+    sample: Literal["room", "noisy-room", "motorcycle"] = "room"
+    """noisy-room is the room as a cheap RGB-D camera records it."""
+    out: Path | None = None
+    """The run's folder. [PATH]"""
 
 
-def run(args: argparse.Namespace, console: Console) -> None:
+def run(args: DemoArguments, console: Console) -> None:
     """Run ``gvtools demo``: write the sample, reconstruct it, say where the results are."""
-    config = config_from(args)
+    config = run_settings(args.settings, texts=args.set, file=args.config)
     default = Path("runs") / f"demo-{args.sample}"
     # Absolute, since the sample's folder is named after it, and "." has no name.
     out = args.out.absolute() if args.out else free_folder(default, resume=args.resume)
@@ -51,13 +45,13 @@ def run(args: argparse.Namespace, console: Console) -> None:
     compile_kernels(config, console, more=(KERNELS,) if args.sample != "motorcycle" else ())
     console.line(f"sample {args.sample}, seed {config.seed}: writing {sample}")
     context, targets = _write(args.sample, sample, config.seed)
-    if args.context is None:
+    if "context" not in args.settings:
         config = config.replaced(context=",".join(context))
-    if args.targets is None:
+    if "targets" not in args.settings:
         config = config.replaced(targets=",".join(targets))
     if config.refine.seconds is None and config.refine.steps is None:
         config = config.replaced(refine=config.refine.replaced(steps=FIT_STEPS))
-    if args.views_per_round is None and args.rounds is None:
+    if not {"views_per_round", "rounds"} & args.settings.keys():
         config = config.replaced(views_per_round=4)
     reconstruct(
         open_project(sample),

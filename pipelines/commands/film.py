@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pydantic import Field
+
 from gvtools.errors import OptionError
+from pipelines.options import Arguments
 
 if TYPE_CHECKING:
     import numpy as np
@@ -25,48 +27,42 @@ EXAMPLES = (
 )
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
-    parser.add_argument("memory", type=Path, metavar="RUN_OR_MEMORY", help="a run or a memory.npz")
-    parser.add_argument(
-        "--path",
-        default="interpolate",
-        metavar="PATH",
-        help="orbit:N, spiral:N, interpolate:N (N frames, 120 by default), cameras (the captured "
-        "views), a TUM or KITTI file, a transforms.json such as 'gvtools view' saves, or a project "
-        "(the last two also PATH@SELECTION)",
-    )
-    parser.add_argument(
-        "--out", type=Path, required=True, metavar="FILE", help="FILE.mp4, FILE.gif or FILE.webp"
-    )
-    parser.add_argument("--fps", type=float, default=24.0, metavar="N", help="frames a second (24)")
-    parser.add_argument(
-        "--width", type=int, metavar="PIXELS", help="of a panel; the height follows (the cameras')"
-    )
-    parser.add_argument("--round", type=int, metavar="R", help="the memory as it was after round R")
-    shown = parser.add_mutually_exclusive_group()
-    shown.add_argument(
-        "--complete", action="store_true", help="fill what the memory leaves open (inpaint)"
-    )
-    shown.add_argument("--depth", action="store_true", help="depth in colours, near is red")
-    shown.add_argument(
-        "--compare",
-        metavar="A,B",
-        help="panels side by side, of memory, observed, completed, depth",
-    )
-    parser.add_argument(
-        "--growth", action="store_true", help="the path once for each round, as memory was then"
-    )
+class FilmArguments(Arguments):
+    """The command's arguments."""
+
+    positional = ("memory",)
+    exclusive = (("complete", "depth", "compare"),)
+
+    memory: Path
+    """A run or a memory.npz. [RUN_OR_MEMORY]"""
+    path: str = "interpolate"
+    """orbit:N, spiral:N, interpolate:N (N frames, 120 by default), cameras (the captured views), a
+    TUM or KITTI file, a transforms.json such as 'gvtools view' saves, or a project (the last two
+    also PATH@SELECTION). [PATH]"""
+    out: Path
+    """FILE.mp4, FILE.gif or FILE.webp. [FILE]"""
+    fps: float = Field(24.0, gt=0, le=240)
+    """Frames a second. [N]"""
+    width: int | None = Field(None, ge=16)
+    """Of a panel; the height follows (the cameras'). [pixels]"""
+    round: int | None = None
+    """The memory as it was after round R. [R]"""
+    complete: bool = False
+    """Fill what the memory leaves open (inpaint)."""
+    depth: bool = False
+    """Depth in colours, near is red."""
+    compare: str | None = None
+    """Panels side by side, of memory, observed, completed, depth. [A,B]"""
+    growth: bool = False
+    """The path once for each round, as memory was then."""
 
 
-def run(args: argparse.Namespace, console: Console) -> None:
+def run(args: FilmArguments, console: Console) -> None:
     """Draw and write the film."""
     from gvtools.runs.run import load_memory
     from pipelines.film import check_suffix, film_cameras, write_film
 
     check_suffix(args.out)
-    if not 0 < args.fps <= 240:
-        raise OptionError(f"--fps {args.fps:g}; expected more than 0 and at most 240")
     if args.growth and args.round is not None:
         raise OptionError("--growth shows every round; leave --round out")
     panels = _panels(args)
@@ -89,7 +85,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
     )
 
 
-def _panels(args: argparse.Namespace) -> tuple[str, ...]:
+def _panels(args: FilmArguments) -> tuple[str, ...]:
     from pipelines.film import PANELS
 
     if args.complete:
@@ -108,7 +104,7 @@ def _panels(args: argparse.Namespace) -> tuple[str, ...]:
 
 
 def _frames(
-    args: argparse.Namespace,
+    args: FilmArguments,
     cameras: Cameras,
     rounds: tuple[int | None, ...],
     *,

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import argparse
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from gvtools.errors import OptionError, ProjectError
+from pipelines.options import Arguments
 
 if TYPE_CHECKING:
     from pipelines.console import Console
@@ -20,31 +20,27 @@ EXAMPLES = (
     "gvtools fleet scenes.yaml --engine slurm --out /shared/fleet",
     "gvtools fleet scenes.yaml --collect --out /shared/fleet",
 )
-ENGINES = ("ray", "processes", "slurm")
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
-    parser.add_argument("scenes", type=Path, metavar="SCENES.yaml", help="stages and scenes")
-    parser.add_argument(
-        "--out",
-        required=True,
-        metavar="FOLDER",
-        help="of the results, a path or URL; goes on there",
-    )
-    parser.add_argument("--engine", choices=ENGINES, default="ray", help="default ray")
-    parser.add_argument(
-        "--address",
-        metavar="WHERE",
-        help="Ray's cluster: auto (the one that runs here), HOST:PORT, or local, a new one on this "
-        "machine (default local)",
-    )
-    parser.add_argument(
-        "--collect", action="store_true", help="run nothing; gather the results that are there"
-    )
+class FleetArguments(Arguments):
+    """The command's arguments."""
+
+    positional = ("scenes",)
+
+    scenes: Path
+    """Stages and scenes. [SCENES.yaml]"""
+    out: str
+    """Of the results, a path or URL; goes on there. [FOLDER]"""
+    engine: Literal["ray", "processes", "slurm"] = "ray"
+    """What runs the commands."""
+    address: str | None = None
+    """Ray's cluster: auto (the one that runs here), HOST:PORT, or local, a new one on this machine
+    (default local). [WHERE]"""
+    collect: bool = False
+    """Run nothing; gather the results that are there."""
 
 
-def run(args: argparse.Namespace, console: Console) -> None:
+def run(args: FleetArguments, console: Console) -> None:
     """Run what is not finished, and print one table."""
     from gvtools.runs.folder import folder_lock
     from pipelines.fleet.run import jobs_of, report, run_fleet, write_slurm
@@ -79,7 +75,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
         )
 
 
-def _pool(left: list[Task], args: argparse.Namespace, console: Console) -> Pool:
+def _pool(left: list[Task], args: FleetArguments, console: Console) -> Pool:
     from pipelines.fleet.run import Ray, this_machine
 
     if args.engine == "processes":

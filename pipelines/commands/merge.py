@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from pipelines.options import Arguments
 
 if TYPE_CHECKING:
     from pipelines.console import Console
@@ -16,20 +17,24 @@ EXAMPLES = (
 )
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
-    parser.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="a block's finished run")
-    parser.add_argument("--out", type=Path, required=True, metavar="RUN", help="the merged run")
-    parser.add_argument(
-        "--blocks", type=Path, metavar="FOLDER", help="where the split lies now, if it was moved"
-    )
-    parser.add_argument(
-        "--project", type=Path, metavar="DIR", help="where the whole project lies now, if moved"
-    )
-    parser.add_argument("--resume", action="store_true", help="continue after the last whole round")
+class MergeArguments(Arguments):
+    """The command's arguments."""
+
+    positional = ("runs",)
+
+    runs: tuple[Path, ...]
+    """A block's finished run. [RUN]"""
+    out: Path
+    """The merged run. [RUN]"""
+    blocks: Path | None = None
+    """Where the split lies now, if it was moved. [FOLDER]"""
+    project: Path | None = None
+    """Where the whole project lies now, if moved. [DIR]"""
+    resume: bool = False
+    """Continue after the last whole round."""
 
 
-def run(args: argparse.Namespace, console: Console) -> None:
+def run(args: MergeArguments, console: Console) -> None:
     """Run ``gvtools merge``."""
     from pipelines.blocks.merge import merge
     from pipelines.report import draw_run

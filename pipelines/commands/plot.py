@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from gvtools.errors import OptionError, ProjectError
+from pipelines.options import Arguments
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -18,36 +18,33 @@ EXAMPLES = (
     "gvtools plot trajectories runs/kitchen --out kitchen.svg",
     "gvtools plot losses training/tiny --out losses.png",
 )
-KINDS = {
-    "growth": "of a run: what is stored, what became of the points, coverage, time",
-    "coverage": "of a run: coverage against round",
-    "timing": "of a run: time by stage and by round",
-    "trajectories": "of a run: given, requested and estimated cameras",
-    "losses": "of a training, or of one stage's folder: loss curves",
-}
 FORMATS = ("png", "svg", "pdf")
-ENDINGS = ".png, .svg or .pdf"
 DPI = 150
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
-    parser.add_argument(
-        "what", choices=tuple(KINDS), help="; ".join(f"{k}: {said}" for k, said in KINDS.items())
-    )
-    parser.add_argument("folder", type=Path, metavar="DIR", help="of the run or training")
-    parser.add_argument(
-        "--out", type=Path, required=True, metavar="FILE", help=f"ends with {ENDINGS}"
-    )
+class PlotArguments(Arguments):
+    """The command's arguments."""
+
+    positional = ("what", "folder")
+
+    what: Literal["growth", "coverage", "timing", "trajectories", "losses"]
+    """growth: of a run: what is stored, what became of the points, coverage, time; coverage: of a
+    run: coverage against round; timing: of a run: time by stage and by round; trajectories: of a
+    run: given, requested and estimated cameras; losses: of a training, or of one stage's folder:
+    loss curves."""
+    folder: Path
+    """Of the run or training. [DIR]"""
+    out: Path
+    """Ends with .png, .svg or .pdf. [FILE]"""
 
 
-def run(args: argparse.Namespace, console: Console) -> None:
+def run(args: PlotArguments, console: Console) -> None:
     """Draw and write."""
     from gvtools.files import replaced_when_written
 
     ending = args.out.suffix.lower().lstrip(".")
     if ending not in FORMATS:
-        raise OptionError(f"--out {args.out}: expected a name that ends with {ENDINGS}")
+        raise OptionError(f"--out {args.out}: expected a name that ends with .png, .svg or .pdf")
     figure = _figure(args.what, args.folder)
     with replaced_when_written(args.out) as temporary:
         figure.savefig(temporary, format=ending, dpi=DPI)

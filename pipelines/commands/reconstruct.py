@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from pipelines.commands.arguments import HelpSettings
+from pydantic import Field
+
+from pipelines.commands.arguments import SceneArguments
+from pipelines.options import HelpSettings, add_settings, given_settings
 
 if TYPE_CHECKING:
     from gvtools.settings import Settings
@@ -40,60 +44,64 @@ METAVARS = {
 }  # fmt: skip
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The options of ``reconstruct``."""
-    parser.add_argument(
-        "project",
-        type=Path,
-        help="COLMAP, posed RGB-D, transforms.json or spec:NAME:SCENE; pictures, a video or a "
-        "recording without cameras, with --capture",
-    )
-    add_run_arguments(parser, out_required=True)
-    parser.add_argument(
-        "--live", action="store_true", help="open the web viewer and follow the run"
-    )
-    parser.add_argument(
-        "--capture",
-        action="store_true",
-        help="where the input has no cameras, find them first, without asking: see gvtools capture",
-    )
-
-
-def add_run_arguments(parser: argparse.ArgumentParser, *, out_required: bool) -> None:
+class RunArguments(SceneArguments):
     """What ``reconstruct`` and ``demo`` share."""
-    from pipelines.commands.arguments import add_scene_arguments
-    from pipelines.commands.options import add_settings
-    from pipelines.reconstruction.settings import RunSettings
 
-    parser.add_argument("--out", type=Path, required=out_required, help="the run's folder")
-    add_settings(parser, RunSettings(), OPTIONS, metavars=METAVARS)
-    parser.add_argument("--config", type=Path, metavar="FILE", help="settings as JSON")
-    parser.add_argument(
-        "--set", action="append", default=[], metavar="KEY=VALUE", help="one setting; repeatable"
-    )
-    parser.add_argument(
-        "--help-settings", action=HelpSettings, settings=_settings, help="list all settings"
-    )
-    parser.add_argument("--resume", action="store_true", help="continue after the last whole round")
-    parser.add_argument("--dry-run", action="store_true", help="say what would be done, and stop")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there too")
-    add_scene_arguments(parser)
+    settings_of = OPTIONS
+
+    settings: dict[str, Any] = Field(default_factory=dict)
+    config: Path | None = None
+    """Settings as JSON. [FILE]"""
+    set: tuple[str, ...] = ()
+    """One setting; repeatable. [KEY=VALUE]"""
+    resume: bool = False
+    """Continue after the last whole round."""
+    dry_run: bool = False
+    """Say what would be done, and stop."""
+    json_: Path | None = None
+    """Write the figures there too. [FILE]"""
+
+    @classmethod
+    def add(cls, parser: argparse.ArgumentParser) -> None:
+        """Add the arguments, and the run's settings."""
+        from pipelines.reconstruction.settings import RunSettings
+
+        super().add(parser)
+        add_settings(parser, RunSettings(), OPTIONS, metavars=METAVARS)
+        parser.add_argument("--help-settings", action=HelpSettings, settings=_settings)
+
+
+class ReconstructArguments(RunArguments):
+    """The command's arguments."""
+
+    positional = ("project",)
+
+    project: Path
+    """COLMAP, posed RGB-D, transforms.json or spec:NAME:SCENE; pictures, a video or a recording
+    without cameras, with --capture. [PROJECT]"""
+    out: Path
+    """The run's folder. [PATH]"""
+    live: bool = False
+    """Open the web viewer and follow the run."""
+    capture: bool = False
+    """Where the input has no cameras, find them first, without asking: see gvtools capture."""
 
 
 def _settings(args: argparse.Namespace) -> list[Settings]:
     from gvtools.completers.base import options_of_all
 
-    return [config_from(args), *options_of_all()]
+    given = given_settings(args, OPTIONS)
+    return [run_settings(given, texts=args.set or (), file=args.config), *options_of_all()]
 
 
-def run(args: argparse.Namespace, console: Console) -> None:
+def run(args: ReconstructArguments, console: Console) -> None:
     """Run ``gvtools reconstruct``."""
     from pipelines.commands.capture import open_or_capture
     from pipelines.reconstruction.run import reconstruct
     from pipelines.report import draw_run
     from pipelines.viewing.serve import live_viewer
 
-    config = config_from(args)
+    config = run_settings(args.settings, texts=args.set, file=args.config)
     scene, reading = open_or_capture(args, console)
     watched = args.live and not args.dry_run
     with live_viewer(args.out, console) if watched else nullcontext():
@@ -110,40 +118,36 @@ def run(args: argparse.Namespace, console: Console) -> None:
         copy_figures(args, args.out)
 
 
-def copy_figures(args: argparse.Namespace, out: Path) -> None:
+def copy_figures(args: RunArguments, out: Path) -> None:
     """Write a run's metrics.json where ``--json`` wants it."""
-    if args.json is not None and not args.dry_run:
+    if args.json_ is not None and not args.dry_run:
         from gvtools.files import write_text
 
-        write_text(args.json, (out / "metrics.json").read_text(encoding="utf-8"))
+        write_text(args.json_, (out / "metrics.json").read_text(encoding="utf-8"))
 
 
-def config_from(args: argparse.Namespace) -> RunSettings:
+def run_settings(
+    given: Mapping[str, Any], *, texts: Sequence[str], file: Path | None
+) -> RunSettings:
     """Defaults, then profile and protocol, then --config, then the options, then --set.
 
     ``--set profile=NAME`` stands for ``--profile NAME``.
     """
     from gvtools.settings import with_file, with_texts, with_values
-    from pipelines.commands.options import given_settings
     from pipelines.reconstruction.settings import RunSettings
 
-    config, texts = RunSettings(), []
-    presets = {name: getattr(args, name) for name in config.presets if getattr(args, name)}
-    for text in args.set:
+    config, others = RunSettings(), []
+    presets = {name: given[name] for name in config.presets if given.get(name)}
+    for text in texts:
         key, equals, value = text.partition("=")
         if key.strip() in config.presets and equals:
             presets[key.strip()] = value.strip()
         else:
-            texts.append(text)
-    if args.config:
-        config = with_file(config, args.config, presets=presets)
-    else:
-        config = with_values(config, presets)
-    given = {
-        key: value for key, value in given_settings(args, OPTIONS).items() if key not in presets
-    }
+            others.append(text)
+    config = with_file(config, file, presets=presets) if file else with_values(config, presets)
+    own = {key: value for key, value in given.items() if key not in presets}
     # A run's record names files wherever it is resumed from.
     for key in ("scan.file", "scan.placement"):
-        if key in given and (key == "scan.file" or Path(given[key]).is_file()):
-            given[key] = str(Path(given[key]).resolve())
-    return with_texts(with_values(config, given), texts)
+        if key in own and (key == "scan.file" or Path(own[key]).is_file()):
+            own[key] = str(Path(own[key]).resolve())
+    return with_texts(with_values(config, own), others)

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import argparse
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gvtools.errors import OptionError
-from pipelines.commands.arguments import (
-    add_lpips_arguments,
-    add_scene_arguments,
-    open_lpips,
-    open_scene,
-)
+from pipelines.commands.arguments import LpipsArguments, SceneArguments
 
 if TYPE_CHECKING:
     from gvtools.cameras import Cameras
@@ -29,46 +24,33 @@ EXAMPLES = (
 )
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
-    parser.add_argument("memory", type=Path, metavar="MEMORY_OR_RUN", help="a memory.npz or a run")
-    parser.add_argument(
-        "--cameras",
-        type=Path,
-        required=True,
-        metavar="PROJECT",
-        help="a project whose cameras to take, or a TUM or KITTI trajectory (camera as the "
-        "memory's first view)",
-    )
-    parser.add_argument("--views", default="all", metavar="SPEC", help="which (all)")
-    parser.add_argument(
-        "--out",
-        type=Path,
-        metavar="DIR",
-        help="for the pictures; with --against-images it may be left out, for the figures alone",
-    )
-    parser.add_argument(
-        "--against-images", action="store_true", help="compare with the project's own pictures"
-    )
-    parser.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="splat.KEY=VALUE",
-        help="a setting of the projection, such as splat.depth_band=0.03",
-    )
-    parser.add_argument(
-        "--backend", metavar="NAME", help="short for --set splat.backend=NAME (cpu, torch, ...)"
-    )
-    parser.add_argument(
-        "--device", metavar="NAME", help="short for --set splat.device=NAME (auto, cpu, cuda)"
-    )
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there")
-    add_lpips_arguments(parser)
-    add_scene_arguments(parser)
+class RenderArguments(LpipsArguments, SceneArguments):
+    """The command's arguments."""
+
+    positional = ("memory",)
+
+    memory: Path
+    """A memory.npz or a run. [MEMORY_OR_RUN]"""
+    cameras: Path
+    """A project whose cameras to take, or a TUM or KITTI trajectory (camera as the memory's first
+    view). [PROJECT]"""
+    views: str = "all"
+    """Which. [SPEC]"""
+    out: Path | None = None
+    """For the pictures; with --against-images it may be left out, for the figures alone. [DIR]"""
+    against_images: bool = False
+    """Compare with the project's own pictures."""
+    set: tuple[str, ...] = ()
+    """A setting of the projection, such as splat.depth_band=0.03. [splat.KEY=VALUE]"""
+    backend: str | None = None
+    """Short for --set splat.backend=NAME (cpu, torch, ...). [NAME]"""
+    device: str | None = None
+    """Short for --set splat.device=NAME (auto, cpu, cuda). [NAME]"""
+    json_: Path | None = None
+    """Write the figures there. [FILE]"""
 
 
-def run(args: argparse.Namespace, console: Console) -> None:
+def run(args: RenderArguments, console: Console) -> None:
     """Project, write pictures, measure."""
     from gvtools.files import write_json
     from gvtools.runs.layout import file_stems
@@ -92,7 +74,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
     names = select(cameras.names, args.views)
     row_of = {name: row for row, name in enumerate(cameras.names)}
     stems = file_stems(names)
-    lpips, no_lpips = open_lpips(args) if args.against_images else (None, None)
+    lpips, no_lpips = args.open_lpips() if args.against_images else (None, None)
     # The first projection compiles or loads the kernels and is not timed.
     memory.project(cameras[row_of[names[0]]], options=options)
     views = []
@@ -105,8 +87,8 @@ def run(args: argparse.Namespace, console: Console) -> None:
             write_view(args.out, stems[name], guidance)
         views.append(measure(name, guidance, frame, seconds=seconds, lpips=lpips))
     figures = summary(views, compared=args.against_images, no_lpips=no_lpips)
-    if args.json is not None:
-        write_json(args.json, figures)
+    if args.json_ is not None:
+        write_json(args.json_, figures)
     else:
         columns = ("view", "psnr", "ssim", "psnr_valid", "ssim_valid", "depth_rel_valid",
                    "coverage", "seconds")  # fmt: skip
@@ -119,7 +101,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
         console.line(f"{len(views)} views in {args.out}")
 
 
-def splat_options(texts: list[str]) -> SplatOptions:
+def splat_options(texts: Sequence[str]) -> SplatOptions:
     """The projection's options, changed by ``splat.KEY=VALUE`` texts."""
     from gvtools.settings import with_texts
     from pipelines.reconstruction.settings import RunSettings
@@ -130,7 +112,7 @@ def splat_options(texts: list[str]) -> SplatOptions:
     return with_texts(RunSettings(), texts).splat
 
 
-def _cameras(args: argparse.Namespace, memory: SpatialMemory) -> tuple[Cameras, Scene | None]:
+def _cameras(args: RenderArguments, memory: SpatialMemory) -> tuple[Cameras, Scene | None]:
     if args.cameras.is_file() and args.cameras.suffix.lower() != ".json":
         from gvtools.trajectory_files import read_trajectory
 
@@ -143,5 +125,5 @@ def _cameras(args: argparse.Namespace, memory: SpatialMemory) -> tuple[Cameras, 
         if not photographed:
             raise OptionError(f"{args.memory}: no photograph's view; give a project as --cameras")
         return read_trajectory(args.cameras, photographed[0].camera), None
-    scene = open_scene(args.cameras, args)
+    scene = args.open_scene(args.cameras)
     return scene.cameras, scene

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import argparse
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gvtools.errors import OptionError
+from pipelines.commands.arguments import SceneArguments
 
 if TYPE_CHECKING:
     from gvtools.scenes.scene import Scene
@@ -26,46 +27,35 @@ LIMIT, RUNS = 900.0, 5
 UNITS = {"": 1.0, "s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
-    from pipelines.commands.arguments import add_scene_arguments
+class TradeoffArguments(SceneArguments):
+    """The command's arguments."""
 
-    parser.add_argument(
-        "project", type=Path, help="COLMAP, posed RGB-D, transforms.json or spec:NAME:SCENE"
-    )
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="of the results")
-    parser.add_argument(
-        "--budget",
-        metavar="TIME",
-        help="of a run: 60, 5m, 2h; default: none",
-    )
-    parser.add_argument(
-        "--context", metavar="SPEC", help=f"views that are given ({SPLIT['context']})"
-    )
-    parser.add_argument(
-        "--targets",
-        metavar="SPEC",
-        help=f"views that are held out and completed ({SPLIT['targets']})",
-    )
-    parser.add_argument("--config", type=Path, metavar="FILE", help="settings to start from")
-    parser.add_argument(
-        "--set", action="append", default=[], metavar="KEY=VALUE", help="one setting; repeatable"
-    )
-    parser.add_argument(
-        "--limit",
-        metavar="TIME",
-        help="of the whole sweep: trials that would not fit are left out and named (five times "
-        "--budget, at most 15m, its default)",
-    )
-    add_scene_arguments(parser)
+    positional = ("project",)
+
+    project: Path
+    """COLMAP, posed RGB-D, transforms.json or spec:NAME:SCENE. [PROJECT]"""
+    out: Path
+    """Of the results. [DIR]"""
+    budget: str | None = None
+    """Of a run: 60, 5m, 2h; default: none. [TIME]"""
+    context: str | None = None
+    """Views that are given (every:2). [SPEC]"""
+    targets: str | None = None
+    """Views that are held out and completed (every:2+1). [SPEC]"""
+    config: Path | None = None
+    """Settings to start from. [FILE]"""
+    set: tuple[str, ...] = ()
+    """One setting; repeatable. [KEY=VALUE]"""
+    limit: str | None = None
+    """Of the whole sweep: trials that would not fit are left out and named (five times --budget, at
+    most 15m, its default). [TIME]"""
 
 
-def run(args: argparse.Namespace, console: Console) -> None:
+def run(args: TradeoffArguments, console: Console) -> None:
     """Sweep, and write table, front and the recommended profile."""
     from gvtools.files import write_json
     from gvtools.runs.folder import folder_lock
     from gvtools.settings import changes
-    from pipelines.commands.arguments import reading_of
     from pipelines.reconstruction.plan import run_identity
     from pipelines.reconstruction.settings import RunSettings
     from pipelines.scoring.tradeoff import (
@@ -94,7 +84,7 @@ def run(args: argparse.Namespace, console: Console) -> None:
         budget=budget,
     )
     with folder_lock(args.out):
-        identity = run_identity(plan, reading_of(args))
+        identity = run_identity(plan, args.reading())
         folder = args.out / "trials"
         folder.mkdir(exist_ok=True)
         runs = Trials(scene, config, folder=folder, identity=identity)
@@ -124,9 +114,8 @@ def _within(config: RunSettings, budget: float | None) -> RunSettings:
     return config.replaced(refine=config.refine.replaced(seconds=budget / 2))
 
 
-def _planned(args: argparse.Namespace, config: RunSettings, console: Console) -> tuple[Scene, Plan]:
+def _planned(args: TradeoffArguments, config: RunSettings, console: Console) -> tuple[Scene, Plan]:
     """The scene, and the plan of the run that the sweep starts from."""
-    from pipelines.commands.arguments import open_scene
     from pipelines.reconstruction.prepare import make_plan
 
     if config.rounds is not None:
@@ -134,7 +123,7 @@ def _planned(args: argparse.Namespace, config: RunSettings, console: Console) ->
             f"rounds {config.rounds}: a sweep completes all views that it holds out; give fewer "
             "--targets instead"
         )
-    scene = open_scene(args.project, args)
+    scene = args.open_scene(args.project)
     plan = make_plan(scene, config, say=console.line)
     if any(view is None for view in plan.targets.truth) or plan.targets.project is not None:
         raise OptionError(
@@ -144,7 +133,7 @@ def _planned(args: argparse.Namespace, config: RunSettings, console: Console) ->
     return scene, plan
 
 
-def asked_for(args: argparse.Namespace, profile: str | None = None) -> RunSettings:
+def asked_for(args: TradeoffArguments, profile: str | None = None) -> RunSettings:
     """The run that the arguments ask for, or would with another profile.
 
     A profile finds its own voxel edge, unless one is given.
@@ -158,7 +147,9 @@ def asked_for(args: argparse.Namespace, profile: str | None = None) -> RunSettin
     elif profile is not None:
         config = with_values(config, {"profile": profile})
     named = [text for text in args.set if text.partition("=")[0].strip() == "profile"]
-    texts = args.set if profile is None else [text for text in args.set if text not in named]
+    texts: Sequence[str] = (
+        args.set if profile is None else [text for text in args.set if text not in named]
+    )
     config = with_texts(config, texts)
     split = {**SPLIT, **changes(RunSettings(), config)}
     return config.replaced(

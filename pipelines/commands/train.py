@@ -10,11 +10,13 @@ import argparse
 import json
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
+
+from pydantic import Field
 
 from gvtools.errors import OptionError
-from pipelines.commands.arguments import HelpSettings
-from pipelines.commands.tune import NAME, add_tune_arguments, refuse_tune_arguments, run_tune
+from pipelines.commands.tune import NAME, TuneArguments, run_tune
+from pipelines.options import HelpSettings
 
 if TYPE_CHECKING:
     from gvtools.settings import Settings
@@ -29,53 +31,42 @@ EXAMPLES = (
 )
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
-    from gvtools.training.records import STAGES
+class TrainArguments(TuneArguments):
+    """The command's arguments."""
 
-    parser.add_argument(
-        "config",
-        metavar="CONFIG",
-        help="a training that ships (tiny, base, micro), a JSON file, or tune: see below",
-    )
-    parser.add_argument(
-        "--stage",
-        choices=(*STAGES, "all"),
-        default="all",
-        help="encoder: pretraining of a small encoder with its heads; denoiser: both denoisers; "
-        "reflow: distillation to few steps; heads: a small model's heads on what it completes; "
-        "refiner: what tells how far its completions are to be trusted; "
-        "all: those that the training has, one after the other (%(default)s)",
-    )
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="of the training")
-    parser.add_argument(
-        "--init",
-        type=Path,
-        metavar="DIR",
-        help="start from these weights: a GeoVerse folder, or one with GLD's published files. By "
-        "default from the stage before. With published files, --stage all leaves the encoder's "
-        "stage out",
-    )
-    parser.add_argument(
-        "--resume", action="store_true", help="continue the stage where its last state was saved"
-    )
-    parser.add_argument("--until", type=int, metavar="STEP", help="stop after this step")
-    parser.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="KEY=VALUE",
-        help="a setting, such as denoiser.optimizer.steps=500",
-    )
-    parser.add_argument(
-        "--help-settings", action=HelpSettings, settings=_settings, help="list all settings"
-    )
-    parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
-    parser.add_argument(
-        "--sheets", type=int, default=250, metavar="N", help="sample sheets every N steps; 0: none"
-    )
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the last figures there")
-    add_tune_arguments(parser)
+    positional = ("config",)
+
+    config: str
+    """A training that ships (tiny, base, micro), a JSON file, or tune: see below. [CONFIG]"""
+    stage: Literal["encoder", "denoiser", "reflow", "heads", "refiner", "all"] = "all"
+    """encoder: pretraining of a small encoder with its heads; denoiser: both denoisers; reflow:
+    distillation to few steps; heads: a small model's heads on what it completes; refiner: what
+    tells how far its completions are to be trusted; all: those that the training has, one after the
+    other."""
+    out: Path
+    """Of the training. [DIR]"""
+    init: Path | None = None
+    """Start from these weights: a GeoVerse folder, or one with GLD's published files. By default
+    from the stage before. With published files, --stage all leaves the encoder's stage out.
+    [DIR]"""
+    resume: bool = False
+    """Continue the stage where its last state was saved."""
+    until: int | None = Field(None, ge=1)
+    """Stop after this step. [STEP]"""
+    set: tuple[str, ...] = ()
+    """A setting, such as denoiser.optimizer.steps=500. [KEY=VALUE]"""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """That computes."""
+    sheets: int = 250
+    """Sample sheets every N steps; 0: none. [N]"""
+    json_: Path | None = None
+    """Write the last figures there. [FILE]"""
+
+    @classmethod
+    def add(cls, parser: argparse.ArgumentParser) -> None:
+        """Add the arguments, and the list of settings."""
+        super().add(parser)
+        parser.add_argument("--help-settings", action=HelpSettings, settings=_settings)
 
 
 def _settings(args: argparse.Namespace) -> list[Settings]:
@@ -83,10 +74,10 @@ def _settings(args: argparse.Namespace) -> list[Settings]:
     from gvtools.training.options import TrainingSettings, shipped_or_read
 
     known = TrainingSettings() if args.config is None else shipped_or_read(args.config)[0]
-    return [with_texts(known, args.set)]
+    return [with_texts(known, args.set or ())]
 
 
-def run(args: argparse.Namespace, console: Console) -> None:
+def run(args: TrainArguments, console: Console) -> None:
     """Train the stages that were asked for."""
     from gvtools.completers.geoverse.weights import WHOLE_FILE
     from gvtools.files import check_parent, make_folder, write_text
@@ -100,19 +91,19 @@ def run(args: argparse.Namespace, console: Console) -> None:
     if args.config == NAME:
         run_tune(args, console)
         return
-    refuse_tune_arguments(args)
+    for name in TuneArguments.model_fields:
+        if name in args.model_fields_set:
+            raise OptionError(f"{args.key(name)} belongs to 'gvtools train tune'; leave it out")
     config, folder = shipped_or_read(args.config)
     config = with_texts(config, args.set)
-    if args.until is not None and args.until < 1:
-        raise OptionError(f"--until {args.until}; expected at least step 1")
     stages: tuple[str, ...] = (args.stage,)
     if args.stage == "all":
         stages = tuple(stage for stage in STAGES if getattr(config, stage) is not None)
         if args.init is not None and not (args.init / WHOLE_FILE).is_file():
             # A published encoder has its training behind it.
             stages = tuple(stage for stage in stages if stage != "encoder")
-    if args.json is not None:
-        check_parent(args.json)
+    if args.json_ is not None:
+        check_parent(args.json_)
     make_folder(args.out)
     figures: dict[str, dict[str, float]] = {}
     with ExitStack() as held:
@@ -137,5 +128,5 @@ def run(args: argparse.Namespace, console: Console) -> None:
             if figures[stage].get("step", 0) < stage_run.options.optimizer.steps:
                 # --until: the next stage has nothing to start from yet.
                 break
-        if args.json is not None and processes.first:
-            write_text(args.json, json.dumps(figures, indent=2) + "\n")
+        if args.json_ is not None and processes.first:
+            write_text(args.json_, json.dumps(figures, indent=2) + "\n")

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
-from gvtools.errors import OptionError
-from pipelines.commands.arguments import add_root_argument, refuse_root
+from pydantic import Field
+
+from pipelines.commands.arguments import RootArguments, refuse_root
 
 if TYPE_CHECKING:
     from gvtools.evaluation.trajectories import PoseErrors
@@ -22,63 +22,44 @@ EXAMPLES = (
 MOST_FOR_AUC = 2000
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's options."""
-    parser.add_argument("metric", choices=("ate", "rpe"), help="absolute or relative error")
-    for name in ("reference", "estimate"):
-        parser.add_argument(
-            name,
-            type=Path,
-            metavar=name.upper(),
-            help="a TUM, KITTI or EuRoC file, a COLMAP model, a project, or a run",
-        )
-    add_root_argument(parser)
-    parser.add_argument(
-        "--align",
-        choices=("none", "se3", "sim3"),
-        default="sim3",
-        help="of the estimate's centres to the reference's (default sim3)",
-    )
-    parser.add_argument(
-        "--delta", type=int, default=1, metavar="N", help="frames between the poses of a pair (1)"
-    )
-    parser.add_argument("--all-pairs", action="store_true", help="pairs start at every frame")
-    parser.add_argument(
-        "--associate",
-        default="auto",
-        metavar="HOW",
-        help="time, name, index, or auto: what both have, in the order name, time, index",
-    )
-    parser.add_argument(
-        "--max-difference",
-        type=float,
-        default=0.01,
-        metavar="SECONDS",
-        help="of times that belong together (default %(default)s)",
-    )
-    parser.add_argument(
-        "--offset", type=float, default=0.0, metavar="SECONDS", help="to add to the estimate's"
-    )
-    parser.add_argument("--layout", default="auto", metavar="NAME", help="tum, kitti or euroc")
-    parser.add_argument(
-        "--allow-mirrored",
-        action="store_true",
-        help="give figures also where the estimate is the reference's mirror image",
-    )
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there")
+class TrajectoryArguments(RootArguments):
+    """The command's arguments."""
+
+    positional = ("metric", "reference", "estimate")
+
+    metric: Literal["ate", "rpe"]
+    """Absolute or relative error."""
+    reference: Path
+    """A TUM, KITTI or EuRoC file, a COLMAP model, a project, or a run. [REFERENCE]"""
+    estimate: Path
+    """Likewise. [ESTIMATE]"""
+    align: Literal["none", "se3", "sim3"] = "sim3"
+    """Of the estimate's centres to the reference's."""
+    delta: int = 1
+    """Frames between the poses of a pair. [N]"""
+    all_pairs: bool = False
+    """Pairs start at every frame."""
+    associate: Literal["auto", "time", "name", "index"] = "auto"
+    """Auto: what both have, in the order name, time, index."""
+    max_difference: float = Field(0.01, ge=0)
+    """Of times that belong together. [seconds]"""
+    offset: float = 0.0
+    """To add to the estimate's. [seconds]"""
+    layout: Literal["auto", "tum", "kitti", "euroc"] = "auto"
+    """Of trajectory files."""
+    allow_mirrored: bool = False
+    """Give figures also where the estimate is the reference's mirror image."""
+    json_: Path | None = None
+    """Write the figures there. [FILE]"""
 
 
-def run(args: argparse.Namespace, console: Console) -> None:
+def run(args: TrajectoryArguments, console: Console) -> None:
     """Associate, align, measure."""
     from gvtools.evaluation.trajectories import absolute_errors, pose_auc, relative_errors
     from gvtools.files import write_json
-    from pipelines.inputs.trajectory_source import LAYOUTS, associate, open_trajectory
+    from pipelines.inputs.trajectory_source import associate, open_trajectory
     from pipelines.scoring.measurement import pose_figures
 
-    if args.layout not in LAYOUTS:
-        raise OptionError(f"--layout {args.layout!r}; expected one of {', '.join(LAYOUTS)}")
-    if not args.max_difference >= 0:
-        raise OptionError(f"--max-difference {args.max_difference}; expected 0 or more seconds")
     refuse_root(args.root, (args.reference, args.estimate))
     reference = open_trajectory(args.reference, layout=args.layout, root=args.root)
     estimate = open_trajectory(args.estimate, layout=args.layout, root=args.root)
@@ -115,8 +96,8 @@ def run(args: argparse.Namespace, console: Console) -> None:
     }
     if args.metric == "ate" and auc is None:
         figures["notes"]["auc"] = f"not measured over more than {MOST_FOR_AUC} poses"
-    if args.json is not None:
-        write_json(args.json, figures)
+    if args.json_ is not None:
+        write_json(args.json_, figures)
     else:
         _print(figures, errors, console)
     if not errors.ok:

@@ -2,68 +2,62 @@
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from gvtools.errors import OptionError
-from pipelines.commands.arguments import add_root_argument
+from pipelines.commands.arguments import RootArguments
 
 if TYPE_CHECKING:
     from gvtools.scenes.scene import Scene
+    from pipelines.commands.train import TrainArguments
     from pipelines.console import Console
     from pipelines.reconstruction.settings import RunSettings
 
 NAME = "tune"
-# Options of the stages that tuning does not look at, with their defaults.
-STAGE_OPTIONS = {"stage": "all", "resume": False, "until": None, "set": [], "sheets": 250}
-DEFAULT_MINUTES = 10.0
+# Of the stages; tuning does not look at them.
+STAGE_OPTIONS = ("stage", "resume", "until", "set", "sheets")
 
 
-def add_tune_arguments(parser: argparse.ArgumentParser) -> None:
+class TuneArguments(RootArguments):
     """What ``tune`` takes beside --init, --out, --device and --json."""
-    group = parser.add_argument_group(
-        NAME,
-        "CONFIG tune: train the denoisers to predict views of one scene from each other. "
+
+    title = (
+        "tune: CONFIG tune trains the denoisers to predict views of one scene from each other. "
         "Some of the views judge; the tuned weights are kept if they predict these better than "
-        "before. --init is the model that ships unless given, and --out a folder for "
-        "--set completer.weights=DIR",
+        "before. --init is the model that ships unless given, and --out a folder for --set "
+        "completer.weights=DIR"
     )
-    group.add_argument("--scene", type=Path, metavar="PROJECT", help="as reconstruct takes it")
-    add_root_argument(group)
-    group.add_argument(
-        "--context", metavar="SPEC", help="views that may be looked at (default all)"
-    )
-    group.add_argument("--depth", metavar="SOURCE", help="of the views, as of reconstruct (auto)")
-    group.add_argument(
-        "--minutes", type=float, metavar="M", help=f"how long (default {DEFAULT_MINUTES:g})"
-    )
-    group.add_argument(
-        "--steps", type=int, metavar="N", help="steps instead of a time: the same result each time"
-    )
-    group.add_argument("--seed", type=int, metavar="N", help="of everything random (default 0)")
+
+    scene: Path | None = None
+    """As reconstruct takes it. [PROJECT]"""
+    context: str = "all"
+    """Views that may be looked at. [SPEC]"""
+    depth: str = "auto"
+    """Of the views, as of reconstruct. [SOURCE]"""
+    minutes: float = 10.0
+    """How long. [min]"""
+    steps: int | None = None
+    """Steps instead of a time: the same result each time. [N]"""
+    seed: int = 0
+    """Of everything random. [N]"""
 
 
-def refuse_tune_arguments(args: argparse.Namespace) -> None:
-    """Refuse options of ``tune`` beside another training."""
-    for name in ("scene", "root", "context", "depth", "minutes", "steps", "seed"):
-        if getattr(args, name) is not None:
-            raise OptionError(f"--{name} belongs to 'gvtools train tune'; leave it out")
-
-
-def run_tune(args: argparse.Namespace, console: Console) -> None:
+def run_tune(args: TrainArguments, console: Console) -> None:
     """Tune, and write the weights."""
     from gvtools.completers.geoverse.completer import SHIPPED
     from gvtools.files import check_parent, write_json
     from gvtools.scenes.project import open_project
     from pipelines.tuning.tune import check_tunable, tune
 
+    if args.scene is None:
+        raise OptionError("train tune needs --scene PROJECT, the scene that is tuned to")
     config = _checked(args)
     weights = args.init or SHIPPED
     check_tunable(weights)
-    if args.json is not None:
-        check_parent(args.json)
+    if args.json_ is not None:
+        check_parent(args.json_)
     if args.out.exists() and not (args.out.is_dir() and not any(args.out.iterdir())):
         raise OptionError(f"--out {args.out}: holds something already; give a new folder")
     with tempfile.TemporaryDirectory() as folder:
@@ -79,32 +73,23 @@ def run_tune(args: argparse.Namespace, console: Console) -> None:
             say=console.line,
         )
     console.line(f"gvtools reconstruct ... --completer geoverse --set completer.weights={args.out}")
-    if args.json is not None:
-        write_json(args.json, tuning.to_dict())
+    if args.json_ is not None:
+        write_json(args.json_, tuning.to_dict())
 
 
-def _checked(args: argparse.Namespace) -> RunSettings:
+def _checked(args: TrainArguments) -> RunSettings:
     """Settings of a run that would read the scene likewise."""
     from gvtools.settings import with_values
     from pipelines.reconstruction.settings import RunSettings
 
-    for name, default in STAGE_OPTIONS.items():
-        if getattr(args, name) != default:
-            raise OptionError(f"train tune does not look at --{name}; leave it out")
-    if args.scene is None:
-        raise OptionError("train tune needs --scene PROJECT, the scene that is tuned to")
-    if args.minutes is not None and args.steps is not None:
+    for name in STAGE_OPTIONS:
+        if name in args.model_fields_set:
+            raise OptionError(f"train tune does not look at {args.key(name)}; leave it out")
+    if {"minutes", "steps"} <= args.model_fields_set:
         raise OptionError("--minutes and --steps: expected one of them; leave the other out")
-    given: dict[str, Any] = {
-        "tune.minutes": DEFAULT_MINUTES if args.minutes is None else args.minutes,
-        "tune.steps": args.steps,
-        "context": args.context,
-        "depth": args.depth,
-        "seed": args.seed,
-    }
-    config = with_values(
-        RunSettings(), {key: value for key, value in given.items() if value is not None}
-    )
+    given = {"tune.minutes": args.minutes, "tune.steps": args.steps, "context": args.context,
+             "depth": args.depth, "seed": args.seed}  # fmt: skip
+    config = with_values(RunSettings(), given)
     if not config.tune.wanted:
         raise OptionError("no minutes and no steps: nothing to do; give --minutes or --steps")
     return config

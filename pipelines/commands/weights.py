@@ -5,7 +5,6 @@ The actions: list, check, create, pack, truncate-wan, empty-prompt.
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gvtools.errors import CheckpointError, GvError, OptionError, ProjectError
-from pipelines.commands.arguments import Action, AddOption, add_actions
+from pipelines.options import Action, Arguments
 
 if TYPE_CHECKING:
     from gvtools.completers.geoverse.config import GeoVerseConfig
@@ -28,57 +27,79 @@ DEPTH = "depth"
 _INTERVAL = 10.0
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's actions and their options."""
-    add_actions(parser, "weights", _ACTIONS)
+class ListWeightsArguments(Arguments):
+    """Of ``weights list``."""
+
+    positional = ("config",)
+
+    config: str | None = None
+    """base, gld, tiny or a config.json; all by default. [CONFIG]"""
 
 
-def _list_options(option: AddOption) -> None:
-    option(
-        "config",
-        nargs="?",
-        metavar="CONFIG",
-        help="base, gld, tiny or a config.json; all by default",
-    )
+class CheckWeightsArguments(Arguments):
+    """Of ``weights check``."""
+
+    positional = ("folder",)
+
+    folder: Path
+    """A weights folder. [DIR]"""
+    config: str | None = None
+    """Instead of the folder's own config.json. [NAME|FILE]"""
+    json_: Path | None = None
+    """Write the report there. [FILE]"""
 
 
-def _check_options(option: AddOption) -> None:
-    option("folder", type=Path, metavar="DIR", help="a weights folder")
-    option("--config", metavar="NAME|FILE", help="instead of the folder's own config.json")
-    option("--json", type=Path, metavar="FILE", help="write the report there")
+class CreateArguments(Arguments):
+    """Of ``weights create``."""
+
+    positional = ("config", "folder")
+
+    config: str
+    """base, gld, tiny or a config.json. [NAME]"""
+    folder: Path
+    """The folder to make. [DIR]"""
+    seed: int = 0
+    """Of the numbers. [N]"""
 
 
-def _create_options(option: AddOption) -> None:
-    option("config", metavar="NAME", help="base, gld, tiny or a config.json")
-    option("folder", type=Path, metavar="DIR", help="the folder to make")
-    option("--seed", type=int, default=0, metavar="N", help="of the numbers (0)")
+class PackArguments(Arguments):
+    """Of ``weights pack``."""
+
+    positional = ("source", "folder")
+
+    source: Path
+    """Of gvtools train --out. [TRAINING]"""
+    folder: Path
+    """The folder to make or to renew. [DIR]"""
 
 
-def _pack_options(option: AddOption) -> None:
-    option("source", type=Path, metavar="TRAINING", help="of gvtools train --out")
-    option("folder", type=Path, metavar="DIR", help="the folder to make or to renew")
+class TruncateArguments(Arguments):
+    """Of ``weights truncate-wan``."""
+
+    positional = ("source", "folder")
+
+    source: Path
+    """The published folder or safetensors file. [SOURCE]"""
+    folder: Path
+    """The folder to make. [DIR]"""
+    vae: Path | None = None
+    """Of diffusers; by default beside the transformer. [DIR]"""
+    blocks: int = 16
+    """Backbone blocks to keep. [N]"""
 
 
-def _truncate_options(option: AddOption) -> None:
-    option("source", type=Path, metavar="SOURCE", help="the published folder or safetensors file")
-    option("folder", type=Path, metavar="DIR", help="the folder to make")
-    option(
-        "--vae", type=Path, metavar="DIR", help="of diffusers; by default beside the transformer"
-    )
-    option("--blocks", type=int, default=16, metavar="N", help="backbone blocks to keep (16)")
+class PromptArguments(Arguments):
+    """Of ``weights empty-prompt``."""
+
+    positional = ("source", "folder")
+
+    source: Path
+    """Wan's text encoder (transformers). [SOURCE]"""
+    folder: Path
+    """The video prior's folder. [DIR]"""
 
 
-def _prompt_options(option: AddOption) -> None:
-    option("source", type=Path, metavar="SOURCE", help="Wan's text encoder (transformers)")
-    option("folder", type=Path, metavar="DIR", help="the video prior's folder")
-
-
-def run(args: argparse.Namespace, console: Console) -> None:
-    """Do what the action says."""
-    args.act(args, console)
-
-
-def _list(args: argparse.Namespace, console: Console) -> None:
+def _list(args: ListWeightsArguments, console: Console) -> None:
     from gvtools.completers.geoverse.config import NAMES
     from pipelines.weights import print_depth, print_needed
 
@@ -92,14 +113,14 @@ def _list(args: argparse.Namespace, console: Console) -> None:
             print_needed(_config(name), console)
 
 
-def _pack(args: argparse.Namespace, console: Console) -> None:
+def _pack(args: PackArguments, console: Console) -> None:
     from pipelines.weights import pack, packed_bytes, size_text
 
     source = pack(args.source, args.folder)
     console.line(f"{args.folder}: {size_text(packed_bytes(args.folder))}, from {source}")
 
 
-def _check(args: argparse.Namespace, console: Console) -> None:
+def _check(args: CheckWeightsArguments, console: Console) -> None:
     from gvtools.completers.geoverse.weights import check_folder, check_is_folder, config_of
     from gvtools.files import write_json
     from pipelines.weights import print_parts
@@ -112,8 +133,8 @@ def _check(args: argparse.Namespace, console: Console) -> None:
         report["config"] = config.name
         parts = check_folder(folder, config)
     except GvError as error:
-        if args.json is not None:
-            write_json(args.json, {**report, "problem": str(error)})
+        if args.json_ is not None:
+            write_json(args.json_, {**report, "problem": str(error)})
         raise
     bad = [part for part in parts if not part.ok]
     problem = None
@@ -123,17 +144,17 @@ def _check(args: argparse.Namespace, console: Console) -> None:
             f"{folder}: {len(bad)} of {len(parts)} parts cannot be loaded, first {first}: "
             f"{bad[0].summary}"
         )
-    if args.json is not None:
+    if args.json_ is not None:
         found = [part.to_dict() for part in parts]
-        write_json(args.json, {**report, "ok": not bad, "parts": found, "problem": problem})
-        console.line(f"report written to {args.json}")
+        write_json(args.json_, {**report, "ok": not bad, "parts": found, "problem": problem})
+        console.line(f"report written to {args.json_}")
     else:
         print_parts(folder, config, parts, console=console)
     if problem:
         raise CheckpointError(problem)
 
 
-def _create(args: argparse.Namespace, console: Console) -> None:
+def _create(args: CreateArguments, console: Console) -> None:
     import torch
 
     from gvtools.completers.geoverse.model import GeoVerse, empty_model
@@ -166,7 +187,7 @@ def _create(args: argparse.Namespace, console: Console) -> None:
         )
 
 
-def _truncate(args: argparse.Namespace, console: Console) -> None:
+def _truncate(args: TruncateArguments, console: Console) -> None:
     from gvtools.completers.geoverse.wan import EMPTY_PROMPT
     from gvtools.completers.geoverse.wan_checkpoint import truncate
 
@@ -178,7 +199,7 @@ def _truncate(args: argparse.Namespace, console: Console) -> None:
     )
 
 
-def _empty_prompt(args: argparse.Namespace, console: Console) -> None:
+def _empty_prompt(args: PromptArguments, console: Console) -> None:
     from gvtools.completers.geoverse.wan import EMPTY_PROMPT
     from gvtools.completers.geoverse.wan_checkpoint import write_empty_prompt
 
@@ -219,29 +240,29 @@ def _config(name: str) -> GeoVerseConfig:
     raise OptionError(f"no configuration {name!r}; expected {', '.join(NAMES)} or a config.json")
 
 
-_ACTIONS = {
-    "list": Action(_list, _list_options, "files, publishers, licences, sizes", ("", "base")),
+ACTIONS = {
+    "list": Action(_list, ListWeightsArguments, "files, publishers, licences, sizes", ("", "base")),
     "check": Action(
         _check,
-        _check_options,
+        CheckWeightsArguments,
         "say precisely what does not fit",
         ("weights/base", "DIR --config tiny"),
     ),
     "create": Action(
         _create,
-        _create_options,
+        CreateArguments,
         "write an untrained model, for tests and as a start of training",
         ("tiny weights/untrained", "tiny weights/other --seed 1"),
     ),
     "pack": Action(
         _pack,
-        _pack_options,
+        PackArguments,
         "write a trained model in half precision, with its training's record",
         ("training/tiny weights/tiny",),
     ),
     "truncate-wan": Action(
         _truncate,
-        _truncate_options,
+        TruncateArguments,
         "make the video prior's folder from published Wan2.2-VACE weights",
         (
             "Wan2.2-VACE-Fun-A14B weights/base/video --vae Wan2.1-VACE-diffusers/vae",
@@ -250,7 +271,7 @@ _ACTIONS = {
     ),
     "empty-prompt": Action(
         _empty_prompt,
-        _prompt_options,
+        PromptArguments,
         "add the empty prompt's embedding to the video prior's folder",
         (
             "Wan2.2-VACE-Fun-14B-diffusers/text_encoder weights/base/video",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
@@ -26,6 +25,7 @@ from pipelines.data_sets.log_histogram import LogHistogram
 
 if TYPE_CHECKING:
     from gvtools.scenes.scene import Scene
+    from pipelines.commands.data import DownloadArguments, ListDataArguments
     from pipelines.console import Console
 
 COLUMNS = ("data set", "kind", "scenes", "images", "weight", "roles", "layout")
@@ -39,13 +39,13 @@ PERCENTILES = (5, 25, 50, 75, 95)
 # --- list -------------------------------------------------------------------------------------
 
 
-def list_data_sets(args: argparse.Namespace, console: Console) -> None:
+def list_data_sets(args: ListDataArguments, console: Console) -> None:
     """Print a table of the data sets, or everything about one."""
     names = spec_names() if args.name is None else (args.name,)
     specs = [load_spec(name) for name in names]
-    if args.json is not None:
-        write_json(args.json, {"data_sets": [known_of(spec) for spec in specs]})
-        console.line(f"{len(specs)} data sets written to {args.json}")
+    if args.json_ is not None:
+        write_json(args.json_, {"data_sets": [known_of(spec) for spec in specs]})
+        console.line(f"{len(specs)} data sets written to {args.json_}")
     elif args.name is None:
         console.table(COLUMNS, table_rows())
         console.line("weight: share in a mixture of all training sets, by the root of their images")
@@ -122,7 +122,7 @@ class SceneCheck:
         return {"scene": self.scene, **self.report.to_dict(), "problem": self.problem}
 
 
-def check_data_set(args: argparse.Namespace, console: Console) -> None:
+def check_data_set(args: DownloadArguments, console: Console) -> None:
     """Report on each scene as soon as it is read."""
     spec = load_spec(args.name)
     names = chosen_scenes(args.name, args.root, args.scene)
@@ -131,9 +131,9 @@ def check_data_set(args: argparse.Namespace, console: Console) -> None:
     bad: list[str] = []
     with ExitStack() as stack:
         written = None
-        if args.json is not None:
+        if args.json_ is not None:
             head = {"data_set": spec.name, "root": str(args.root)}
-            written = stack.enter_context(json_list_written(args.json, head, "scenes"))
+            written = stack.enter_context(json_list_written(args.json_, head, "scenes"))
         for check in checks(spec, args.root, names):
             _print_check(check, console, said)
             if written is not None:
@@ -284,7 +284,7 @@ class DownloadStatistics:
         return {**{name: getattr(self, name) for name in counts}, **sizes, **spreads}
 
 
-def statistics_of_data_set(args: argparse.Namespace, console: Console) -> None:
+def statistics_of_data_set(args: DownloadArguments, console: Console) -> None:
     """Print figures of all scenes of a download together."""
     spec = load_spec(args.name)
     names = chosen_scenes(args.name, args.root, args.scene)
@@ -304,10 +304,10 @@ def statistics_of_data_set(args: argparse.Namespace, console: Console) -> None:
         console.warn(f"{total.skipped} of {len(names)} scenes cannot be read, first {first}")
     if total.unreadable:
         console.warn(f"{total.unreadable} sampled views cannot be read; see gvtools data check")
-    if args.json is not None:
+    if args.json_ is not None:
         head = {"data_set": spec.name, "root": str(args.root)}
-        write_json(args.json, {**head, **total.to_dict()})
-        console.line(f"figures written to {args.json}")
+        write_json(args.json_, {**head, **total.to_dict()})
+        console.line(f"figures written to {args.json_}")
     else:
         _print_statistics(total, console)
 

@@ -2,48 +2,22 @@
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gvtools.errors import OptionError, ProjectError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from gvtools.scenes.shards.index import Skipped
     from gvtools.scenes.shards.writer import WrittenShard
+    from pipelines.commands.data import ShardsArguments, VerifyArguments
     from pipelines.console import Console
 
 # Of what could not be converted, so many are named; all are in index.json.
 NAMED = 5
 
 
-def shards_options(option: Callable[..., object]) -> None:
-    """The options of ``gvtools data shards``."""
-    option(
-        "scenes_of",
-        metavar="NAME|PROJECT",
-        help="a data set's name with --root, spec:NAME:SCENE with --root, or a project's folder",
-    )
-    option("--root", type=Path, metavar="DIR", help="the folder of the data set's download")
-    option("--out", type=Path, required=True, metavar="DIR", help="the folder of the shards")
-    option("--scenes", nargs="+", metavar="SCENE", help="of the data set, by name (all)")
-    option("--size", type=float, default=256, metavar="MB", help="of a shard (%(default)s)")
-    option(
-        "--max-side",
-        type=int,
-        metavar="PX",
-        help="reduce pictures to this length of their longer side (as they are)",
-    )
-
-
-def verify_options(option: Callable[..., object]) -> None:
-    """The options of ``gvtools data verify``."""
-    option("folder", type=Path, metavar="DIR", help="a folder of shards")
-
-
-def shards(args: argparse.Namespace, console: Console) -> None:
+def shards(args: ShardsArguments, console: Console) -> None:
     """Convert scenes to shards, or go on where a conversion stopped."""
     from gvtools.scenes.data_sets.catalogue import name_key, spec_names
     from gvtools.scenes.layout import SPEC
@@ -85,7 +59,7 @@ def _warn(skipped: tuple[Skipped, ...], console: Console) -> None:
         console.warn(f"left out: {len(skipped) - NAMED} more, listed in index.json")
 
 
-def verify(args: argparse.Namespace, console: Console) -> None:
+def verify(args: VerifyArguments, console: Console) -> None:
     """Compare shards with their checksums."""
     from gvtools.scenes.shards.index import read_index
     from gvtools.scenes.shards.reader import verify as problems_of

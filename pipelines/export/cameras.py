@@ -20,14 +20,14 @@ from gvtools.scenes.colmap_model import write_colmap as write_model
 from gvtools.scenes.transforms import FILE as TRANSFORMS
 from gvtools.scenes.transforms import write_transforms as write_frames
 from gvtools.scenes.transforms import written_here
-from pipelines.export.source import DistinctCameras, ExportOptions, ExportSource
+from pipelines.export.formats import ExportOptions
+from pipelines.export.source import DistinctCameras, ExportSource
 
 GENERATED = "generated.txt"
 HEADER = "# views that a completer made: name, and its picture where the run kept it"
 MODEL = "sparse/0"
 # COLMAP's own tools give up on more.
 MAX_POINTS = 200_000
-IMAGES = "images"
 
 
 def write_colmap(source: ExportSource, path: Path, options: ExportOptions) -> str:
@@ -69,13 +69,12 @@ def write_transforms(source: ExportSource, path: Path, options: ExportOptions) -
     ``images`` is the folder of the observed views' pictures, absolute or relative to the file;
     pictures of generated views are those of the run's rounds.
     """
-    images = IMAGES if options.images is None else options.images
     file, distinct = transforms_file(path), source.cameras()
     home = file.parent.resolve()
     paths, elsewhere = [], {}
     for name in distinct.cameras.names:
         made = distinct.generated.get(name)
-        picture = (home / images / name if made is None else made).resolve()
+        picture = (home / options.images / name if made is None else made).resolve()
         inside = picture.is_relative_to(home)
         place = picture.relative_to(home) if inside else Path("images") / name
         paths.append(place)

@@ -14,21 +14,49 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
+
+from pydantic import Field
 
 from gvtools.errors import OptionError
 from gvtools.optional import require
+from gvtools.settings import Settings
 
 # What every point format takes, and what a mesh takes beside it.
 POINTS = ("max_points", "observed")
 MESH = ("observed", "method", "voxel", "max_triangles", "texture")
+FormatName = Literal[
+    "ply", "splat", "spz", "mesh", "las", "usd", "rrd", "glb", "colmap", "transforms"
+]
+
+
+class ExportOptions(Settings):
+    """What a user asks of an export, beside its format and place."""
+
+    max_points: int | None = Field(None, ge=1)
+    """Thin to at most N points, one a voxel (ply: all; colmap: 200000; rrd: 1 million; glb, usd: 2
+    million; otherwise the memory's voxels). [N]"""
+    observed: bool = False
+    """Leave out what a completer made."""
+    method: Literal["tsdf", "poisson"] = "tsdf"
+    """Mesh: how it is made."""
+    voxel: float | None = Field(None, gt=0)
+    """Mesh: edge of the voxels that it is made in, scene units (from the memory's). [EDGE]"""
+    max_triangles: int | None = Field(None, ge=1)
+    """Mesh: simplify to at most N triangles. [N]"""
+    texture: int | None = Field(None, ge=64, le=4096)
+    """Mesh (.glb, .obj): colours from the run's photographs, in a picture of SIDE x SIDE; one
+    triangle for 80 of its pixels, unless --max-triangles says otherwise. [SIDE]"""
+    images: str = "images"
+    """Transforms: where the observed views' pictures are, beside the file; undistorted ones, if the
+    project's were distorted. [DIR]"""
 
 
 @dataclass(frozen=True)
 class ExportFormat:
     """One line of the table; functions are named ``module.function`` of ``pipelines.export``."""
 
-    name: str  # as ``--format`` takes it
+    name: FormatName
     writer: str
     holds: str  # what the files are, for ``--help``
     # That a file may have, and how such a file begins; none of what fills a folder.

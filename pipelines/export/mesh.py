@@ -22,8 +22,9 @@ from gvtools.files import replaced_when_written, write_text
 from gvtools.memory.store.local_frame import LocalFrame
 from gvtools.runs.layout import RECORD
 from gvtools.runs.run import load_run
+from pipelines.export.formats import ExportOptions
 from pipelines.export.points import write_glb_scene
-from pipelines.export.source import ExportOptions, ExportSource
+from pipelines.export.source import ExportSource
 from pipelines.export.surfaces import mesh_voxel, poisson_mesh, tsdf_mesh
 from pipelines.export.texture import TEXELS, Texture, texture_of
 
@@ -67,9 +68,9 @@ def write_mesh(source: ExportSource, path: Path, options: ExportOptions) -> str:
     memory, size = source.memory, options.texture
     if size is not None:
         _check_texture(source, path)
-    method = options.method or "tsdf"
+    method = options.method
     voxel = mesh_voxel(memory) if options.voxel is None else options.voxel
-    mesh = METHODS[method](memory, voxel, observed=bool(options.observed))
+    mesh = METHODS[method](memory, voxel, observed=options.observed)
     made = len(mesh.triangle.indices)
     most = options.max_triangles
     if size is not None and most is None:

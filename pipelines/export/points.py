@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from gvtools.files import replaced_when_written
 from gvtools.memory.ply import export_memory_ply
-from pipelines.export.source import ExportOptions, ExportSource, box_middle
+from pipelines.export.formats import ExportOptions
+from pipelines.export.source import ExportSource, box_middle
 
 # LAS: point format 7 has colours of 16 bits.
 POINT_FORMAT, VERSION = 7, "1.4"
@@ -36,7 +37,7 @@ FRAME = "input world frame, scene units, axes as in the input (not turned to y u
 
 def write_ply(source: ExportSource, path: Path, options: ExportOptions) -> str:
     """Write every observation, or one a voxel where a number of points is given."""
-    memory, observed = source.memory, bool(options.observed)
+    memory, observed = source.memory, options.observed
     points, edge = export_memory_ply(memory, path, max_points=options.max_points, observed=observed)
     thinned = f", thinned to voxels of {edge:.4g}" if edge else ""
     return f"{points} of {len(memory)} observations{thinned} in {path}"

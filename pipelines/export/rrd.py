@@ -20,7 +20,8 @@ from gvtools.errors import GvError
 from gvtools.files import replaced_when_written
 from gvtools.runs.layout import RECORD
 from gvtools.runs.run import load_run
-from pipelines.export.source import ExportOptions, ExportSource
+from pipelines.export.formats import ExportOptions
+from pipelines.export.source import ExportSource
 
 if TYPE_CHECKING:
     import rerun

@@ -1,4 +1,4 @@
-"""Contents of an export: points, Gaussians and cameras of a run or a memory, and user's options.
+"""Contents of an export: points, Gaussians and cameras of a run or a memory.
 
 Gaussians are those that the run fitted, which show what photographs saw. Of the memory's points,
 generated ones are added, and scanned ones that have no photograph's observation near them. Without
@@ -27,6 +27,7 @@ from gvtools.memory.store.voxel_index import levels_above
 from gvtools.memory.thinning import thinned
 from gvtools.runs.run import load_appearance
 from gvtools.runs.target_files import completed_picture
+from pipelines.export.formats import ExportOptions
 
 if TYPE_CHECKING:
     from gvtools.appearance.appearance import Appearance
@@ -41,19 +42,6 @@ HALFWAY = 0.5
 # Files hold float32. Where its rounding is more than the share ROUNDING of the size of small
 # Gaussians (the quantile SMALLEST), positions are relative to the middle of the scene.
 ROUNDING, SMALLEST = 0.1, 0.01
-
-
-@dataclass(frozen=True)
-class ExportOptions:
-    """What a user asked for; None: was not given, the format has its own default."""
-
-    max_points: int | None = None  # thin to at most so many
-    observed: bool | None = None  # leave out what a completer made
-    images: str | None = None  # folder of the observed views' pictures, for ``transforms``
-    method: str | None = None  # that makes a mesh, ``tsdf`` or ``poisson``
-    voxel: float | None = None  # edge of the voxels that a mesh is made in, scene units
-    max_triangles: int | None = None  # simplify a mesh to at most so many
-    texture: int | None = None  # side of the picture that a mesh's colours are in, texels
 
 
 @dataclass(frozen=True, eq=False)

@@ -36,7 +36,8 @@ from gvtools.errors import MemoryFileError
 from gvtools.files import replaced_when_written
 from gvtools.ply import read_ply, write_ply
 from gvtools.untrusted import read_bytes, unpack_gzip
-from pipelines.export.source import ExportOptions, ExportSource, Splats
+from pipelines.export.formats import ExportOptions
+from pipelines.export.source import ExportSource, Splats
 
 MAGIC, VERSION = 0x5053474E, 3
 # What may be unpacked: so many bytes for each of the file's, which harmonics of zeros need, and so

@@ -21,7 +21,8 @@ from gvtools.optional import require
 from gvtools.ply import read_header
 from gvtools.runs.layout import RECORD
 from gvtools.runs.run import Run, count_rounds, load_growing_run, load_memory
-from pipelines.export.source import ExportOptions, ExportSource, Splats
+from pipelines.export.formats import ExportOptions
+from pipelines.export.source import ExportSource, Splats
 from pipelines.export.splats import is_splat, read_splat_ply, read_spz
 from pipelines.viewing.readers import GREY, load_mesh, read_usd
 from viz.viewer.run_view import (

@@ -174,7 +174,7 @@ def test_an_experiment_without_what_it_needs_is_one_line(tmp_path, capsys):
     assert main(["experiment", "completion", "--scenes", "0"]) == 2
     assert "expected at least 1" in capsys.readouterr().err
     assert main(["experiment", "poses", "--teacher", "x", "--pictures", "y"]) == 2
-    assert "poses does not look at --teacher, --pictures" in capsys.readouterr().err
+    assert "poses does not look at --pictures, --teacher" in capsys.readouterr().err
     absent = str(tmp_path / "absent")
     assert main(["experiment", "poses", "--weights", absent]) == 2
     assert absent in capsys.readouterr().err

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import shutil
 import sys
@@ -10,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from command_line import refused
+from command_line import arguments, refused
 from PIL import Image
 
 from gvtools.errors import OptionError, UnposedError
 from gvtools.procedural.room_sample import write_room
-from pipelines.cli import build_parser, main
+from pipelines.cli import main
 from pipelines.commands import capture
 from pipelines.commands.capture import open_or_capture
 from pipelines.console import Console
@@ -30,10 +29,6 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("first") / "room"
     write_room(folder, views=8, width=320, height=240)
     return folder
-
-
-def arguments(*given: object) -> argparse.Namespace:
-    return build_parser().parse_args(["reconstruct", *(str(part) for part in given)])
 
 
 @pytest.fixture
@@ -91,7 +86,9 @@ def test_without_a_terminal_one_line_gives_the_command(
 def test_capture_comes_unasked_and_once(room: Path, captures: list[Asked], tmp_path: Path) -> None:
     masks = tmp_path / "masks"
     masks.mkdir()
-    args = arguments(room / "images", "--out", tmp_path / "run", "--capture", "--masks", masks)
+    args = arguments(
+        "reconstruct", room / "images", "--out", tmp_path / "run", "--capture", "--masks", masks
+    )
     for _ in range(2):
         scene, reading = open_or_capture(args, Console(quiet=True))
         assert len(scene) == 8
@@ -100,7 +97,15 @@ def test_capture_comes_unasked_and_once(room: Path, captures: list[Asked], tmp_p
     assert captures == [(room / "images", tmp_path / "run-project", masks)]
     with pytest.raises(OptionError, match="--images: of a COLMAP project"):
         open_or_capture(
-            arguments(room / "images", "--out", tmp_path / "b", "--capture", "--images", masks),
+            arguments(
+                "reconstruct",
+                room / "images",
+                "--out",
+                tmp_path / "b",
+                "--capture",
+                "--images",
+                masks,
+            ),
             Console(quiet=True),
         )
 
@@ -115,7 +120,7 @@ def test_a_user_at_a_terminal_is_asked(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     questions = on_terminal(monkeypatch, answer)
-    args = arguments(room / "images", "--out", tmp_path / "run")
+    args = arguments("reconstruct", room / "images", "--out", tmp_path / "run")
     if calls:
         assert len(open_or_capture(args, Console())[0]) == 8
     else:

@@ -1,23 +1,19 @@
 from __future__ import annotations
 
-import argparse
 import json
 
 import numpy as np
 import pytest
 import skimage.data
+from command_line import run_command
 from PIL import Image
 from scenes_workspace import HEIGHT, WIDTH, sevenscenes, workspace
 
 from gvtools.errors import ProjectError
-from pipelines.commands import check
-from pipelines.console import Console
 
 
 def run(*words: object) -> None:
-    parser = argparse.ArgumentParser()
-    check.add_arguments(parser)
-    check.run(parser.parse_args([str(word) for word in words]), Console())
+    run_command("check", *words)
 
 
 def test_a_good_project_is_ok_and_told_in_lines(tmp_path, capsys):

@@ -212,14 +212,6 @@ def test_one_scene_is_held_at_a_time(root: Path, monkeypatch: pytest.MonkeyPatch
     assert len(seen) == 6
 
 
-def test_the_command_line_loads_nothing_heavy() -> None:
-    script = "import sys, pipelines.commands.data; print(*sys.modules)"
-    done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=True
-    )
-    assert not {"numpy", "pydantic", "torch", "cv2"} & set(done.stdout.split())
-
-
 @pytest.mark.slow
 def test_ten_thousand_frames_stay_below_300_megabytes(tmp_path: Path) -> None:
     """Of a process's peak above that of the interpreter alone."""

@@ -1,11 +1,11 @@
 from __future__ import annotations
 
-import argparse
 import json
 
 import numpy as np
 import pytest
 from box_project import HEIGHT, SIZE, WIDTH, fused, write_box
+from command_line import run_command
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
@@ -18,14 +18,10 @@ from gvtools.memory.ply import export_memory_ply
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.runs.layout import file_stems
 from pipelines.bench.procedural_cloud import inside_camera, photograph
-from pipelines.commands import render
-from pipelines.console import Console
 
 
 def run(*words: object) -> None:
-    parser = argparse.ArgumentParser()
-    render.add_arguments(parser)
-    render.run(parser.parse_args([str(word) for word in words]), Console(quiet=True))
+    run_command("render", *words, quiet=True)
 
 
 @pytest.fixture(scope="module")

@@ -9,13 +9,13 @@ from scenes_workspace import sevenscenes, workspace
 from gvtools.errors import OptionError, ProjectError
 from gvtools.scenes.project import rgbd_options
 from gvtools.scenes.scene import Scene
-from pipelines.commands.arguments import add_scene_arguments, open_scene, reading_of
+from pipelines.commands.arguments import SceneArguments
 
 
-def parsed(*words: object) -> argparse.Namespace:
+def parsed(*words: object) -> SceneArguments:
     parser = argparse.ArgumentParser(exit_on_error=False)
-    add_scene_arguments(parser)
-    return parser.parse_args([str(word) for word in words])
+    SceneArguments.add(parser)
+    return SceneArguments.read(parser.parse_args([str(word) for word in words]))
 
 
 def depth_of(scene: Scene) -> np.ndarray:
@@ -25,33 +25,33 @@ def depth_of(scene: Scene) -> np.ndarray:
 
 
 def test_nothing_given_is_no_rgbd_option(tmp_path):
-    assert rgbd_options(reading_of(parsed())) is None
+    assert rgbd_options(parsed().reading()) is None
     workspace(tmp_path)
-    assert open_scene(tmp_path, parsed()).kind == "colmap"
+    assert parsed().open_scene(tmp_path).kind == "colmap"
 
 
 def test_images_and_masks_reach_the_reader(tmp_path):
     workspace(tmp_path / "project")
     (tmp_path / "project" / "images").rename(tmp_path / "pictures")
     with pytest.raises(ProjectError, match="--images"):
-        open_scene(tmp_path / "project", parsed())
-    scene = open_scene(tmp_path / "project", parsed("--images", tmp_path / "pictures"))
+        parsed().open_scene(tmp_path / "project")
+    scene = parsed("--images", tmp_path / "pictures").open_scene(tmp_path / "project")
     assert scene.views[0].load().rgb.any()
     with pytest.raises(ProjectError, match="masked"):
         masks = ("--masks", tmp_path / "masked")
-        open_scene(tmp_path / "project", parsed("--images", tmp_path / "pictures", *masks))
+        parsed("--images", tmp_path / "pictures", *masks).open_scene(tmp_path / "project")
 
 
 def test_depth_unit_and_intrinsics_change_what_is_read(tmp_path):
     sevenscenes(tmp_path)
-    plain = open_scene(tmp_path, parsed())
-    double = open_scene(tmp_path, parsed("--depth-unit", 0.002))
+    plain = parsed().open_scene(tmp_path)
+    double = parsed("--depth-unit", 0.002).open_scene(tmp_path)
     np.testing.assert_allclose(depth_of(double), 2 * depth_of(plain))
-    other = open_scene(tmp_path, parsed("--color-intrinsics", "100,101,40,30"))
+    other = parsed("--color-intrinsics", "100,101,40,30").open_scene(tmp_path)
     # Published with the first pixel's centre at (0, 0), here at (0.5, 0.5).
     expected = np.array([[100, 0, 40.5], [0, 101, 30.5], [0, 0, 1]])
     np.testing.assert_allclose(other.views[0].camera.K[0], expected)
-    near = open_scene(tmp_path, parsed("--depth-max", 1.0))
+    near = parsed("--depth-max", 1.0).open_scene(tmp_path)
     assert not depth_of(near).any()
 
 
@@ -62,8 +62,8 @@ def test_registration_takes_the_matrix_of_a_file(tmp_path):
     moved[0, 3] = 0.2
     np.savetxt(file, moved)
     args = parsed("--depth-intrinsics", "90,90,47.5,35.5", "--color-from-depth", file)
-    depth = depth_of(open_scene(tmp_path, args))
-    plain = depth_of(open_scene(tmp_path, parsed()))
+    depth = depth_of(args.open_scene(tmp_path))
+    plain = depth_of(parsed().open_scene(tmp_path))
     # A wall at 2 m moves by 90 x 0.2 / 2 = 9 pixels: the left edge has none now.
     assert not depth[:, :8].any()
     np.testing.assert_allclose(depth[10:60, 12:90], plain[10:60, 3:81], rtol=1e-3)
@@ -74,24 +74,24 @@ def test_a_file_without_a_matrix(tmp_path, text):
     file = tmp_path / "moved.txt"
     file.write_text(text)
     with pytest.raises(OptionError, match=r"moved\.txt.*4x4|four rows of four"):
-        rgbd_options(reading_of(parsed("--color-from-depth", file)))
+        rgbd_options(parsed("--color-from-depth", file).reading())
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("--depth-unit", "-1"), "no positive number"),
-        (("--depth-unit", "nan"), "no positive number"),
+        (("--depth-unit", "-1"), "--depth-unit -1; expected more than 0"),
+        (("--depth-unit", "nan"), "--depth-unit nan; expected more than 0"),
         (("--color-intrinsics", "1,2,3"), "four numbers"),
         (("--depth-intrinsics", "0,1,2,3"), "above 0"),
     ],
 )
 def test_numbers_that_are_none(words, message):
-    with pytest.raises(argparse.ArgumentError, match=message):
+    with pytest.raises(OptionError, match=message):
         parsed(*words)
 
 
 def test_rgbd_options_on_a_colmap_project_are_refused(tmp_path):
     workspace(tmp_path)
     with pytest.raises(OptionError, match="expected no RGB-D options"):
-        open_scene(tmp_path, parsed("--depth-unit", "0.001"))
+        parsed("--depth-unit", "0.001").open_scene(tmp_path)

@@ -10,11 +10,12 @@ import sys
 import threading
 import time
 from contextlib import contextmanager
+from typing import get_args
 
 import numpy as np
 import pytest
 from browser import free_port
-from command_line import refused
+from command_line import arguments, refused
 from PIL import Image
 
 from gvtools.errors import OptionError
@@ -50,9 +51,10 @@ def display(tmp_path):
 
 
 def test_the_parser_knows_what_the_viewers_know():
-    assert (view.LOCAL, view.PORT, view.MAX_POINTS) == (LOCAL, PORT, BUDGET)
+    args = arguments("view", "run")
+    assert (args.host, args.port, args.max_points) == (LOCAL, PORT, BUDGET)
     assert LOCAL == "127.0.0.1"
-    assert tuple(MODES) == view.COLORS
+    assert tuple(MODES) == get_args(view.ViewArguments.model_fields["color"].annotation)
 
 
 def test_a_picture_needs_no_display(small_run, tmp_path, monkeypatch, capsys):

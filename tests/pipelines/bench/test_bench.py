@@ -1,15 +1,13 @@
 from __future__ import annotations
 
-import argparse
 import json
 
 import numpy as np
 import pytest
+from command_line import run_command
 
 from gvtools.errors import OptionError
 from pipelines.bench import open3d_peers, procedural_cloud, side_by_side
-from pipelines.commands import bench
-from pipelines.console import Console
 
 
 @pytest.fixture(autouse=True)
@@ -18,9 +16,7 @@ def no_pauses(monkeypatch):
 
 
 def run(*words: object) -> None:
-    parser = argparse.ArgumentParser()
-    bench.add_arguments(parser)
-    bench.run(parser.parse_args([str(word) for word in words]), Console())
+    run_command("bench", *words)
 
 
 @pytest.mark.slow
@@ -44,9 +40,9 @@ def test_the_table_is_printed(capsys):
 
 
 def test_sizes_that_measure_nothing():
-    with pytest.raises(OptionError, match="at least 1000 points"):
+    with pytest.raises(OptionError, match="--points 10; expected at least 1000"):
         run("fuse", "--points", 10)
-    with pytest.raises(OptionError, match="1 repeat"):
+    with pytest.raises(OptionError, match="--repeat 0; expected at least 1"):
         run("splat", "--repeat", 0)
 
 

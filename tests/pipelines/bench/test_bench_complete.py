@@ -1,12 +1,12 @@
 from __future__ import annotations
 
-import argparse
 import importlib.util
 import json
 
 import geoverse_models as micro
 import pytest
 import torch
+from command_line import run_command
 
 from gvtools.completers.geoverse import model as stages
 from gvtools.completers.geoverse.config import named
@@ -18,8 +18,6 @@ from pipelines.bench import side_by_side
 from pipelines.bench.complete import StageClock, TimedPass, parameters, total, weight_bytes
 from pipelines.bench.options import CompleteOptions
 from pipelines.bench.random_model import random_features, random_model, random_video, random_views
-from pipelines.commands import bench
-from pipelines.console import Console
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -44,9 +42,7 @@ def no_pauses(monkeypatch):
 
 
 def run(*words: object) -> None:
-    parser = argparse.ArgumentParser()
-    bench.add_arguments(parser)
-    bench.run(parser.parse_args(["complete", *map(str, words)]), Console())
+    run_command("bench", "complete", *words)
 
 
 # Counting.
@@ -201,11 +197,8 @@ def test_options_that_do_not_fit(words, said):
 
 
 def test_other_benchmarks_know_no_model():
-    parser = argparse.ArgumentParser()
-    bench.add_arguments(parser)
-    args = parser.parse_args(["fuse", "--steps", "3", "--compile"])
     with pytest.raises(OptionError, match="--compile, --steps given"):
-        bench.run(args, Console())
+        run_command("bench", "fuse", "--steps", 3, "--compile")
 
 
 def test_sizes():

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import argparse
 import json
 import subprocess
 import sys
@@ -10,12 +9,11 @@ from pathlib import Path
 import geoverse_models as micro
 import pytest
 import torch
+from command_line import run_command
 
 from benchmarks.memory import CASES, peak, predicted_peak
 from gvtools.errors import OptionError
 from pipelines.bench.memory import LiveBytes, StagePeaks, alone, card_line, fake_tensors
-from pipelines.commands import bench
-from pipelines.console import Console
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -93,9 +91,7 @@ def test_what_is_predicted_is_what_is_counted_with_numbers():
 
 
 def run(*words: object) -> None:
-    parser = argparse.ArgumentParser()
-    bench.add_arguments(parser)
-    bench.run(parser.parse_args(["complete", *map(str, words)]), Console())
+    run_command("bench", "complete", *words)
 
 
 @pytest.mark.slow

@@ -220,7 +220,7 @@ def test_a_view_fused_twice_is_one_camera(scene, tmp_path):
 
 
 def test_options_that_make_no_sense(saved, tmp_path):
-    with pytest.raises(OptionError, match="1 or more"):
+    with pytest.raises(OptionError, match="--max-points 0; expected at least 1"):
         export_run(saved, "ply", tmp_path / "a.ply", "--max-points", 0)
     with pytest.raises(OptionError, match="transforms does not take it"):
         export_run(saved, "transforms", tmp_path / "a", "--max-points", 5)

@@ -8,11 +8,12 @@ import shutil
 from pathlib import Path
 
 import pytest
+from command_line import arguments
 from tiny_scan import write_scan
 
 from gvtools.runs.folder import folder_lock
 from gvtools.settings import changes, with_texts, with_values
-from pipelines.cli import build_parser, main
+from pipelines.cli import main
 from pipelines.commands.tradeoff import asked_for
 from pipelines.reconstruction.settings import RunSettings
 from pipelines.scoring.tradeoff import EQUAL, changed
@@ -82,8 +83,8 @@ def test_reconstruct_gives_the_figures_of_a_trial(scan, swept, tmp_path, label):
 def test_settings_of_ones_own_stand_over_every_profile(own, tmp_path):
     file = tmp_path / "given.json"
     file.write_text('{"profile": "accurate", "effort": {"inpaint_below": 0.07}}')
-    arguments = ["tradeoff", "scan", "--out", "out", "--config", str(file)]
-    args = build_parser().parse_args(arguments + [word for text in own for word in ("--set", text)])
+    words = ["tradeoff", "scan", "--out", "out", "--config", file]
+    args = arguments(*words, *(word for text in own for word in ("--set", text)))
     start = asked_for(args)
     assert start.profile == "accurate" and start.memory.merge_angle_deg == 0
     for name in RunSettings.presets["profile"]:
