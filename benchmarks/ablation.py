@@ -55,7 +55,7 @@ def _as_completed(projected: Any, guidance: Any, rgb: Any) -> Any:
 PARTS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "nothing (all parts)": ({}, {}),
     "fitting": ({"refine.steps": 0}, {}),
-    "several fits": ({}, {"gvtools.appearance.fits.MOST_FITS": 1}),
+    "several fits": ({}, {"gvtools.appearance.fit.MOST_FITS": 1}),
     "exposures": ({"refine.exposure": False}, {}),
     "exposures of new cameras": (
         {},

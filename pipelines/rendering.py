@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.appearance.appearance import Appearance, applied
+from gvtools.appearance.appearance import Appearance, recolor
 from gvtools.cameras import Cameras
 from gvtools.evaluation.images import FIGURES, view_figures
 from gvtools.evaluation.lpips_distance import Lpips
@@ -38,7 +38,7 @@ def render_view(
     start = time.perf_counter()
     guidance = memory.project(camera, options=options)
     if appearance is not None:
-        guidance = applied(appearance.picture(camera), guidance, blend=appearance.blend)
+        guidance = recolor(guidance, appearance.picture(camera), blend=appearance.blend)
     return guidance, time.perf_counter() - start
 
 

@@ -19,12 +19,12 @@ ROOT = Path(gvtools.__file__).parent
 # Modules whose docstrings hold examples.
 DOCTESTED = (
     "gvtools",
-    "gvtools.appearance.picture",
+    "gvtools.appearance.appearance",
     "gvtools.appearance.camera_corrections",
     "gvtools.appearance.fit_options",
     "gvtools.appearance.gaussians",
     "gvtools.appearance.splat.splat",
-    "gvtools.appearance.turning",
+    "gvtools.appearance.harmonics",
     "gvtools.cameras",
     "gvtools.capture.matching",
     "gvtools.completers.base",

@@ -25,21 +25,18 @@ class CameraCorrections:
     """Pose and exposure of each view, as corrected so far.
 
     The corrections of all views have mean zero, so that the scene as a whole stays where it is.
-
-    Attributes:
-        twists: (V, 6) in se(3), shift (in shares of the depth), then turn [rad]; multiplied from
-            the left: exp(twist) cam_from_local.
-        log_gains: (V, 3) logarithms of the brightness of red, green and blue.
-        depth: typical depth, scene units.
-        spread: whether cameras that are not fitted take the mean correction of the views near them.
     """
 
     def __init__(
         self, poses: NDArray[np.float64], *, depth: float, with_poses: bool, exposure: bool
     ) -> None:
+        # ``depth`` is a typical one, scene units; ``spread``: whether cameras that are not fitted
+        # take the mean correction of the views near them.
         self.given, self.depth, self.spread = poses, depth, False
         self.with_poses, self.exposure = with_poses, exposure
         count = len(poses)
+        # In se(3), shift (in shares of the depth), then turn [rad]; multiplied from the left:
+        # exp(twist) cam_from_local. Logarithms of the brightness of red, green and blue.
         self.twists, self.log_gains = np.zeros((count, 6)), np.zeros((count, 3))
         self._pose_moments = np.zeros((2, count, 6))
         self._gain_moments = np.zeros((2, count, 3))

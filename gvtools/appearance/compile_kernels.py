@@ -10,8 +10,7 @@ from gvtools.kernels import KernelSet
 def compile_splatting() -> None:
     """Call each kernel of splatting once."""
     from gvtools.appearance.gaussians import Gaussians
-    from gvtools.appearance.splat.median_depth import median_depth
-    from gvtools.appearance.splat.splat import Lens, Splat
+    from gvtools.appearance.splat.splat import Lens, Splat, median_depth
 
     some = Gaussians.at([[0.0, 0.0, 2.0]], [[255, 0, 0]], sizes=[0.5])
     lens = Lens.of(np.eye(4), np.diag([16.0, 16.0, 1.0]), size=(16, 16), near=0.1)
@@ -22,27 +21,27 @@ def compile_splatting() -> None:
 
 def compile_steps() -> None:
     """Call each kernel of the loss and of the optimiser once."""
-    from gvtools.appearance import kernels
-    from gvtools.appearance.smooth_depth import add_bending
+    from gvtools.appearance import loss
+    from gvtools.appearance.loss import add_bending
     from gvtools.appearance.splat.project_kernels import VALUES
 
     picture = np.zeros((3, 16, 16), np.float32)
     weight = np.ones((16, 16), np.float32)
-    kernels.loss_gradient(0, 3, picture, picture, weight, 0.2, np.zeros_like(picture))
+    loss.loss_gradient(0, 3, picture, picture, weight, 0.2, np.zeros_like(picture))
     image = np.ones((5, 16, 16), np.float32)
     add_bending(image, picture, np.zeros_like(image), weight=1.0)
     rows, gradients = np.zeros(1, np.int64), np.zeros((1, VALUES + 2), np.float32)
     values, moments = np.zeros((1, VALUES), np.float32), np.zeros((2, 1, VALUES), np.float32)
     rates, widths = np.zeros(VALUES, np.float32), np.ones(1, np.float32)
-    kernels.adam_rows(0, 1, rows, gradients[:, :VALUES], values, moments, rates, widths, 1)
+    loss.adam_rows(0, 1, rows, gradients[:, :VALUES], values, moments, rates, widths, 1)
 
 
 def kernel_sets() -> tuple[KernelSet, ...]:
     """What fitting needs."""
-    from gvtools.appearance import kernels
-    from gvtools.appearance.splat import median_depth
+    from gvtools.appearance import loss
+    from gvtools.appearance.splat import tile_kernels
 
     return (
-        KernelSet("splatting", compile_splatting, median_depth.median_tiles),
-        KernelSet("fitting", compile_steps, kernels.adam_rows),
+        KernelSet("splatting", compile_splatting, tile_kernels.median_tiles),
+        KernelSet("fitting", compile_steps, loss.adam_rows),
     )

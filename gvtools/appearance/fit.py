@@ -3,6 +3,10 @@
 After Kerbl et al. 2023, with step lengths for hundreds of steps instead of tens of thousands.
 Positions move in units of a pixel's width at their depth, so results do not depend on the scene's
 scale.
+
+A fit has converged after a number of steps that grows with the number of photographs; more steps
+gain next to nothing. Fits with other random seeds make other errors, above all where few
+photographs leave much undetermined, so the mean of their pictures is better than each of them.
 """
 
 from __future__ import annotations
@@ -15,15 +19,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.appearance import kernels
+from gvtools.appearance import loss
+from gvtools.appearance.appearance import Picture, mean_picture
 from gvtools.appearance.camera_corrections import CameraCorrections, Exposures
-from gvtools.appearance.depth_loss import add_depth
 from gvtools.appearance.fit_options import FitOptions, converged_steps, most_gaussians
 from gvtools.appearance.free_space import floaters, free_depth
 from gvtools.appearance.gaussians import Gaussians
-from gvtools.appearance.picture import Picture
+from gvtools.appearance.loss import add_bending, add_depth
 from gvtools.appearance.population import Population, Sample, pixel_width
-from gvtools.appearance.smooth_depth import add_bending
 from gvtools.appearance.splat.project_kernels import LOG_SCALE, LOGIT, QUATERNION, SH, VALUES
 from gvtools.appearance.splat.splat import Lens, Splat
 from gvtools.kernels import in_threads
@@ -70,7 +73,7 @@ FEW, FADING = 10, 0.003
 # The backward pass skips blocks of 16 pixels to which a Gaussian adds less light than this in all:
 # a tenth less time for the same pictures.
 FAINT = 0.01
-# Weight in the loss of the bending of surfaces, see smooth_depth; for views without recorded depth.
+# Weight in the loss of the bending of surfaces, for views without recorded depth.
 SMOOTH = 0.1
 # Reduced photographs are kept for later steps if all of them together take fewer bytes.
 KEPT_BYTES = 2**30
@@ -86,17 +89,7 @@ FLOATER_FADE = 0.3
 
 
 class Fit:
-    """A fit in progress.
-
-    Attributes:
-        population: the Gaussians.
-        cameras: corrections of poses and exposures.
-        recorded: whether all photographs have recorded depth.
-        converged_after: number of steps after which further ones gain next to nothing.
-        steps: made so far.
-        predicted: pictures of the validation photographs, by their numbers, as rendered before
-            these joined the fit.
-    """
+    """A fit in progress."""
 
     def __init__(
         self,
@@ -110,16 +103,13 @@ class Fit:
         splatter: type[Splat] = Splat,
         backdrop: bool = True,
     ) -> None:
-        """Prepare a fit.
+        """Prepare a fit; ``start`` is left as it is.
 
         Args:
-            start: Gaussians to begin with; left as they are.
-            views: at least one.
             seed: of the order of photographs and of where Gaussians are added.
             begin: progress at which the fit begins, above 0 where ``start`` was fitted to the same
                 photographs before; there are no validation photographs then.
-            surface: (N, 3) points on surfaces: nothing may float before them, see free_space. None
-                allows Gaussians everywhere.
+            surface: (N, 3) points on surfaces: nothing may float before them, see free_space.
             backdrop: put another colour behind the Gaussians in each step, without recorded depth:
                 only opaque surfaces match photographs then, while over black a photograph's dark
                 parts could be fitted by stopping less light.
@@ -143,6 +133,7 @@ class Fit:
         self.steps = 0
         self._stop = threading.Event()
         self._last_psnr = -np.inf
+        # Pictures of the validation photographs, by their numbers, before these joined the fit.
         self.predicted: dict[int, Picture] = {}
         self.begin = begin
         # The limit of Gaussians does not count those of an earlier fit.
@@ -179,9 +170,7 @@ class Fit:
     def again(self, number: int, options: FitOptions, *, backdrop: bool | None = None) -> Fit:
         """A new fit from the same start at the poses of this one, which has ended or not begun.
 
-        Args:
-            number: of the fit; random choices differ with it.
-            backdrop: None for this one's.
+        Random choices differ by its ``number``; a ``backdrop`` of None is this one's.
         """
         poses = self.cameras.poses()
         views = [replace(v, cam_from_local=p) for v, p in zip(self.views, poses, strict=True)]
@@ -204,12 +193,9 @@ class Fit:
         """Fit for the time or the number of steps that the options give, or until it converged.
 
         In a fit for a time, what is left until validation photographs join is skipped when they
-        stop gaining. ``stop`` ends it after the step at work.
-
-        Args:
-            clock: tells seconds.
-            report: is called now and then, and at the end, with the share that is done, 0 to 1.
-            until: the progress at which a trial ends, with its validation photographs left out.
+        stop gaining. ``stop`` ends it after the step at work. ``report`` is called now and then,
+        and at the end, with the share that is done; a trial ends at the progress ``until``, with
+        its validation photographs left out.
         """
         limit, began = self.options.limit, clock()
         most = np.inf if self.begin else self.converged_after
@@ -300,7 +286,7 @@ class Fit:
         self.cameras.step(number, d_camera, share=share)
         used = SH + 3 * (degree + 1) ** 2
         in_threads(
-            kernels.adam_rows, len(seen), seen, rows[:, :used],
+            loss.adam_rows, len(seen), seen, rows[:, :used],
             self.population.values, self.population.moments, _rates(share),
             self.population.footprint, self.steps,
         )  # fmt: skip
@@ -422,7 +408,7 @@ class Fit:
         masked = self.views[number].mask is not None
         target = np.where(view.weight > 0, view.target, shown) if masked else view.target
         gradient = np.zeros_like(picture.image)
-        in_threads(kernels.loss_gradient, 3, shown, target, view.weight, options.ssim, gradient)
+        in_threads(loss.loss_gradient, 3, shown, target, view.weight, options.ssim, gradient)
         gradient *= pixels
         self._errors.append(float(((shown - target) ** 2 * view.weight).mean()))
         self.cameras.step_gain(number, (gradient[:3] * lit).sum(axis=(1, 2)) / pixels)
@@ -462,3 +448,105 @@ def _rates(share: float) -> NDArray[np.float32]:
     rates[SH + 3 :] = harmonic
     rates[LOG_SCALE:] *= REST ** max(0.0, (share - REST_BEGINS) / (1 - REST_BEGINS))
     return rates
+
+
+# A backdrop is another random colour behind the Gaussians at each step, see Fit. With it, an object
+# in 12 photographs gains 3 dB, and a toy in 8 loses 0.8 to 2.4. Two trials tell: the first part
+# (progress) of fits of so many steps, one with it and one over black.
+TRIAL_STEPS, TRIAL_ENDS = 500, 0.2
+# There are trials for at most so many photographs, and in fits that may take at least so long [s].
+FEW_PHOTOGRAPHS, TRIAL_SECONDS = 16, 15.0
+# The fit goes without where photographs that the trials left out are better by more than this [dB].
+CLEARLY_BETTER = 0.3
+# More fits than this gain nothing measurable.
+MOST_FITS = 6
+# No further fit is made when the last one raised the PSNR of validation photographs by less [dB].
+LEAST_FURTHER_GAIN = 0.05
+# A further fit begins only if at least this share of the first one's time, or steps, and of its
+# Gaussians is left.
+LEAST_SHARE = 0.5
+
+
+def with_chosen_backdrop(fit: Fit) -> tuple[Fit, str]:
+    """A fit that has not begun, or the same over black if left-out photographs say so; and why."""
+    few, limit = len(fit.views) <= FEW_PHOTOGRAPHS, fit.options.limit
+    long = (fit.options.steps or 0) >= TRIAL_STEPS if limit is None else limit >= TRIAL_SECONDS
+    if fit.begin or fit.recorded or not (few and long and validation_rows(len(fit.views))):
+        return fit, ""
+    options = fit.options.replaced(seconds=None, steps=TRIAL_STEPS)
+    trials = [fit.again(0, options, backdrop=backdrop) for backdrop in (True, False)]
+    for trial in trials:
+        trial.run(until=TRIAL_ENDS)
+    random, black = (trial.left_out_psnr() for trial in trials)
+    chosen = fit.again(0, fit.options, backdrop=False) if black > random + CLEARLY_BETTER else fit
+    behind = "random colours" if chosen is fit else "black"
+    return chosen, (
+        f"{behind} behind the Gaussians (trials with left-out photographs: random {random:.2f} dB, "
+        f"black {black:.2f} dB)"
+    )
+
+
+def run_fits(
+    first: Fit,
+    *,
+    clock: Callable[[], float] = time.perf_counter,
+    report: Callable[[Fit, float], object] = lambda fit, share: None,
+) -> list[Fit]:
+    """Run a fit; if it converges before its time or its steps are over, run further ones.
+
+    No more are made when the time, the steps or the Gaussians that the options allow are used up,
+    when there are ``MOST_FITS``, or when the last one raised the PSNR of validation photographs by
+    less than ``LEAST_FURTHER_GAIN``. A fit that continues an earlier one (``Fit.begin`` above 0) is
+    run alone. ``report`` gets the fit at work and the share of the whole time, or steps.
+
+    Returns the fits to average, the first one first: one that lowered that PSNR is left out.
+    """
+    options, began = first.options, clock()
+    timed = options.limit is not None
+    # In seconds, or in steps where these are given.
+    budget = options.limit if options.limit is not None else float(options.steps or 0)
+    made, kept = [first], [first]
+
+    def used() -> float:
+        return clock() - began if timed else sum(fit.steps for fit in made)
+
+    def tell(share: float) -> None:
+        report(made[-1], min(used() / budget, 1.0) if budget else 1.0)
+
+    first.run(clock=clock, report=tell)
+    taken = used()
+    while len(made) < MOST_FITS and not (first.begin or first.stopped):
+        left = budget - used()
+        if left < LEAST_SHARE * taken or left <= 0:
+            break
+        room = options.most_gaussians - sum(len(fit.population) for fit in kept)
+        if room < max(LEAST_SHARE * len(first.population), len(first.start)):
+            break
+        # The rest is shared evenly by as many fits as fit into it, by time and by Gaussians.
+        fits_left = min(round(left / taken), room // max(len(first.population), len(first.start)))
+        part = left / max(fits_left, 1)
+        length = {"seconds": part} if timed else {"steps": round(part)}
+        more = options.replaced(most_gaussians=room, **length)
+        fit = first.again(len(made), more)
+        made.append(fit)
+        fit.run(clock=clock, report=tell)
+        gain = _gain(kept, fit)
+        # Without validation photographs, a fit that was stopped early would only blur the others.
+        if gain > 0 if gain is not None else not fit.stopped:
+            kept.append(fit)
+        if gain is not None and gain < LEAST_FURTHER_GAIN:
+            break
+    report(made[-1], 1.0)
+    return kept
+
+
+def _gain(fits: list[Fit], another: Fit) -> float | None:
+    """Gain in PSNR of validation photographs by another fit [dB]; None if there are none."""
+    if not another.predicted:
+        return None
+    before = {row: mean_picture([fit.predicted[row] for fit in fits]) for row in another.predicted}
+    after = {
+        row: mean_picture([*(fit.predicted[row] for fit in fits), shown])
+        for row, shown in another.predicted.items()
+    }
+    return another.psnr_of(after) - another.psnr_of(before)

@@ -66,16 +66,12 @@ class FitOptions(Settings):
 
 
 def converged_steps(views: int, *, recorded: bool) -> int:
-    """After how many steps a fit has converged: more gain next to nothing.
-
-    Args:
-        recorded: whether all of them have recorded depth.
-    """
+    """After how many steps a fit has converged: more gain next to nothing."""
     return max(
         CONVERGED_PER_VIEW * views, CONVERGED_LEAST_RECORDED if recorded else CONVERGED_LEAST
     )
 
 
 def most_gaussians(steps: int, views: int, *, recorded: bool) -> int:
-    """How many Gaussians a fit of so many steps can do with; see ``converged_steps``."""
+    """How many Gaussians a fit of so many steps can do with."""
     return PER_STEP * steps if recorded else min(PER_STEP * steps, PER_VIEW * views)

@@ -25,13 +25,9 @@ AROUND = 2
 
 
 def free_depth(points: NDArray[np.float32], lens: Lens) -> NDArray[np.float32] | None:
-    """(rows, columns) z-depth up to which space is free, by cells of a picture.
+    """(rows, columns) z-depth up to which space is free, by cells; None without a point.
 
-    Args:
-        points: (N, 3) on surfaces, in the frame of the lens.
-
-    Returns:
-        None if the picture has no point.
+    ``points`` (N, 3) on surfaces, in the frame of the lens.
 
     >>> lens = Lens.of(np.eye(4), np.diag([24.0, 24.0, 1]), size=(24, 24), near=0.1)
     >>> wall = np.array([[0.25, 0.25, 2.0]], np.float32)
@@ -66,14 +62,9 @@ def floaters(
     *,
     rows: NDArray[np.int64] | None = None,
 ) -> NDArray[np.bool_]:
-    """(M,) which Gaussians have their centres in the free space of a camera.
+    """(M,) which of ``rows`` (None: all) have their centres in the ``free`` space of a camera.
 
     Beside the picture its outermost cells hold.
-
-    Args:
-        values: (N, VALUES), see project_kernels.
-        free: see ``free_depth``.
-        rows: (M,) of ``values``; None for all.
     """
     if rows is None:
         rows = np.arange(len(values))

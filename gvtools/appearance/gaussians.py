@@ -41,11 +41,7 @@ ATTRIBUTES = {
 
 
 class Gaussians:
-    """Coloured, anisotropic Gaussians in a local frame.
-
-    Attributes:
-        values: (N, VALUES) float32, a row a Gaussian; see splat.project_kernels.
-        frame: that positions and rotations are in.
+    """Coloured, anisotropic Gaussians in a local frame; ``values`` (N, VALUES), a row a Gaussian.
 
     >>> some = Gaussians.at([[0, 0, 2], [1, 0, 2]], [[255, 0, 0], [0, 0, 255]], sizes=[0.1, 0.2])
     >>> some
@@ -73,14 +69,7 @@ class Gaussians:
         sizes: ArrayLike,
         frame: LocalFrame | None = None,
     ) -> Gaussians:
-        """Round, faint Gaussians.
-
-        Args:
-            positions: (N, 3) in ``frame``.
-            colors: (N, 3) from 0 to 255.
-            sizes: (N,) standard deviations, scene units.
-            frame: None for the world's.
-        """
+        """Round, faint Gaussians: colours from 0 to 255, sizes are standard deviations."""
         values = np.zeros((len(np.asarray(positions)), VALUES), np.float32)
         values[:, :LOG_SCALE] = positions
         values[:, LOG_SCALE:QUATERNION] = np.log(np.asarray(sizes))[:, None]

@@ -1,4 +1,4 @@
-"""The Gaussians of a fit: where they are added and removed, and random parts of them."""
+"""The Gaussians of a fit: at the start, where they are added and removed, random parts of them."""
 
 from __future__ import annotations
 
@@ -8,8 +8,93 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gvtools.appearance.gaussians import Gaussians
 from gvtools.appearance.splat.project_kernels import LOG_SCALE, LOGIT, QUATERNION, VALUES
+from gvtools.errors import DegenerateError
+from gvtools.memory.store.local_frame import LocalFrame
 from gvtools.poses.views import FitView
+
+# Points are thinned to fewer than twice as many: few Gaussians are fitted faster, and the fit adds
+# more where they are needed.
+STARTING_GAUSSIANS = 25_000
+# Least red, green and blue (of 255) that a Gaussian begins with: colours are clipped at 0, where
+# their gradient is 0, too.
+DARKEST = 8
+# A Gaussian is as wide as its NEIGHBOURS nearest neighbours are away, at most this quantile of all.
+NEIGHBOURS, LARGEST = 3, 0.99
+
+
+def from_points(
+    positions: NDArray[np.float64],
+    colors: NDArray[np.uint8],
+    *,
+    frame: LocalFrame,
+    most: int | None = None,
+) -> Gaussians:
+    """Gaussians at coloured points, as wide as the points lie apart.
+
+    ``positions`` (N, 3) in ``frame``, at least two different ones; ``most`` limits their number, by
+    default to about STARTING_GAUSSIANS.
+    """
+    every = max(1, len(positions) // STARTING_GAUSSIANS)
+    if most is not None:
+        every = max(every, -(-len(positions) // most))
+    rows = slice(None, None, every)
+    positions, colors = positions[rows], np.maximum(colors[rows], DARKEST)
+    return Gaussians.at(positions, colors, sizes=_sizes(positions), frame=frame)
+
+
+def from_depth(
+    views: Sequence[FitView], *, frame: LocalFrame, seed: int, most: int | None = None
+) -> Gaussians:
+    """Gaussians at randomly picked pixels with depth; ``most`` as for ``from_points``."""
+    count = STARTING_GAUSSIANS if most is None else min(most, STARTING_GAUSSIANS)
+    positions, colors = pixels_with_depth(views, seed=seed, count=count)
+    if len(positions) <= NEIGHBOURS:
+        raise DegenerateError(
+            f"{len(positions)} pixels with depth in {len(views)} views; expected more"
+        )
+    return from_points(positions, colors, frame=frame, most=most)
+
+
+def pixels_with_depth(
+    views: Sequence[FitView], *, seed: int, count: int
+) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Randomly picked pixels with depth, lifted: positions in the local frame, and colours.
+
+    Views without depth are skipped; the others contribute equal shares of ``count``.
+    """
+    rng = np.random.default_rng(seed)
+    share = max(count // max(sum(view.depth is not None for view in views), 1), 1)
+    positions, colors = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)]
+    for view in views:
+        if view.depth is None:
+            continue
+        usable = view.depth > 0 if view.mask is None else (view.depth > 0) & view.mask
+        row, column = np.nonzero(usable)
+        picked = rng.permutation(len(row))[:share]
+        row, column = row[picked], column[picked]
+        rays = np.stack([column + 0.5, row + 0.5, np.ones(len(row))]).T @ np.linalg.inv(view.K).T
+        points = rays * view.depth[row, column, None]
+        pose = view.cam_from_local
+        positions.append((points - pose[:3, 3]) @ pose[:3, :3])
+        colors.append(view.rgb[row, column])
+    return np.concatenate(positions), np.concatenate(colors)
+
+
+def _sizes(positions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(N,) root mean squared distance to the nearest neighbours, scene units."""
+    import open3d as o3d
+
+    points = o3d.core.Tensor(np.ascontiguousarray(positions - positions.mean(axis=0)))
+    search = o3d.core.nns.NearestNeighborSearch(points)
+    search.knn_index()
+    _, squared = search.knn_search(points, NEIGHBOURS + 1)
+    sizes = np.sqrt(squared.numpy()[:, 1:].mean(axis=1))
+    positive = sizes[sizes > 0]
+    least = float(positive.min()) if positive.size else 1.0
+    return np.clip(sizes, least, np.quantile(sizes, LARGEST))
+
 
 # Gaussians of a smaller opacity are removed.
 FAINTEST = 0.005
@@ -22,18 +107,12 @@ MOST_OPAQUE = 0.995
 
 
 class Population:
-    """The Gaussians of a fit, with the state that the optimiser keeps for each.
-
-    Attributes:
-        values: (N, VALUES) float32 parameters.
-        moments: (2, N, VALUES) float32, Adam's running means.
-        footprint: (N,) float32 width of a pixel where it lies, scene units.
-        pull: (N,) sum over pictures of the length of the loss's gradient by the projected centre.
-        pulls: (N,) number of pictures in that sum.
-    """
+    """The Gaussians of a fit, with the state that the optimiser keeps for each."""
 
     def __init__(self, values: NDArray[np.float32], footprint: NDArray[np.float32]) -> None:
+        # (N, VALUES), and (N,) width of a pixel where each lies, scene units.
         self.values, self.footprint = values, footprint
+        # Adam's running means.
         self.moments = np.zeros((2, *values.shape), np.float32)
         self._forget_pulls()
 
@@ -41,6 +120,8 @@ class Population:
         return len(self.values)
 
     def _forget_pulls(self) -> None:
+        # (N,) sums over pictures of the length of the loss's gradient by the projected centre, and
+        # numbers of pictures in them.
         self.pull, self.pulls = np.zeros(len(self)), np.zeros(len(self))
 
     def keep(self, rows: NDArray[np.bool_]) -> None:
@@ -125,21 +206,13 @@ def pixel_width(positions: NDArray[np.float32], views: Sequence[FitView]) -> NDA
 
 
 class Sample:
-    """Some rows of the parameters; their opacities are raised for those that are missing.
-
-    Attributes:
-        values: (M, VALUES) rows that are left; the given array where none is left out.
-    """
+    """Some rows of the parameters; their opacities are raised for those that are missing."""
 
     def __init__(
         self, values: NDArray[np.float32], left_out: float, *, rng: np.random.Generator
     ) -> None:
-        """Draw rows.
-
-        Args:
-            values: (N, VALUES).
-            left_out: share of the rows that is left out, 0 to below 1.
-        """
+        """Draw rows of ``values`` (N, VALUES) without a share ``left_out``, 0 to below 1."""
+        # (M, VALUES) rows that are left; the given array where none is left out.
         self.values, self._rows = values, None
         if left_out < NEGLIGIBLE:
             return
@@ -153,11 +226,10 @@ class Sample:
         self._slope[raised >= MOST_OPAQUE] = 0
 
     def back(self, seen: NDArray[np.int64], gradients: NDArray[np.float32]) -> NDArray[np.int64]:
-        """Numbers of the given rows for those of ``values``.
+        """Numbers of the given rows for ``seen`` (K,) ones of ``values``.
 
-        Args:
-            seen: (K,) numbers of rows of ``values``.
-            gradients: (K, at least VALUES) by their parameters; changed to those by the given ones.
+        ``gradients`` (K, at least VALUES) by their parameters are changed to those by the given
+        ones.
         """
         if self._rows is None:
             return seen

@@ -14,13 +14,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.appearance.appearance import Appearance
+from gvtools.appearance.appearance import Appearance, Blend
 from gvtools.appearance.camera_corrections import Exposures
 from gvtools.appearance.fit_options import FitOptions
 from gvtools.appearance.gaussians import Gaussians
-from gvtools.appearance.picture import Blend
+from gvtools.appearance.harmonics import turned
 from gvtools.appearance.splat.project_kernels import HARMONICS, LOG_SCALE, SH
-from gvtools.appearance.turning import turned
 from gvtools.memory.store.local_frame import LocalFrame
 from gvtools.view_selection import evenly_spread
 from pipelines.blocks.block import SceneBlock

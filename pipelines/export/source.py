@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.appearance.gaussians import Gaussians
+from gvtools.appearance.harmonics import turned
 from gvtools.appearance.splat.project_kernels import LOG_SCALE, LOGIT, QUATERNION, SH
-from gvtools.appearance.turning import turned
 from gvtools.cameras import Cameras, concatenate
 from gvtools.errors import OptionError, ProjectError
 from gvtools.memory.store.local_frame import LocalFrame
@@ -180,7 +180,7 @@ class ExportSource:
             return Splats(values, origin, 0, 0, rounds)
         first = appearance.gaussians
         if appearance.exposures is not None:
-            from gvtools.appearance.exposed import exposed
+            from gvtools.appearance.harmonics import exposed
 
             photographs = concatenate([view.camera for view in memory.views.photographed])
             first = exposed(first, appearance.exposures, photographs)

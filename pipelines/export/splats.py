@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gvtools.appearance.harmonics import turned
 from gvtools.appearance.splat.project_kernels import (
     LOG_SCALE,
     LOGIT,
@@ -31,7 +32,6 @@ from gvtools.appearance.splat.project_kernels import (
     SH,
     VALUES,
 )
-from gvtools.appearance.turning import turned
 from gvtools.errors import MemoryFileError
 from gvtools.files import replaced_when_written
 from gvtools.ply import read_ply, write_ply

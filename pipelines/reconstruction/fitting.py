@@ -21,16 +21,21 @@ import torch
 from numba import get_num_threads
 from numpy.typing import NDArray
 
-from gvtools.appearance.appearance import Appearance
+from gvtools.appearance.appearance import Appearance, Blend, Picture, best_blend, mean_picture
 from gvtools.appearance.camera_corrections import Exposures
-from gvtools.appearance.fit import CONTINUED, Fit
+from gvtools.appearance.fit import (
+    CONTINUED,
+    LEAST_SHARE,
+    MOST_FITS,
+    Fit,
+    run_fits,
+    with_chosen_backdrop,
+)
 from gvtools.appearance.fit_options import FitOptions, converged_steps
-from gvtools.appearance.fits import LEAST_SHARE, MOST_FITS, run_fits, with_chosen_backdrop
 from gvtools.appearance.gaussians import Gaussians
-from gvtools.appearance.picture import Blend, Picture, best_blend, mean_picture
+from gvtools.appearance.population import from_depth, from_points, pixels_with_depth
 from gvtools.appearance.splat.gsplat_splatter import GsplatSplat, splatter_on
 from gvtools.appearance.splat.project_kernels import LOG_SCALE
-from gvtools.appearance.start import from_depth, from_points, pixels_with_depth
 from gvtools.depth.choice import is_estimated
 from gvtools.depth.fitted_depth import FittedDepth
 from gvtools.depth.source import DepthMap, MixedDepth, RecordedDepth, is_recorded

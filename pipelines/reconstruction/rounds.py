@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.appearance.appearance import Appearance, Picture, applied
+from gvtools.appearance.appearance import Appearance, Picture, recolor
 from gvtools.cameras import Cameras
 from gvtools.completers.base import (
     Completer,
@@ -105,7 +105,7 @@ class CachedProjection:
             if self.appearance is not None:
                 if self._picture is None:
                     self._picture = self.appearance.picture(self.camera)
-                self._guidance = applied(self._picture, self._guidance, blend=self.appearance.blend)
+                self._guidance = recolor(self._guidance, self._picture, blend=self.appearance.blend)
             self._at = at
         return self._guidance
 

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from splat_scene import HEIGHT, WALL, WIDTH, K, pose, rough_gaussians
 
-from gvtools.appearance.appearance import Appearance, applied
+from gvtools.appearance.appearance import Appearance, Blend, blended, recolor
 from gvtools.appearance.gaussians import Gaussians
-from gvtools.appearance.picture import Blend, blended
 from gvtools.appearance.splat.project_kernels import LOGIT
 from gvtools.cameras import Cameras
 from gvtools.depth.fitted_depth import LEAST_CONFIDENCE, OPAQUE, FittedDepth
@@ -51,7 +50,7 @@ def test_only_colours_of_surfaces_that_gaussians_show_change(solid, guidance):
     where = guidance.valid[0] & (picture.alpha > 0.5)
     assert 0 < where.sum() < guidance.valid[0].sum()
     assert guidance.generated[0][where].any()
-    result = applied(picture, guidance, blend=Blend(0.3, 0.5))
+    result = recolor(guidance, picture, blend=Blend(0.3, 0.5))
     for name in ("depth", "valid", "generated", "confidence"):
         np.testing.assert_array_equal(getattr(result, name), getattr(guidance, name))
     assert result.cameras is guidance.cameras

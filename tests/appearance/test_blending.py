@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from skimage.filters import gaussian
 
-from gvtools.appearance.picture import SHARES, TOLERANCES, Blend, best_blend, blended
+from gvtools.appearance.appearance import SHARES, TOLERANCES, Blend, best_blend, blended
 
 SHAPE = (40, 50)
 

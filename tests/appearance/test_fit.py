@@ -21,7 +21,6 @@ from splat_scene import (
 
 from gvtools.appearance import fit as fit_module
 from gvtools.appearance import fit_options
-from gvtools.appearance.depth_loss import ESTIMATE, ESTIMATE_TOLERANCE, add_depth
 from gvtools.appearance.fit import OF_STEPS, OF_TIME, VALIDATION_ENDS, Fit, validation_rows
 from gvtools.appearance.fit_options import (
     PER_STEP,
@@ -30,6 +29,7 @@ from gvtools.appearance.fit_options import (
     converged_steps,
     most_gaussians,
 )
+from gvtools.appearance.loss import ESTIMATE, ESTIMATE_TOLERANCE, add_depth
 from gvtools.appearance.splat.project_kernels import SH
 from gvtools.appearance.splat.splat import Lens, Splat
 from gvtools.poses.views import FitView, reduced

@@ -11,7 +11,7 @@ from splat_scene import photographs, picture, pose, pose_errors, rough_gaussians
 from gvtools.appearance.camera_corrections import CameraCorrections
 from gvtools.appearance.fit import VALIDATION_ENDS, Fit, validation_rows
 from gvtools.appearance.fit_options import FitOptions
-from gvtools.appearance.start import from_depth
+from gvtools.appearance.population import from_depth
 from gvtools.memory.store.local_frame import LocalFrame
 from gvtools.poses.motions import moved
 from gvtools.poses.refinement import compared, prediction_error

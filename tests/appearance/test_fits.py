@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 from splat_scene import photographs, rough_gaussians, walk
 
+from gvtools.appearance import fit as module
 from gvtools.appearance import fit_options
-from gvtools.appearance import fits as module
-from gvtools.appearance.fit import Fit
+from gvtools.appearance.appearance import mean_picture
+from gvtools.appearance.fit import Fit, run_fits, with_chosen_backdrop
 from gvtools.appearance.fit_options import FitOptions
-from gvtools.appearance.fits import run_fits, with_chosen_backdrop
-from gvtools.appearance.picture import mean_picture
 
 WHOLE = 10
 

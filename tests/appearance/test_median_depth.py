@@ -5,9 +5,8 @@ import pytest
 
 from gvtools.appearance.appearance import Appearance
 from gvtools.appearance.gaussians import Gaussians
-from gvtools.appearance.splat.median_depth import median_depth
 from gvtools.appearance.splat.project_kernels import LOGIT
-from gvtools.appearance.splat.splat import Lens, Splat
+from gvtools.appearance.splat.splat import Lens, Splat, median_depth
 from gvtools.cameras import Cameras
 
 SIZE = 45, 37

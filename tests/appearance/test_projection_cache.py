@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from gvtools import kernels as compiled
-from gvtools.appearance.appearance import Appearance
+from gvtools.appearance.appearance import Appearance, Blend, Picture
 from gvtools.appearance.gaussians import Gaussians
-from gvtools.appearance.picture import Blend, Picture
 from gvtools.appearance.splat.project_kernels import VALUES
 from gvtools.cameras import Cameras
 from gvtools.guidance import Guidance

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch.nn.functional import huber_loss
 
-from gvtools.appearance.smooth_depth import EDGE, LEAST_ALPHA, SOFT, add_bending
+from gvtools.appearance.loss import EDGE, LEAST_ALPHA, SOFT, add_bending
 
 HEIGHT, WIDTH = 17, 23
 

@@ -9,8 +9,8 @@ import pytest
 from scipy.spatial import cKDTree
 from splat_scene import photographs, walk
 
-from gvtools.appearance import start
-from gvtools.appearance.start import LARGEST, NEIGHBOURS, from_depth, from_points
+from gvtools.appearance import population
+from gvtools.appearance.population import LARGEST, NEIGHBOURS, from_depth, from_points
 from gvtools.memory.store.local_frame import LocalFrame
 
 FRAME = LocalFrame.at([1.0, 2.0, 3.0])
@@ -61,7 +61,7 @@ def test_fewer_points_than_neighbours_are_enough(count):
 
 @pytest.mark.parametrize(("most", "kept"), [(None, 100), (60, 50), (100, 100), (7, 7)])
 def test_many_points_are_thinned_evenly(monkeypatch, most, kept):
-    monkeypatch.setattr(start, "STARTING_GAUSSIANS", 100)
+    monkeypatch.setattr(population, "STARTING_GAUSSIANS", 100)
     places = np.random.default_rng(0).normal(size=(100, 3))
     colors = np.arange(300, dtype=np.uint8).reshape(100, 3)
     some = from_points(places, colors, frame=FRAME, most=most)

@@ -109,13 +109,9 @@ def image_of(colors: Tensor, alphas: Tensor) -> Tensor:
 def gradient_rows(
     d_values: Tensor, d_centers: Tensor, d_viewmats: Tensor, *, seen: NDArray[np.int64]
 ) -> tuple[NDArray[Any], NDArray[Any]]:
-    """The gradients that ``Splat.backward`` gives.
+    """The gradients that ``Splat.backward`` gives of the Gaussians ``seen``.
 
-    Args:
-        d_values: (N, VALUES) by the parameters.
-        d_centers: (1, N, 2) by the centres in the picture [1/px].
-        d_viewmats: (1, 4, 4) by the pose.
-        seen: (M,) numbers of the Gaussians that reach the picture.
+    From those by the parameters, by the centres (1, N, 2) [1/px] and by the pose (1, 4, 4).
     """
     rows = torch.cat([d_values, d_centers[0]], dim=1).cpu().numpy()[seen]
     pose = d_viewmats[0].cpu().numpy()

@@ -123,16 +123,10 @@ def _harmonics(k, x, y, z):
 
 @compiled(error_model="numpy", fastmath=FAST)
 def project_gaussians(first, last, values, terms, camera, width, height, near, out):
-    """Project Gaussians.
+    """Project Gaussians (N, VALUES); ``terms`` harmonics count, 1, 4 or 9.
 
-    Args:
-        last: one past the last of them.
-        values: (N, VALUES), see above.
-        terms: how many harmonics count, 1, 4 or 9.
-        width: of the picture [px].
-        height: of the picture [px].
-        near: what is nearer is left out, scene units.
-        out: (N, COLUMNS), see above, written; DEPTH is 0 for what does not reach the picture.
+    ``out`` (N, COLUMNS) is written; DEPTH is 0 for what does not reach the picture or is nearer
+    than ``near``.
     """
     dtype = values.dtype.type
     # Constants of the arrays' type: other ones make double precision of single.
@@ -203,17 +197,10 @@ def backward_gaussians(
 ):  # fmt: skip
     """Gradients of the parameters of Gaussians that were splatted.
 
-    Args:
-        last: one past the last of them.
-        bounds: places in ``seen`` at which parts begin and end.
-        seen: numbers of the Gaussians that were splatted.
-        starts: rows of ``sums`` of each of them, one a tile: ``starts[j]`` to ``starts[j + 1]``.
-        sums: (pairs, SUMS), see above.
-        height: as for
-            ``project_gaussians``.
-        d_values: (len(seen), VALUES + 2) gradients of the parameters, and by the centre in the
-            picture [1/px], written; harmonics from ``terms`` on get none.
-        d_camera: (parts, 12) gradient by rotation and translation that each part adds, written.
+    The parts of ``seen`` begin and end at ``bounds``; the rows of ``sums`` (pairs, SUMS) of each,
+    one a tile, are ``starts[j]`` to ``starts[j + 1]``. Written: ``d_values`` (len(seen), VALUES +
+    2), by the parameters and by the centre in the picture [1/px], harmonics from ``terms`` on get
+    none; and ``d_camera`` (parts, 12), by rotation and translation that each part adds.
     """
     dtype = values.dtype.type
     zero, one, half, two = dtype(0), dtype(1), dtype(0.5), dtype(2)

@@ -24,17 +24,13 @@ EXACT = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """The camera of one picture.
+    """The camera of one picture."""
 
-    Attributes:
-        numbers: (16,) rotation of cam_from_world row by row, translation, fx, fy, cx, cy [px].
-        width, height: of the picture [px].
-        near: what is nearer is not drawn, scene units.
-    """
-
+    # (16,) rotation of cam_from_world row by row, translation, fx, fy, cx, cy [px].
     numbers: NDArray[Any]
     width: int
     height: int
+    # What is nearer is not drawn, scene units.
     near: float
 
     @classmethod
@@ -54,22 +50,14 @@ class Lens:
 
 
 class Splat:
-    """One picture of Gaussians, and the way back from its gradient to theirs.
-
-    Attributes:
-        image: (5, H, W) red, green, blue, depth times alpha (scene units), and alpha, the share of
-            light that Gaussians stop; black behind the last Gaussian.
-        seen: (M,) numbers of the Gaussians that reach the picture.
-        projected: (N, COLUMNS), see project_kernels.
-    """
+    """One picture of Gaussians, and the way back from its gradient to theirs."""
 
     def __init__(
         self, values: NDArray[Any], lens: Lens, *, degree: int = 2, faint: float = EXACT
     ) -> None:
-        """Splat Gaussians.
+        """Splat ``values`` (N, VALUES), float32 or float64, see project_kernels; kept, not copied.
 
         Args:
-            values: (N, VALUES) float32 or float64, see project_kernels; kept, not copied.
             degree: of the spherical harmonics that count, 0 to 2.
             faint: gradients leave out blocks of 8 x 2 pixels that got less light than this, summed
                 over the block, from a Gaussian.
@@ -78,6 +66,8 @@ class Splat:
         self._project()
         self._sort_into_tiles()
         tiles = len(self.tiles)
+        # (5, H, W) red, green, blue, depth times alpha (scene units), and alpha, the share of light
+        # that Gaussians stop; black behind the last Gaussian.
         self.image = np.empty((5, lens.height, lens.width), values.dtype)
         self.used = np.empty(tiles, np.int64)
         in_threads(tile_kernels.blend_tiles, tiles, *self._tile_arguments(), faint)
@@ -89,8 +79,8 @@ class Splat:
             project_kernels.project_gaussians, len(values), values, self.terms, lens.numbers,
             lens.width, lens.height, values.dtype.type(lens.near), self.projected,
         )  # fmt: skip
-        depth = self.projected[:, project_kernels.DEPTH]
-        self.seen = np.flatnonzero(depth)
+        # (M,) numbers of the Gaussians that reach the picture.
+        self.seen = np.flatnonzero(self.projected[:, project_kernels.DEPTH])
 
     def _sort_into_tiles(self) -> None:
         """List the Gaussians of each tile, nearest first."""
@@ -130,14 +120,10 @@ class Splat:
         )  # fmt: skip
 
     def backward(self, d_image: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Gradients of a loss.
+        """Gradients of a loss by its gradient by the image (5, H, W).
 
-        Args:
-            d_image: (5, H, W) gradient by the image.
-
-        Returns:
-            (M, VALUES + 2) by the parameters of the Gaussians ``seen``, and by their centres in
-            the picture [1/px]; and (12,) by the camera's rotation and translation.
+        Returns (M, VALUES + 2) by the parameters of the Gaussians ``seen``, and by their centres in
+        the picture [1/px]; and (12,) by the camera's rotation and translation.
         """
         lens, dtype = self.lens, self.values.dtype
         sums = np.empty((self.starts[-1], project_kernels.SUMS), dtype)
@@ -154,6 +140,23 @@ class Splat:
         return gradients, d_camera.sum(axis=0)
 
 
+def median_depth(values: NDArray[Any], lens: Lens) -> NDArray[np.float32]:
+    """(H, W) z-depth, scene units, of the Gaussian at which half of the light is stopped; else 0.
+
+    The weighted mean of depths, which fits compare with recorded depth, is too near: faint
+    Gaussians before a surface pull it forward, and nothing behind the surface balances them. On
+    photographs of an object it was 1.6 % nearer than a plane sweep's depth, the median 0.3 %. The
+    median is less smooth: each Gaussian has one depth. ``values`` and ``lens`` are in one frame.
+    """
+    shown = Splat(values, lens)
+    out = np.zeros((lens.height, lens.width), np.float32)
+    in_threads(
+        tile_kernels.median_tiles, len(shown.tiles), shown.tiles, shown.tiles_x, shown.offsets,
+        shown.lists, shown.projected, out,
+    )  # fmt: skip
+    return out
+
+
 def splat(
     values: Tensor,
     *,
@@ -165,12 +168,7 @@ def splat(
 ) -> Tensor:
     """The image (5, H, W) of Gaussians, differentiable by ``values`` and ``cam_from_world``.
 
-    Args:
-        values: (N, VALUES) on the CPU, float32 or float64; see ``Splat``.
-        cam_from_world: (4, 4) pose.
-        K: (3, 3) intrinsics without skew [px].
-        near: what is nearer is not drawn, scene units.
-        degree: of the spherical harmonics that count.
+    ``values`` (N, VALUES) on the CPU, float32 or float64; ``K`` without skew [px]; see ``Splat``.
 
     >>> from gvtools.appearance.gaussians import Gaussians
     >>> red = Gaussians.at([[0.0, 0.0, 2.0]], [[255, 0, 0]], sizes=[0.5])

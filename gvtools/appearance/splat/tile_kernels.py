@@ -74,16 +74,11 @@ def _tile_columns(row, tile_row, tiles_x):
 
 @compiled(error_model="numpy")
 def count_tiles(first, last, bounds, seen, depth_part, projected, tiles_x, tiles_y, pairs, counts):
-    """Count each Gaussian's tiles, and each tile's Gaussians.
+    """Count each Gaussian's tiles, and each tile's Gaussians, for the parts ``first`` to ``last``.
 
-    Args:
-        first: parts of ``seen`` to do.
-        last: one past the last of them.
-        bounds: part p holds the places ``bounds[p]`` to ``bounds[p + 1]``.
-        seen: numbers of the Gaussians that reach the picture.
-        depth_part: the part that each falls into when they are ordered by depth.
-        pairs: (len(seen),), written.
-        counts: (parts of ``seen``, parts by depth, tiles), added to.
+    Part p holds the places ``bounds[p]`` to ``bounds[p + 1]`` of ``seen``; ``depth_part``: the part
+    that each falls into when they are ordered by depth. ``pairs`` (len(seen),) is written,
+    ``counts`` (parts of ``seen``, parts by depth, tiles) added to.
     """
     for part in range(first, last):
         for j in range(bounds[part], bounds[part + 1]):
@@ -106,17 +101,10 @@ def fill_tiles(
 ):
     """Write the tiles' lists: each Gaussian's number and the row of its gradient sums.
 
-    Args:
-        last: one past the last of them.
-        bounds: part p holds the places ``bounds[p]`` to ``bounds[p + 1]`` of ``nearest``.
-        nearest: places in ``seen``, nearest Gaussian first.
-        seen: see ``count_tiles``.
-        projected: see ``count_tiles``.
-        tiles_x: see ``count_tiles``.
-        tiles_y: see ``count_tiles``.
-        starts: where the rows of each Gaussian of ``seen`` begin.
-        place: (parts, tiles) where each part's Gaussians begin in each tile's list; advanced.
-        lists: (pairs, 3), the first two columns are written.
+    ``bounds`` are those of parts of ``nearest``, places in ``seen``, nearest first; ``starts``:
+    where the rows of each Gaussian of ``seen`` begin; ``place`` (parts, tiles): where each part's
+    Gaussians begin in each tile's list, advanced. Of ``lists`` (pairs, 3) the first two columns are
+    written.
     """
     for part in range(first, last):
         for j in range(bounds[part], bounds[part + 1]):
@@ -140,17 +128,11 @@ def fill_tiles(
 def blend_tiles(first, last, tiles, tiles_x, offsets, lists, blocks, projected, image, used, faint):
     """Blend the tiles ``tiles[first:last]`` from front to back.
 
-    Args:
-        first: of the rows of ``tiles``.
-        last: one past the last of them.
-        offsets: of the tiles' lists in ``lists``.
-        lists: (pairs, 3) Gaussians of the tiles, nearest first; the last column is written: how
-            many blocks of the tile each touches.
-        blocks: (pairs,) int64 the numbers of those blocks, four bits each, written.
-        image: (5, H, W) red, green, blue, depth (weighted sums) and alpha, written.
-        used: (tiles,) how many of its Gaussians a tile looked at, written.
-        faint: the gradient leaves out blocks whose 16 pixels got less light than this from a
-            Gaussian together.
+    ``lists`` (pairs, 3) of a tile begin at its ``offsets``; the last column is written, how many
+    blocks of the tile each touches, and to ``blocks`` (pairs,) their numbers, four bits each.
+    ``image`` (5, H, W): red, green, blue, depth (weighted sums) and alpha; ``used`` (tiles,): how
+    many Gaussians a tile looked at. The gradient leaves out blocks whose 16 pixels together got
+    less light than ``faint``.
     """
     dtype = projected.dtype.type
     zero, one, two, most = dtype(0), dtype(1), dtype(2), dtype(MOST_ALPHA)
@@ -235,19 +217,8 @@ def backward_tiles(
 ):
     """Gradient sums of each Gaussian in each of the tiles ``tiles[first:last]``.
 
-    Args:
-        first: see ``blend_tiles``.
-        last: one past the last of them.
-        tiles: see ``blend_tiles``.
-        tiles_x: see ``blend_tiles``.
-        offsets: see ``blend_tiles``.
-        lists: see ``blend_tiles``.
-        blocks: see ``blend_tiles``.
-        projected: see ``blend_tiles``.
-        image: see ``blend_tiles``.
-        used: see ``blend_tiles``.
-        d_image: (5, H, W) gradient of the loss by the image.
-        sums: (pairs, SUMS) see project_kernels, written.
+    By ``d_image`` (5, H, W), to ``sums`` (pairs, SUMS), see project_kernels. The other arguments
+    are those of ``blend_tiles``.
     """
     dtype = projected.dtype.type
     zero, one, two, most = dtype(0), dtype(1), dtype(2), dtype(MOST_ALPHA)
@@ -333,3 +304,32 @@ def backward_tiles(
                 for j in range(BLOCK):
                     total += lanes[s * BLOCK + j]
                 out[s] = total
+
+
+# The surface is the first Gaussian after which less than this share of the light is left.
+HALF = 0.5
+
+
+@compiled(error_model="numpy")
+def median_tiles(first, last, tiles, tiles_x, offsets, lists, projected, depth):
+    """Write the median depth (H, W) of the tiles ``tiles[first:last]``; see blend_tiles."""
+    height, width = depth.shape
+    for at in range(first, last):
+        tile = tiles[at]
+        left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
+        for y in range(top, min(top + TILE, height)):
+            for x in range(left, min(left + TILE, width)):
+                light = 1.0
+                for k in range(offsets[tile], offsets[tile + 1]):
+                    row = projected[lists[k, 0]]
+                    dx, dy = x + 0.5 - row[X], y + 0.5 - row[Y]
+                    q = 0.5 * (row[CONIC_XX] * dx * dx + row[CONIC_YY] * dy * dy)
+                    q += row[CONIC_XY] * dx * dy
+                    if q < row[END]:
+                        # As in blend_tiles: falls to zero twice as fast near LEAST_ALPHA.
+                        alpha = row[OPACITY] * math.exp(-q)
+                        alpha = min(alpha, 2 * alpha - 2 * LEAST_ALPHA, MOST_ALPHA)
+                        light *= 1 - max(alpha, 0)
+                        if light < HALF:
+                            depth[y, x] = row[DEPTH]
+                            break

@@ -13,8 +13,8 @@ from tiny_scan import write_scan
 from gvtools.appearance.appearance import Appearance
 from gvtools.appearance.camera_corrections import Exposures
 from gvtools.appearance.gaussians import Gaussians
+from gvtools.appearance.harmonics import turned
 from gvtools.appearance.splat.project_kernels import HARMONICS, LOG_SCALE, SH
-from gvtools.appearance.turning import turned
 from gvtools.cameras import Cameras
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.store.local_frame import LocalFrame

@@ -13,12 +13,11 @@ from PIL import Image
 from run_files import Killed, kill_after_round_0, results, untimed
 from tiny_scan import write_colmap_scan, write_scan
 
-from gvtools.appearance.appearance import Appearance, applied
+from gvtools.appearance.appearance import Appearance, Blend, Picture, recolor
 from gvtools.appearance.fit import Fit
 from gvtools.appearance.gaussians import Gaussians
-from gvtools.appearance.picture import Blend, Picture
+from gvtools.appearance.population import from_points
 from gvtools.appearance.splat.project_kernels import VALUES
-from gvtools.appearance.start import from_points
 from gvtools.depth.foundation import FoundationDepth
 from gvtools.depth.source import DepthMap
 from gvtools.errors import DegenerateError, MemoryFileError, ProjectError
@@ -108,7 +107,7 @@ def test_targets_show_the_gaussians_where_the_memory_observed(whole, scan):
     memory = memory_of_round_0(whole)
     camera = fitted.apply(plan).targets.cameras[[0]]
     guidance = project(memory, camera, options=plan.config.splat)
-    shown = applied(fitted.appearance.picture(camera), guidance, blend=fitted.appearance.blend)
+    shown = recolor(guidance, fitted.appearance.picture(camera), blend=fitted.appearance.blend)
     off = np.abs(shown.rgb[0] * 255 - guidance_of(whole, 1))[guidance.valid[0]]
     assert off.max() <= 1
     assert np.abs(guidance.rgb[0] * 255 - guidance_of(whole, 1))[guidance.valid[0]].max() > 1

@@ -7,7 +7,7 @@ import pytest
 import torch
 from kornia.metrics import ssim
 
-from gvtools.appearance import kernels
+from gvtools.appearance import loss
 from gvtools.appearance.splat.project_kernels import VALUES
 
 HEIGHT, WIDTH, SHARE = 30, 37, 0.2
@@ -20,7 +20,7 @@ def pictures():
     target = rng.uniform(0, 1, (3, HEIGHT, WIDTH)).astype(np.float32)
     picture = (0.6 * target + 0.4 * rng.uniform(0, 1, target.shape)).astype(np.float32)
     weight = np.zeros((HEIGHT, WIDTH), np.float32)
-    inner = (slice(kernels.HALF, -kernels.HALF),) * 2
+    inner = (slice(loss.HALF, -loss.HALF),) * 2
     weight[inner] = rng.uniform(0, 1, weight[inner].shape)
     return picture, target, weight
 
@@ -28,14 +28,14 @@ def pictures():
 def gradient_of(pictures, first: int = 0, last: int = 3) -> np.ndarray:
     picture, target, weight = pictures
     gradient = np.zeros_like(picture)
-    kernels.loss_gradient(first, last, picture, target, weight, SHARE, gradient)
+    loss.loss_gradient(first, last, picture, target, weight, SHARE, gradient)
     return gradient
 
 
 def reference_loss(picture: torch.Tensor, target, weight) -> torch.Tensor:
     """By kornia: the weighted mean over all pixels and channels."""
     theirs = torch.from_numpy(target).double()[None]
-    similar = ssim(picture[None], theirs, kernels.WINDOW)[0]
+    similar = ssim(picture[None], theirs, loss.WINDOW)[0]
     each = (1 - SHARE) * (picture - theirs[0]).abs() + SHARE * (1 - similar)
     return (each * torch.from_numpy(weight).double()).mean()
 
@@ -65,12 +65,12 @@ def test_the_gradient_is_rounded_as_written(pictures):
     """So that it cannot depend on how a compiler orders sums, or on where arrays lie."""
     picture, target, weight = pictures
     interpreted = np.zeros_like(picture)
-    kernels.loss_gradient.py_func(0, 3, picture, target, weight, SHARE, interpreted)
+    loss.loss_gradient.py_func(0, 3, picture, target, weight, SHARE, interpreted)
     np.testing.assert_array_equal(gradient_of(pictures), interpreted)
     compiled, by_hand = np.empty_like(weight), np.empty_like(weight)
-    work = np.empty(WIDTH + kernels.WINDOW + 1, np.float32)
-    kernels.blur(picture[0], compiled, work)
-    kernels.blur.py_func(picture[0], by_hand, work)
+    work = np.empty(WIDTH + loss.WINDOW + 1, np.float32)
+    loss.blur(picture[0], compiled, work)
+    loss.blur.py_func(picture[0], by_hand, work)
     np.testing.assert_array_equal(compiled, by_hand)
 
 
@@ -89,7 +89,7 @@ def test_rows_move_as_by_torchs_adam_and_the_others_stay(columns):
         unit.grad = torch.from_numpy(gradients).double()
         adam.step()
         for first, last in ((0, 1), (1, 4)):
-            kernels.adam_rows(
+            loss.adam_rows(
                 first, last, rows, gradients, values, moments, rates, widths, step
             )  # fmt: skip
     length = np.repeat(rates[None, :columns], 4, axis=0)

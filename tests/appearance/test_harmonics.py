@@ -10,11 +10,10 @@ from scipy.spatial.transform import Rotation
 from splat_scene import HEIGHT, NEAR, WIDTH, K, pose, rough_gaussians, walk
 
 from gvtools.appearance.camera_corrections import Exposures
-from gvtools.appearance.exposed import exposed
 from gvtools.appearance.gaussians import Gaussians
+from gvtools.appearance.harmonics import exposed, harmonics, harmonics_turned, turned
 from gvtools.appearance.splat.project_kernels import LOGIT, SH
 from gvtools.appearance.splat.splat import Lens, Splat
-from gvtools.appearance.turning import harmonics, harmonics_turned, turned
 from gvtools.cameras import Cameras
 from gvtools.memory.store.local_frame import LocalFrame
 
