@@ -35,7 +35,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path, PurePosixPath
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,10 +45,6 @@ from gvtools.scenes.images import read_depth
 from gvtools.scenes.scene import Frame, natural_key
 from gvtools.untrusted import UNPACKED_BYTES, UNPACKED_RATIO, LimitedReader, open_picture, regular
 
-if TYPE_CHECKING:
-    from PIL.Image import Image
-
-RULES = ("auto", "name", "order")
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".ppm")
 SPLITS = ("test", "val", "train")
 _CANVAS = re.compile(r"(\d{6})-img\.(jpg|png)", re.IGNORECASE)
@@ -93,51 +89,37 @@ def match_pictures(
     >>> match_pictures(["00001.png", "00000.png"], ["a.jpg", "b.jpg"]).picture_of
     (1, 0)
     """
-    if rule not in RULES:
-        raise OptionError(f"--match {rule!r}; expected one of {', '.join(RULES)}")
     if not pictures:
         raise OptionError(f"{what}: no picture; expected one for each of {len(views)} views")
     # Pictures that are numbered alphabetically must not be taken for views whose names are numbers.
     by_name = rule == "name" or (rule == "auto" and not alphabetical)
-    named = _by_name(pictures, views, what) if by_name else None
-    found = 0 if named is None else sum(number is not None for number in named)
+    partners: list[int | None] = [None] * len(views)
+    if by_name:
+        partners = _by_name(pictures, views, what)
+    found = sum(number is not None for number in partners)
     if rule == "name" and not found:
         raise OptionError(
             f"{what}: none of {len(pictures)} pictures (first {pictures[0]!r}) is named like one "
             f"of {len(views)} views (first {views[0]!r}); rename them, or give --match order"
         )
-    partial = 0 < found < min(len(pictures), len(views))
-    if rule == "auto" and partial and len(pictures) == len(views):
+    if rule == "auto" and 0 < found < len(pictures) == len(views):
         raise OptionError(
             f"{what}: {found} of {len(pictures)} pictures are named like views, the others are "
             "not, and the order would give other partners; say --match name or --match order"
         )
-    if named is not None and found:
-        return _matching("name", named, pictures=pictures, views=views)
-    if len(pictures) != len(views):
+    if not found and len(pictures) != len(views):
         raise OptionError(
             f"{what}: {len(pictures)} pictures (first {pictures[0]!r}) for {len(views)} views "
             f"(first {views[0]!r}); expected names like the views', or as many pictures as views"
         )
-    partners: list[int | None] = [None] * len(views)
-    in_order = sorted(range(len(views)), key=views.__getitem__) if alphabetical else None
-    for view, picture in zip(
-        in_order or _natural_order(views), _natural_order(pictures), strict=True
-    ):
-        partners[view] = picture
-    return _matching("order", partners, pictures=pictures, views=views)
-
-
-def _matching(
-    rule: str,
-    partners: Sequence[int | None],
-    *,
-    pictures: Sequence[str],
-    views: Sequence[str],
-) -> Matching:
-    used = {number for number in partners if number is not None}
+    if not found:
+        in_order = sorted(range(len(views)), key=views.__getitem__) if alphabetical else None
+        in_order = in_order or _natural_order(views)
+        for view, picture in zip(in_order, _natural_order(pictures), strict=True):
+            partners[view] = picture
+    used = set(partners)
     return Matching(
-        rule,
+        "name" if found else "order",
         tuple(partners),
         tuple(view for view, number in zip(views, partners, strict=True) if number is None),
         tuple(name for number, name in enumerate(pictures) if number not in used),
@@ -154,10 +136,12 @@ def _by_name(pictures: Sequence[str], views: Sequence[str], what: str) -> list[i
     Of both, what finds most partners is taken.
     """
     tried: list[list[list[int]]] = [[[] for _ in views]]
-    for view_keys in (_paths(views), _last_parts(views)):
+    for view_folders in (True, False):
+        view_keys = [_key(name, folders=view_folders) for name in views]
         if len(set(view_keys)) == len(view_keys):
-            for picture_keys in (_paths(pictures), _last_parts(pictures)):
-                tried.append(_partners(picture_keys, view_keys))
+            for folders in (True, False):
+                keys = [_key(name, folders=folders) for name in pictures]
+                tried.append(_partners(keys, view_keys))
     best = max(tried, key=lambda lists: sum(bool(numbers) for numbers in lists))
     for view, numbers in zip(views, best, strict=True):
         if len(numbers) > 1:
@@ -176,7 +160,10 @@ def _partners(pictures: Sequence[str], views: Sequence[str]) -> list[list[int]]:
     where several pairs of them are equally frequent.
     """
     index = {view: number for number, view in enumerate(views)}
-    pattern, affixes = _any_of(views), Counter[tuple[str, str]]()
+    # Any view's name as a whole word, the longest first.
+    names = "|".join(re.escape(view) for view in sorted(views, key=len, reverse=True))
+    pattern = re.compile(rf"(?=(?<![a-z0-9])({names})(?![a-z0-9]))")
+    affixes = Counter[tuple[str, str]]()
     for picture in pictures:
         affixes.update(
             {(picture[: m.start(1)], picture[m.end(1) :]) for m in pattern.finditer(picture)}
@@ -194,23 +181,11 @@ def _partners(pictures: Sequence[str], views: Sequence[str]) -> list[list[int]]:
     return out
 
 
-def _any_of(views: Sequence[str]) -> re.Pattern[str]:
-    """Matches any view's name as a whole word, the longest first; group 1 is the name."""
-    names = "|".join(re.escape(view) for view in sorted(views, key=len, reverse=True))
-    return re.compile(rf"(?=(?<![a-z0-9])({names})(?![a-z0-9]))")
-
-
-def _paths(names: Sequence[str]) -> list[str]:
-    return [_without_ending(name.replace("\\", "/")).lower() for name in names]
-
-
-def _last_parts(names: Sequence[str]) -> list[str]:
-    return [_without_ending(PurePosixPath(name.replace("\\", "/")).name).lower() for name in names]
-
-
-def _without_ending(name: str) -> str:
-    path = PurePosixPath(name)
-    return str(path.with_suffix("")) if path.suffix.lower() in IMAGE_ENDINGS else name
+def _key(name: str, *, folders: bool) -> str:
+    """A name as it is compared."""
+    path = PurePosixPath(name.replace("\\", "/"))
+    path = path.with_suffix("") if path.suffix.lower() in IMAGE_ENDINGS else path
+    return str(path if folders else path.name).lower()
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,8 +207,7 @@ class PictureSet:
     path: Path  # what was given
     layout: str  # whose layout it has
     pictures: tuple[MethodPicture, ...]  # in natural order of their names
-    # Whether numbers in the names count the views in alphabetical order of their names instead of
-    # natural order.
+    # Whether numbers in the names count the views in alphabetical order instead of natural order.
     alphabetical: bool = False
     notes: tuple[str, ...] = ()  # what was chosen or left out on reading
 
@@ -268,16 +242,12 @@ def read_rgb(source: Path | IO[bytes], *, name: str = "") -> NDArray[np.uint8]:
         return read_image(source).rgb
     try:
         with open_picture(source if isinstance(source, Path) else source.read()) as image:
-            return _on_black(image)
+            rgba: NDArray[Any] = np.asarray(image.convert("RGBA")).astype(np.float64)
+            return np.rint(rgba[..., :3] * (rgba[..., 3:] / 255)).astype(np.uint8)
     except UNREADABLE as error:
         raise ProjectError(
             f"{name or source}: no readable picture ({error}); expected PNG or JPEG"
         ) from None
-
-
-def _on_black(image: Image) -> NDArray[np.uint8]:
-    rgba: NDArray[Any] = np.asarray(image.convert("RGBA")).astype(np.float64)
-    return np.rint(rgba[..., :3] * (rgba[..., 3:] / 255)).astype(np.uint8)
 
 
 def canvas_picture(file: Path, folder: Path) -> MethodPicture:
@@ -451,13 +421,9 @@ def open_pictures(path: Path) -> PictureSet:
         return PictureSet(path, "gvtools render", pictures)
     if not files:
         raise ProjectError(f"{path}: no pictures; expected PNG or JPEG files")
-    return PictureSet(path, "plain folder", tuple(_plain(file, path) for file in files))
-
-
-def _plain(file: Path, folder: Path) -> MethodPicture:
-    if file.with_suffix(".depth.npz").is_file():
-        return _rendered(file, folder, file.suffix)
-    return MethodPicture(file.relative_to(folder).as_posix(), lambda: Frame(read_rgb(file)))
+    return PictureSet(
+        path, "plain folder", tuple(_rendered(file, path, file.suffix) for file in files)
+    )
 
 
 def _rendered(file: Path, folder: Path, ending: str) -> MethodPicture:

@@ -21,18 +21,13 @@ from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from gvtools.errors import OptionError, ProjectError
+from gvtools.specs import SpecRecord
 from gvtools.untrusted import read_json
 
 Numbers = Annotated[tuple[int, ...], Field(strict=False)]
-
-
-class SpecRecord(BaseModel):
-    """Part of a specification: exactly these keys, of exactly these types."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
 
 class SplitRule(SpecRecord):

@@ -248,7 +248,8 @@ def open_collection(address: str, root: Path | None = None) -> SceneCollection:
 
         path = Path(address)
         return open_shards(path) if is_shards(path) else of_scenes([open_project(path)])
-    from gvtools.scenes.data_sets.catalogue import load_spec, name_key, open_data_set, scenes_of
+    from gvtools.scenes.data_sets.catalogue import load_spec, open_data_set, scenes_of
+    from gvtools.specs import name_key
 
     name, colon, scene = address.removeprefix(SPEC).partition(":")
     spec = load_spec(name)

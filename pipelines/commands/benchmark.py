@@ -140,7 +140,7 @@ def _chosen_views(text: str | None, benchmark: Benchmark) -> tuple[int, ...]:
 
 
 def _chosen_scenes(text: str | None, known: tuple[str, ...]) -> tuple[str, ...]:
-    from gvtools.evaluation.published import unknown
+    from gvtools.specs import unknown
 
     if text is None:
         return known

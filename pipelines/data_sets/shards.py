@@ -19,10 +19,11 @@ NAMED = 5
 
 def shards(args: ShardsArguments, console: Console) -> None:
     """Convert scenes to shards, or go on where a conversion stopped."""
-    from gvtools.scenes.data_sets.catalogue import name_key, spec_names
+    from gvtools.scenes.data_sets.catalogue import spec_names
     from gvtools.scenes.layout import SPEC
     from gvtools.scenes.project import open_collection
     from gvtools.scenes.shards.writer import MEGABYTE, ShardOptions, write_shards
+    from gvtools.specs import name_key
 
     address = args.scenes_of
     if args.root is not None and not address.startswith(SPEC):

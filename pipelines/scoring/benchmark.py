@@ -98,7 +98,7 @@ def parse_methods(text: str) -> tuple[Method, ...]:
 
 def _parsed(text: str) -> Method:
     from gvtools.completers.base import available
-    from gvtools.evaluation.published import unknown
+    from gvtools.specs import unknown
     from pipelines.reconstruction.settings import RunSettings
 
     name, equals, path = text.partition("=")
@@ -324,7 +324,7 @@ def _of_pictures(opened: _OpenCell) -> tuple[dict[str, Any], dict[str, np.ndarra
 
 def _summary(evaluation: Mapping[str, Any]) -> dict[str, Any]:
     """What tables show of an evaluation, as ``gvtools evaluate`` has it."""
-    from gvtools.evaluation.ranking import Setting
+    from gvtools.evaluation.published import Setting
     from pipelines.report import nested
     from pipelines.scoring.tables import measured_row, scalars
 

@@ -8,9 +8,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gvtools.evaluation.published import Benchmark
-from gvtools.evaluation.ranking import (
+from gvtools.evaluation.published import (
     MEASURED,
+    Benchmark,
     MeasuredRow,
     Setting,
     SideBySideRow,

@@ -11,8 +11,14 @@ from typing import TYPE_CHECKING, Any
 
 from gvtools.errors import OptionError, ProjectError
 from gvtools.evaluation.images import FIGURES
-from gvtools.evaluation.published import Benchmark, benchmark_names, load_benchmark
-from gvtools.evaluation.ranking import Setting, comparison_table, side_by_side
+from gvtools.evaluation.published import (
+    Benchmark,
+    Setting,
+    benchmark_names,
+    comparison_table,
+    load_benchmark,
+    side_by_side,
+)
 from gvtools.evaluation.splits import protocol_split
 from gvtools.evaluation.statistics import LEVEL, RESAMPLES, mean_interval
 from gvtools.files import write_json

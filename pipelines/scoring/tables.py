@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gvtools.evaluation.images import FIGURES
-from gvtools.evaluation.ranking import MeasuredRow, Setting
+from gvtools.evaluation.published import MeasuredRow, Setting
 from gvtools.evaluation.statistics import mean_interval
 from gvtools.evaluation.tables import Column, Ranked, Table, Value, markdown, render
 from gvtools.files import write_text

@@ -7,24 +7,22 @@ import re
 import pytest
 
 from gvtools.errors import OptionError
-from gvtools.evaluation import published
 from gvtools.evaluation.published import (
     ASPECTS,
-    benchmark_names,
-    load_benchmark,
-    parse_benchmark,
-)
-from gvtools.evaluation.ranking import (
     MEASURED,
     NO_VALUE,
     NOTHING_COMPARABLE,
     PUBLISHED,
     MeasuredRow,
     Setting,
+    benchmark_names,
     comparison_table,
+    load_benchmark,
+    parse_benchmark,
     reasons_not_to_rank,
     side_by_side,
 )
+from gvtools.specs import spec_texts
 
 NAMES = ("dl3dv", "mipnerf360", "realestate10k", "scannetv2")
 FIGURES = ("psnr", "ssim", "lpips", "ate", "rpe_r", "rpe_t", "reproj", "met3r", "time")
@@ -217,7 +215,7 @@ def test_each_difference_is_a_reason_for_the_figures_it_concerns(change, reason,
 
 
 def test_a_definition_that_the_source_comes_to_state_lets_its_figure_be_ranked():
-    text = published._specs()["dl3dv"]
+    text = spec_texts("benchmarks")["dl3dv"]
     told = with_stated_views(parse_benchmark(text.replace("lpips_net: null", "lpips_net: VGG")))
     assert reasons_not_to_rank(ALIKE, told, "lpips") == ()
     other = dataclasses.replace(ALIKE, lpips_net="alex")
@@ -408,7 +406,7 @@ def test_aspects_are_fields_of_a_setting():
     ],
 )
 def test_a_wrong_specification_is_refused(old, new, message):
-    text = published._specs()["dl3dv"]
+    text = spec_texts("benchmarks")["dl3dv"]
     assert old in text
     with pytest.raises(OptionError, match=message):
         parse_benchmark(text.replace(old, new, 1))

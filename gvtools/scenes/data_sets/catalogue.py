@@ -12,28 +12,20 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
-from importlib import resources
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from gvtools.errors import OptionError, ProjectError
 from gvtools.scenes.data_sets import aria, captures, hypersim, mvs, reconstructed, synthetic, waymo
 from gvtools.scenes.layout import FORM, SPEC, Layout
 from gvtools.scenes.scene import Origin, Scene
+from gvtools.specs import SpecRecord, Texts, name_key, spec_file, spec_texts
 from gvtools.untrusted import parse_yaml
 
-Texts = Annotated[tuple[str, ...], Field(strict=False)]
 
-
-class _Record(BaseModel):
-    """Part of a spec: exactly these keys, of exactly these types."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
-
-
-class SceneCounts(_Record):
+class SceneCounts(SpecRecord):
     """How large a data set is, and who says so."""
 
     # Scenes, sequences or trajectories, as the source counts them.
@@ -44,7 +36,7 @@ class SceneCounts(_Record):
     whole: str | None = None
 
 
-class CameraConvention(_Record):
+class CameraConvention(SpecRecord):
     """The convention in which cameras are stored."""
 
     axes: str  # directions of x, y and z of a camera, such as "x right, y down, z forward"
@@ -58,7 +50,7 @@ class CameraConvention(_Record):
     intrinsics: str | None = None  # where intrinsics are stored, and in which unit
 
 
-class DepthEncoding(_Record):
+class DepthEncoding(SpecRecord):
     """How depth is stored; a data set without depth has none of this."""
 
     encoding: str  # file type and number type, such as "16-bit PNG"
@@ -74,7 +66,7 @@ class DepthEncoding(_Record):
     complete: bool
 
 
-class Licence(_Record):
+class Licence(SpecRecord):
     """On what terms the data can be had, and from where."""
 
     terms: str  # name of the licence, or the terms in short
@@ -83,7 +75,7 @@ class Licence(_Record):
     redistribution: bool | None = None
 
 
-class GeometrySource(_Record):
+class GeometrySource(SpecRecord):
     """Where the poses and depth of training samples come from (the paper's appendix)."""
 
     # Own: the data set's. Estimated: by a network alone. Mixed: sampled at ``own_share``.
@@ -105,7 +97,7 @@ class GeometrySource(_Record):
         return self
 
 
-class DataSetSpec(_Record):
+class DataSetSpec(SpecRecord):
     """A data set: what it holds, how it is stored, on what terms, and how it is sampled."""
 
     name: str  # as printed
@@ -123,7 +115,9 @@ class DataSetSpec(_Record):
     camera: CameraConvention  # conventions of the cameras
     depth: DepthEncoding | None = None  # of stored depth; None where the data set has none
     licence: Licence  # terms and address
-    splits: dict[str, str] = {}  # official splits: name, and which file or rule defines it
+    splits: dict[str, str] = Field(
+        default_factory=dict
+    )  # official splits: name, and which file or rule defines it
     # Of training; None for data sets that serve as benchmarks alone.
     geometry: GeometrySource | None = None
     sources: Texts  # where each of these facts was read
@@ -145,7 +139,7 @@ class DataSetSpec(_Record):
 
 def spec_names() -> tuple[str, ...]:
     """The data sets there are, as ``load_spec`` takes them."""
-    return tuple(_texts())
+    return tuple(spec_texts("data_sets"))
 
 
 @cache
@@ -155,12 +149,9 @@ def load_spec(name: str) -> DataSetSpec:
     >>> load_spec("7-Scenes").depth.unit_m
     0.001
     """
-    texts, key = _texts(), name_key(name)
-    if key not in texts:
-        near = difflib.get_close_matches(key, list(texts), n=1)
-        hint = f"did you mean {near[0]!r}?" if near else f"expected one of {', '.join(texts)}"
-        raise OptionError(f"data set {name!r} is unknown; {hint}")
-    return parse_spec(texts[key], where=f"{key}.yaml")
+    texts = spec_texts("data_sets")
+    file = spec_file("data set", name, texts)
+    return parse_spec(texts[file], where=f"{file}.yaml")
 
 
 def parse_spec(text: str, *, where: str = "spec") -> DataSetSpec:
@@ -173,22 +164,6 @@ def parse_spec(text: str, *, where: str = "spec") -> DataSetSpec:
         raise OptionError(f"{where}, {place}: {first['msg']}") from None
     except ValueError as error:
         raise OptionError(f"{where}: {error}; expected the YAML of a data set") from None
-
-
-def name_key(text: str) -> str:
-    """Letters and digits alone, so that ScanNet++ v2 is scannetppv2.
-
-    >>> name_key("ScanNet++ v2")
-    'scannetppv2'
-    """
-    return "".join(sign for sign in text.casefold().replace("+", "p") if sign.isalnum())
-
-
-def _texts() -> dict[str, str]:
-    """The specs' texts by their files' names."""
-    entries = resources.files("data_specs").joinpath("data_sets").iterdir()
-    found = {x.name[:-5]: x.read_text(encoding="utf-8") for x in entries if x.name[-5:] == ".yaml"}
-    return dict(sorted(found.items()))
 
 
 # The ``layout`` of a data set's spec, by name.

@@ -13,10 +13,10 @@ from gvtools.scenes.data_sets.catalogue import (
     DataSetSpec,
     layout_of,
     load_spec,
-    name_key,
     parse_spec,
     spec_names,
 )
+from gvtools.specs import name_key
 
 FOLDER = Path(__file__).parents[3] / "data_specs" / "data_sets"
 # Scenes and images of the paper's table of training data, in its order.
