@@ -8,6 +8,7 @@ thousandfold; an archive or an array may claim terabytes in a kilobyte; a name m
 from __future__ import annotations
 
 import codecs
+import csv
 import io
 import json
 import math
@@ -38,6 +39,48 @@ MOST_INTEGER = 300
 MOST_CHARACTERS, MOST_NODES = 400_000, 100_000
 # Numbers of more digits than this are none.
 MOST_DIGITS = 400
+# What parsers stumble upon in damaged files, they raise as it comes.
+PARSER_ERRORS = (
+    TypeError, AttributeError, ArithmeticError, SyntaxError, EOFError, RuntimeError, MemoryError,
+    struct.error, zlib.error, csv.Error,
+)  # fmt: skip
+DAMAGED = (OSError, ValueError, LookupError, StopIteration, *PARSER_ERRORS)
+
+
+@contextmanager
+def reading(
+    where: Path | str,
+    advice: str = "expected a complete file; copy or export it again",
+    *,
+    also: tuple[type[Exception], ...] = (),
+) -> Iterator[None]:
+    """Refuses the file that is read inside, whatever its damage makes a parser raise.
+
+    ``also`` are errors of that parser alone.
+    """
+    stumbles: tuple[type[Exception], ...] = (*DAMAGED, *also)
+    try:
+        yield
+    except stumbles as error:
+        raise ProjectError(f"{where}: {_reason(error, str(where))}; {advice}") from None
+
+
+def _reason(error: Exception, where: str) -> str:
+    if isinstance(error, FileNotFoundError):
+        return "no such file"
+    text = str(getattr(error, "strerror", None) or error)
+    if type(error).__name__ == "UnidentifiedImageError":
+        text = "no picture"
+    elif type(error).__name__ == "ValidationError":
+        first = error.errors()[0]  # type: ignore[attr-defined]
+        text = f"{'.'.join(str(part) for part in first['loc'])}: {first['msg']}"
+    elif isinstance(error, KeyError) and error.args:
+        text = str(error.args[0])
+        text = text if " " in text else f"no {text!r}"
+    lines = text.replace(repr(where), "").replace(where, "").strip(" :\n").splitlines() or [
+        type(error).__name__
+    ]
+    return f"unreadable ({lines[0]})"
 
 
 def regular(path: Path) -> Path:
@@ -70,10 +113,7 @@ def read_bytes(path: Path) -> bytes:
 
 
 def read_text(path: Path, *, errors: str = "strict") -> str:
-    """A text file, in UTF-8 or, with a byte order mark, UTF-16; no mark, lines end by a line feed.
-
-    ``errors`` is as ``bytes.decode`` takes it.
-    """
+    """A text file, in UTF-8 or, with a byte order mark, UTF-16; no mark, lines end by LF."""
     data = read_bytes(path)
     marked = data[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
     text = data.decode("utf-16" if marked else "utf-8-sig", errors)
@@ -155,11 +195,8 @@ def named_file(folder: Path, name: str | Path, *, where: str, follow_links: bool
     The folder itself may be reached over links; from there on, neither "..", an absolute path nor
     a link may lead out of it. The file need not be there.
 
-    Args:
-        folder: that the name is relative to, and may not leave.
-        where: the file and the place in it, for the message.
-        follow_links: whether links to places outside are followed, as those of a download that is
-            kept elsewhere; the name itself still may not.
+    ``where`` is the other file and the place in it. With ``follow_links``, links may lead out, as
+    those of a download that is kept elsewhere; the name itself still may not.
     """
     try:
         path = folder / name
@@ -189,16 +226,12 @@ def archive(source: Path | bytes) -> Iterator[zipfile.ZipFile]:
             if claimed > UNPACKED_RATIO * size + UNPACKED_BYTES:
                 raise ValueError(f"its members claim {claimed} bytes in a file of {size}")
             yield opened
-    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, struct.error,
-            RuntimeError, MemoryError, OverflowError) as error:  # fmt: skip
+    except (zipfile.BadZipFile, *PARSER_ERRORS) as error:
         raise ValueError(f"damaged archive: {error or type(error).__name__}") from None
 
 
 def unpack_gzip(data: bytes, most: int) -> bytes:
-    """What a gzip stream holds.
-
-    Args:
-        most: bytes that it may unpack to.
+    """What a gzip stream holds, which may be of so many bytes.
 
     >>> import gzip
     >>> unpack_gzip(gzip.compress(b"abc"), 3)
@@ -224,11 +257,7 @@ class SupportsRead(Protocol):
 
 
 class LimitedReader:
-    """A stream of which no more than a number of bytes can be read.
-
-    Args:
-        most: bytes.
-    """
+    """A stream of which no more than so many bytes can be read."""
 
     def __init__(self, stream: SupportsRead, most: int) -> None:
         self.stream, self.left = stream, most
@@ -243,11 +272,7 @@ class LimitedReader:
 
 
 def load_arrays(source: Path | bytes, *names: str) -> dict[str, NDArray[Any]]:
-    """Arrays of an ``.npz`` file, without pickle.
-
-    Args:
-        names: of the arrays; none for all that are there.
-    """
+    """Arrays of an ``.npz`` file by name, or all of them, without pickle."""
     with archive(source) as opened:
         held = {item.removesuffix(".npy") for item in opened.namelist()}
         for name in names:
@@ -303,9 +328,7 @@ def open_picture(source: Path | bytes) -> Image.Image:
     size = len(source) if isinstance(source, bytes) else regular(source).stat().st_size
     try:
         image = Image.open(io.BytesIO(source) if isinstance(source, bytes) else source)
-    except (Image.DecompressionBombError, SyntaxError, OverflowError, struct.error, TypeError,
-            KeyError, IndexError, ZeroDivisionError, AttributeError, EOFError, MemoryError,
-            RuntimeError) as error:  # fmt: skip
+    except (Image.DecompressionBombError, LookupError, *PARSER_ERRORS) as error:
         raise ValueError(str(error) or type(error).__name__) from None
     width, height = image.size
     pixel = len(image.getbands()) * (4 if image.mode[:1] in "IF" else 1)

@@ -49,7 +49,7 @@ DOCTESTED = (
     "gvtools.scenes.matching",
     "gvtools.settings.base",
     "gvtools.system_libraries",
-    "gvtools.scenes.shards.index",
+    "gvtools.scenes.shards",
     "gvtools.training.data",
     "pipelines.tuning.options",
     "gvtools.trajectory_files",

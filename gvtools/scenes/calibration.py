@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from gvtools.errors import ProjectError
 from gvtools.scenes.scene import Finding
 from gvtools.scenes.undistort import LensParameters, camera_of
-from gvtools.untrusted import read_json, read_text
+from gvtools.untrusted import read_json, read_text, reading
 
 Float64 = NDArray[np.float64]
 
@@ -32,59 +32,41 @@ DIRECTIONS = {"up": (0, -1), "left": (-1, 0), "down": (0, 1), "right": (1, 0)}
 def number_table(path: Path, columns: int, *, skip: int = 0, required: bool = False) -> Float64:
     """(N, columns) float64 of a text file with one row a line.
 
-    Args:
-        required: whether an absent file or one without rows is refused; else it has no rows.
+    An absent file or one without rows has none, unless one is ``required``.
     """
-    try:
-        lines = read_text(path).splitlines()[skip:]
-    except (OSError, UnicodeDecodeError) as error:
-        if isinstance(error, FileNotFoundError) and not required:
-            return np.zeros((0, columns))
-        raise ProjectError(f"{path}: unreadable ({error}); download it again") from None
-    rows = [line.split() for line in lines if line.strip()]
-    for number, row in enumerate(rows, start=1):
-        if len(row) != columns:
-            raise ProjectError(
-                f"{path}: row {number} of {len(rows)} has {len(row)} numbers; expected {columns}; "
-                "download it again"
-            )
-    if required and not rows:
-        raise ProjectError(f"{path}: no rows; expected {columns} numbers in each")
-    try:
+    if not required and not path.exists():
+        return np.zeros((0, columns))
+    with reading(path, f"expected {columns} numbers in each row; download it again"):
+        rows = [line.split() for line in read_text(path).splitlines()[skip:] if line.strip()]
+        for number, row in enumerate(rows, start=1):
+            if len(row) != columns:
+                raise ValueError(f"row {number} of {len(rows)} has {len(row)} numbers")
+        if required and not rows:
+            raise ValueError("no rows")
         return np.array(rows, np.float64).reshape(-1, columns)
-    except ValueError as error:
-        raise ProjectError(f"{path}: {error}; expected {columns} numbers in each row") from None
 
 
 def load_matrix(path: Path, *shapes: tuple[int, int]) -> Float64:
     """A matrix of one of the shapes in a text file."""
     expected = " or ".join(f"{rows}x{columns}" for rows, columns in shapes)
-    try:
-        text = read_text(path).replace(",", " ")
-        matrix = np.loadtxt(text.splitlines(), np.float64, ndmin=2)
-    except (OSError, ValueError) as error:
-        reason = str(error).splitlines()[0]
-        raise ProjectError(f"{path}: unreadable ({reason}); expected {expected} numbers") from None
-    if matrix.shape not in shapes:
-        shape = "x".join(str(length) for length in matrix.shape)
-        raise ProjectError(f"{path}: {shape} numbers; expected {expected}")
-    return matrix
+    with reading(path, f"expected {expected} numbers"):
+        lines = read_text(path).replace(",", " ").splitlines()
+        matrix = np.loadtxt(lines, np.float64, ndmin=2)
+        if matrix.shape not in shapes:
+            raise ValueError(f"{'x'.join(str(length) for length in matrix.shape)} numbers")
+        return matrix
 
 
 def csv_rows(path: Path, *, again: str = "copy it again") -> list[dict[str, str]]:
     """The rows of a CSV file by the names of its header."""
-    try:
+    with reading(path, again):
         return list(csv.DictReader(read_text(path).splitlines(), skipinitialspace=True))
-    except (OSError, ValueError, csv.Error) as error:
-        raise ProjectError(f"{path}: unreadable ({error}); {again}") from None
 
 
 def json_file(path: Path) -> Any:
     """The value in a JSON file that has to be there."""
-    try:
+    with reading(path, "download it again"):
         return read_json(path)
-    except (OSError, ValueError) as error:
-        raise ProjectError(f"{path}: unreadable ({error}); download it again") from None
 
 
 def json_object(path: Path) -> Mapping[str, Any]:
@@ -148,14 +130,10 @@ def _text(path: Path) -> str:
 
 def open3d_intrinsics(path: Path) -> Float64:
     """(3, 3) intrinsics of Open3D's JSON form, which lists them column by column."""
-    try:
+    form = "expected Open3D's form with 'intrinsic_matrix' as nine numbers, column by column"
+    with reading(path, form):
         values = read_json(path)["intrinsic_matrix"]
         return np.array(values, np.float64).reshape(3, 3).T
-    except (OSError, ValueError, KeyError, TypeError, OverflowError) as error:
-        raise ProjectError(
-            f"{path}: {type(error).__name__} ({error}); expected Open3D's form with "
-            "'intrinsic_matrix' as nine numbers, column by column"
-        ) from None
 
 
 def sensor_default() -> tuple[Float64, Finding]:
@@ -182,11 +160,9 @@ def corner_origin(K: ArrayLike, *, what: str) -> Float64:
 
 
 def pinhole_lens(K: ArrayLike, size: tuple[int, int]) -> LensParameters:
-    """A pinhole camera without distortion.
+    """A pinhole camera without distortion of fx, fy, cx, cy, or a (3, 3) matrix without skew.
 
-    Args:
-        K: fx, fy, cx, cy, or a (3, 3) matrix without skew; pixels, first pixel centre (0.5, 0.5).
-        size: width and height of the picture, pixels.
+    ``size`` is width and height; all in pixels, the first pixel's centre is (0.5, 0.5).
 
     >>> pinhole_lens([500, 500, 320, 240], (640, 480)).values
     (500.0, 500.0, 320.0, 240.0)
@@ -262,12 +238,7 @@ def opencv_pose(world_from_cam: ArrayLike) -> Float64:
 
 
 def sky_findings(cam_from_world: Float64, axis: int) -> list[Finding]:
-    """A line when the sky is not to the top of most pictures.
-
-    Args:
-        cam_from_world: (N, 4, 4), OpenCV axes.
-        axis: the number of the world's axis that points up.
-    """
+    """A line when the sky, along that axis of the world, is not to the top of most pictures."""
     up = cam_from_world[:, :2, axis].mean(axis=0)
     sky = max(DIRECTIONS, key=lambda name: float(up @ np.array(DIRECTIONS[name])))
     if sky == "up":

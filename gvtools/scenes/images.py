@@ -1,25 +1,42 @@
-"""One picture, mask or depth map read from disk, and what its header says.
+"""Pictures, masks and depth maps of one file each, and what their headers say.
 
-EXIF orientation is never applied: intrinsics and poses were solved on the pixels as stored, so a
-turned picture would no longer fit its camera.
+HDF5 and OpenEXR are read by packages that come with ``gvtools[data]``. EXIF orientation is never
+applied: intrinsics and poses were solved on the pixels as stored, so a turned picture would no
+longer fit its camera.
 """
 
 from __future__ import annotations
 
 import re
-import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from gvtools.errors import ProjectError, ShapeError
 from gvtools.files import replaced_when_written
+from gvtools.optional import require
 from gvtools.scenes.scene import Frame
-from gvtools.untrusted import load_array, load_arrays, open_picture, regular
+from gvtools.untrusted import (
+    DAMAGED,
+    UNPACKED_BYTES,
+    UNPACKED_RATIO,
+    load_array,
+    load_arrays,
+    open_picture,
+    reading,
+    regular,
+)
+
+if TYPE_CHECKING:
+    import h5py
+
+Depth = NDArray[np.float32]
 
 DEPTH_SATURATED = 65535  # "no reading" of Kinect-like 16-bit depth, besides 0
 # What a folder of pictures may hold.
@@ -29,12 +46,7 @@ OPAQUE_FROM = 128  # an alpha at or above this counts as part of the picture
 _EXIF_ORIENTATION = 0x0112
 # COLMAP's dense depth maps: ``width&height&channels&``, then float32 row by row.
 _COLMAP_HEAD = re.compile(rb"(\d{1,9})&(\d{1,9})&(\d{1,9})&")
-# What Pillow's decoders stumble upon in damaged files, they raise as it comes.
-UNREADABLE = (
-    OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError, struct.error,
-    KeyError, IndexError, TypeError, OverflowError, ZeroDivisionError, RuntimeError, MemoryError,
-    AttributeError,
-)  # fmt: skip
+UNREADABLE = (*DAMAGED, Image.DecompressionBombError)
 
 
 @dataclass(frozen=True)
@@ -54,14 +66,11 @@ class ImageHeader:
 
 def read_header(path: Path) -> ImageHeader:
     """Size and layout of the picture at ``path``."""
-    try:
-        with open_picture(path) as image:
-            # Other formats are decoded whole when asked for EXIF.
-            exif = image.getexif() if image.format in ("JPEG", "MPO") else {}
-            orientation = int(exif.get(_EXIF_ORIENTATION, 1) or 1)
-            return ImageHeader(image.width, image.height, image.mode, orientation)
-    except UNREADABLE as error:
-        raise _unreadable(path, error) from None
+    with _picture(path) as image:
+        # Other formats are decoded whole when asked for EXIF.
+        exif = image.getexif() if image.format in ("JPEG", "MPO") else {}
+        orientation = int(exif.get(_EXIF_ORIENTATION, 1) or 1)
+        return ImageHeader(image.width, image.height, image.mode, orientation)
 
 
 def read_image(path: Path) -> Frame:
@@ -70,24 +79,24 @@ def read_image(path: Path) -> Frame:
     Grey is repeated over the channels, palettes are resolved, 16 bits a channel keep their upper
     eight. EXIF orientation is not applied (see the module's text).
     """
-    try:
-        with open_picture(path) as image:
-            return _decode(image, path)
-    except UNREADABLE as error:
-        raise _unreadable(path, error) from None
+    with _picture(path) as image:
+        return _decode(image, path)
 
 
 def decode_picture(data: bytes, *, where: str) -> Frame:
     """The picture that an encoded file in another file is, as ``read_image`` has it."""
-    try:
-        with open_picture(data) as image:
-            return _decode(image, Path(where))
-    except UNREADABLE as error:
-        unknown = isinstance(error, UnidentifiedImageError)
-        raise _unreadable(Path(where), ValueError("no picture") if unknown else error) from None
+    with _picture(data, where) as image:
+        return _decode(image, where)
 
 
-def _decode(image: Image.Image, path: Path) -> Frame:
+@contextmanager
+def _picture(source: Path | bytes, where: str = "") -> Iterator[Image.Image]:
+    place = where or str(source)
+    with reading(place, also=(Image.DecompressionBombError,)), open_picture(source) as image:
+        yield image
+
+
+def _decode(image: Image.Image, path: Path | str) -> Frame:
     if image.mode in ("I", "F"):
         raise ProjectError(
             f"{path}: the picture holds 32-bit values ({image.mode}); "
@@ -106,12 +115,8 @@ def _decode(image: Image.Image, path: Path) -> Frame:
 
 def read_mask(path: Path) -> NDArray[np.bool_]:
     """(H, W) bool mask at ``path``: black is ignored (False), everything else used (True)."""
-    try:
-        with open_picture(path) as image:
-            pixels = np.asarray(image if image.mode.startswith("I") else image.convert("L"))
-            return pixels > 0
-    except UNREADABLE as error:
-        raise _unreadable(path, error) from None
+    with _picture(path) as image:
+        return np.asarray(image if image.mode.startswith("I") else image.convert("L")) > 0
 
 
 def read_depth(
@@ -131,10 +136,8 @@ def read_depth(
     """
     loaders = {".npy": _load_array, ".npz": _load_array, ".bin": _load_colmap}
     raw = loaders.get(path.suffix, _load_depth_image)(path)
-    if raw.ndim == 3 and raw.shape[-1] == 1:
-        raw = raw[..., 0]
-    elif raw.ndim == 3 and raw.shape[0] == 1:
-        raw = raw[0]
+    if raw.ndim == 3 and 1 in (raw.shape[0], raw.shape[2]):
+        raw = raw[..., 0] if raw.shape[2] == 1 else raw[0]
     if raw.ndim != 2 or raw.dtype.kind not in "uif":
         raise ProjectError(
             f"{path}: depth of shape {raw.shape} and type {raw.dtype}; expected (height, width) "
@@ -158,27 +161,20 @@ def readings(
 
 
 def _load_depth_image(path: Path) -> NDArray[Any]:
-    try:
-        with open_picture(path) as image:
-            if not image.mode.startswith("I") and image.mode != "F":
-                raise ProjectError(
-                    f"{path}: a depth map with 8 bits a channel ({image.mode}); expected 16-bit "
-                    "grey; export raw depth instead of a preview"
-                )
-            return np.asarray(image)
-    except UNREADABLE as error:
-        raise _unreadable(path, error) from None
+    with _picture(path) as image:
+        if not image.mode.startswith("I") and image.mode != "F":
+            raise ProjectError(
+                f"{path}: a depth map with 8 bits a channel ({image.mode}); expected 16-bit grey; "
+                "export raw depth instead of a preview"
+            )
+        return np.asarray(image)
 
 
 def _load_array(path: Path) -> NDArray[Any]:
-    try:
+    with reading(path, "expected one array, in an archive with the key 'depth'; copy it again"):
         with regular(path).open("rb") as file:
             packed = file.read(2) == b"PK"
         return load_arrays(path, "depth")["depth"] if packed else load_array(path)
-    except KeyError as error:
-        raise ProjectError(f"{path}: {error.args[0]}; expected the key 'depth'") from None
-    except UNREADABLE as error:
-        raise _unreadable(path, error) from None
 
 
 def stored_depth_size(path: Path) -> tuple[int, int] | None:
@@ -195,24 +191,16 @@ def stored_depth_size(path: Path) -> tuple[int, int] | None:
 
 def _colmap_head(path: Path) -> tuple[int, int, int]:
     """Width, height and where the values begin of COLMAP's depth map, which has to be whole."""
-    try:
+    with reading(path, "expected 'width&height&1&' and so many floats; compute or copy it again"):
         with regular(path).open("rb") as file:
             head = _COLMAP_HEAD.match(file.read(64))
-        size = path.stat().st_size
-    except OSError as error:
-        raise _unreadable(path, error) from None
-    if head is None:
-        raise ProjectError(
-            f"{path}: no COLMAP depth map; expected it to start with 'width&height&1&'"
-        )
-    width, height, channels = (int(group) for group in head.groups())
-    expected = head.end() + 4 * width * height * channels
-    if channels != 1 or size != expected:
-        raise ProjectError(
-            f"{path}: {size} bytes with the head {width}x{height}x{channels}; expected {expected} "
-            "bytes and one channel; the file is truncated or damaged; compute or copy it again"
-        )
-    return width, height, head.end()
+        if head is None:
+            raise ValueError("no COLMAP depth map")
+        width, height, channels = (int(group) for group in head.groups())
+        size, expected = path.stat().st_size, head.end() + 4 * width * height * channels
+        if channels != 1 or size != expected:
+            raise ValueError(f"{width}x{height}x{channels} in {size} bytes, not {expected}")
+        return width, height, head.end()
 
 
 def _load_colmap(path: Path) -> NDArray[np.float32]:
@@ -276,10 +264,65 @@ def check_size(
     )
 
 
-def _unreadable(path: Path, error: BaseException) -> ProjectError:
-    if isinstance(error, FileNotFoundError):
-        return ProjectError(f"{path}: no such file")
-    reason = str(error).replace(str(path), "").strip(" '\"") or type(error).__name__
-    return ProjectError(
-        f"{path}: unreadable ({reason}); expected a complete file; copy or export it again"
-    )
+# --- HDF5, OpenEXR, PFM ---------------------------------------------------------------------
+
+
+@contextmanager
+def hdf5_file(path: Path) -> Iterator[h5py.File]:
+    """The HDF5 file at ``path``, open for reading."""
+    h5py = require("h5py", extra="data", purpose=f"{path}: HDF5")
+    with reading(path), h5py.File(regular(path), "r") as file:
+        yield file
+
+
+def read_dataset(path: Path, found: Any) -> NDArray[Any]:
+    """A data set of h5py, of the HDF5 file at ``path``."""
+    size = path.stat().st_size
+    if not hasattr(found, "nbytes"):
+        raise ValueError("a group; expected an array")
+    if found.nbytes > UNPACKED_RATIO * size + UNPACKED_BYTES:
+        raise ValueError(f"an array of shape {found.shape} in {size} bytes")
+    return np.asarray(found[()])
+
+
+def hdf5_array(path: Path, key: str) -> NDArray[Any]:
+    """The array of that name in an HDF5 file."""
+    with hdf5_file(path) as file:
+        if key not in file:
+            raise KeyError(f"holds {', '.join(list(file)[:5]) or 'nothing'}; expected {key!r}")
+        return read_dataset(path, file[key])
+
+
+def hdf5_depth(path: Path, *, key: str) -> Depth:
+    """(H, W) float32 z-depth in an array of an HDF5 file, 0 for none."""
+    depth = np.squeeze(hdf5_array(path, key))
+    if depth.ndim != 2:
+        raise ProjectError(f"{path}, {key}: shape {depth.shape}; expected (height, width)")
+    return readings(depth)
+
+
+def exr_depth(path: Path, *, channels: tuple[str, ...]) -> Depth:
+    """(H, W) float32 z-depth of an OpenEXR file: the first of the channels that is there."""
+    OpenEXR = require("OpenEXR", extra="data", purpose=f"{path}: EXR")
+    # Else R, G and B come as one array.
+    with reading(path), OpenEXR.File(str(regular(path)), separate_channels=True) as file:
+        found = dict(file.channels())
+        name = next((name for name in channels if name in found), None)
+        if name is None:
+            raise ValueError(
+                f"holds the channels {', '.join(sorted(found))}; expected {' or '.join(channels)}"
+            )
+        return readings(np.array(found[name].pixels, np.float32))
+
+
+def read_pfm_depth(path: Path, *, unit: float = 1.0) -> Depth:
+    """(H, W) float32 z-depth of a grey PFM file, whose rows run from the bottom up; 0 for none."""
+    with reading(path, "expected a grey PFM; copy or export it again"):
+        with regular(path).open("rb") as file:
+            kind = file.readline().split()
+            width, height = (int(word) for word in file.readline().split())
+            dtype = np.dtype("<f4" if float(file.readline()) < 0 else ">f4")
+            if kind != [b"Pf"]:
+                raise ValueError(f"it begins with {kind}, not with Pf")
+            values = np.frombuffer(file.read(width * height * 4), dtype).reshape(height, width)
+        return readings(values[::-1], unit=unit)

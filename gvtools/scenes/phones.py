@@ -1,4 +1,4 @@
-"""Exports of phones: Polycam, 3D Scanner App and Stray Scanner, all of them ARKit recordings.
+"""Exports of phones: Polycam, 3D Scanner App, Stray Scanner and Record3D, all ARKit recordings.
 
 ARKit's camera looks along -z with y up, its world has y up and metres. Depth and its confidence
 come from the LiDAR scanner at a lower resolution (256x192 as a rule) than the picture, of the same
@@ -10,16 +10,21 @@ gvtools does.
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, Field
 
 from gvtools.errors import ProjectError
+from gvtools.optional import require
 from gvtools.scenes.calibration import (
     MILLIMETRES,
     Float64,
@@ -30,16 +35,28 @@ from gvtools.scenes.calibration import (
     opencv_pose,
     pinhole_lens,
     quaternion_pose,
+    scaled_lens,
     sky_findings,
 )
-from gvtools.scenes.images import read_depth, read_image, read_mask, resize_nearest
+from gvtools.scenes.images import (
+    decode_picture,
+    exr_depth,
+    read_depth,
+    read_image,
+    read_mask,
+    readings,
+    resize_nearest,
+)
 from gvtools.scenes.layout import Layout
 from gvtools.scenes.matching import natural
 from gvtools.scenes.photographs import Depth, PosedFrame, first_size, posed_scene
 from gvtools.scenes.scene import Finding, Frame, Scene
+from gvtools.scenes.undistort import LensParameters
 from gvtools.scenes.video import frame_seconds, read_frame, video_header
+from gvtools.untrusted import archive, open_picture, parse_json, read_bytes, reading
 
 WORLD_UP = 1  # y
+AGAIN = "export the recording again"
 
 
 def phone_scene(
@@ -293,7 +310,7 @@ def _read_stray_scanner(root: Path) -> Scene:
 def _odometry(path: Path) -> list[dict[str, float]]:
     """The rows by the names of the header; what is no number is left out."""
     rows = []
-    for line in csv_rows(path, again="export the recording again"):
+    for line in csv_rows(path, again=AGAIN):
         row = {}
         for key, word in line.items():
             try:
@@ -306,7 +323,7 @@ def _odometry(path: Path) -> list[dict[str, float]]:
     if not rows:
         raise ProjectError(
             f"{path}: no row with a frame number; expected columns timestamp, frame, x, y, z, qx, "
-            "qy, qz and qw; export the recording again"
+            f"qy, qz and qw; {AGAIN}"
         )
     return rows
 
@@ -316,4 +333,226 @@ STRAY_SCANNER = Layout.of_folder(
     f"{_VIDEO}, {_ODOMETRY}, {_MATRIX}, depth",
     matches=_is_stray_scanner,
     read=_read_stray_scanner,
+)
+
+
+# --- Record3D ---------------------------------------------------------------------------------
+#
+# An ``.r3d`` archive, the folder that it was unpacked into, or an export of EXR and JPG.
+#
+# An archive (ZIP) has ``metadata``, a JSON, and ``rgbd/N.{jpg, depth, conf}``; depth is float32
+# metres and confidence uint8, both compressed by LZFSE. The export has ``metadata.json``, ``rgb``
+# and ``depth/N.exr`` (one float32 channel, metres) in a folder ``EXR_RGBD``, and no confidence.
+#
+# A frame's pose is the metadata's of its number: quaternion x, y, z, w and place of world_from_cam,
+# OpenGL's axes. ``K`` is of the first frame, column by column; ``perFrameIntrinsicCoeffs`` has fx,
+# fy, cx, cy of each. Both are of pictures of w x h. The world is where the recording began, so that
+# none of its axes need be gravity's. Recordings of the selfie camera have no poses: each is the
+# identity.
+
+_ARCHIVE, _EXPORT = ".r3d", "EXR_RGBD"
+_PHOTOS = (".jpg", ".png")
+_CHANNELS = ("R", "Y", "Z")
+_NO_POSE = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
+_LZFSE_RATIO = 4000  # LZFSE packs no more bytes than this into one
+_LIDAR = (192, 256)  # width and height of depth maps where the metadata does not say
+
+
+class Record3dMetadata(BaseModel):
+    """What is read of a recording's metadata, named as there."""
+
+    w: int = Field(gt=0)
+    h: int = Field(gt=0)
+    dw: int = Field(_LIDAR[0], gt=0)
+    dh: int = Field(_LIDAR[1], gt=0)
+    K: list[float] = Field(min_length=9, max_length=9)
+    poses: list[list[float]] = Field(min_length=1)
+    perFrameIntrinsicCoeffs: list[list[float]] = []
+
+    def lens(self, number: int) -> LensParameters | None:
+        """Of a frame, for pictures of ``w`` x ``h``; None where it is impossible."""
+        given = self.perFrameIntrinsicCoeffs
+        own = finite_array(given[number], 4) if number < len(given) else None
+        K = finite_array([self.K[place] for place in (0, 4, 6, 7)], 4) if own is None else own
+        return None if K is None else pinhole_lens(K, (self.w, self.h))
+
+    def pose(self, number: int) -> Float64 | None:
+        """(4, 4) world_from_cam of a frame, OpenCV axes, metres; None where there is none."""
+        values = finite_array(self.poses[number], 7) if number < len(self.poses) else None
+        if values is None:
+            return None
+        return opencv_pose(quaternion_pose(values[[3, 0, 1, 2]], values[4:]))
+
+    def frames(self, stems: set[str]) -> list[int]:
+        """Numbers of frames that have a pose or a picture of that name."""
+        return sorted({*range(len(self.poses)), *(int(stem) for stem in stems if stem.isdecimal())})
+
+
+def _is_record3d(path: Path) -> bool:
+    if path.is_file():
+        return path.suffix.lower() == _ARCHIVE
+    unpacked = (path / "metadata").is_file() and (path / "rgbd").is_dir()
+    return unpacked or _export(path) is not None
+
+
+def _export(path: Path) -> Path | None:
+    """The folder of an export of EXR and JPG, which may lie inside the one that is given."""
+    for home in (path, path / _EXPORT):
+        if (home / "metadata.json").is_file() and (home / "rgb").is_dir():
+            return home
+    return None
+
+
+def _read_record3d(path: Path) -> Scene:
+    home = _export(path)
+    if home is None:
+        pictures, bare = _from_archive(path, _metadata(path, "metadata"))
+    else:
+        pictures, bare = _from_export(home, _metadata(home, "metadata.json"))
+    line = "the world is where the recording began: which way is up is not said"
+    findings = [Finding("info", line)]
+    if bare:
+        line = f"{bare} depth maps have no confidence map: all of their depth is used"
+        findings.append(Finding("info", line))
+    return phone_scene(path, "Record3D", pictures, upright=False, findings=findings)
+
+
+def _metadata(home: Path, name: str) -> Record3dMetadata:
+    expected = f"expected Record3D's form with w, h, K and poses; {AGAIN}"
+    with reading(f"{home}: {name}", expected):
+        metadata = Record3dMetadata.model_validate(parse_json(_stored(home, name)))
+    if len(metadata.poses) > 1 and all(pose == _NO_POSE for pose in metadata.poses):
+        raise ProjectError(
+            f"{home}: no frame has a pose, as in recordings of the selfie camera; expected one of "
+            "the LiDAR camera, or its pictures alone: gvtools capture finds their cameras"
+        )
+    return metadata
+
+
+def _from_export(home: Path, metadata: Record3dMetadata) -> tuple[list[PosedFrame], int]:
+    """The frames, and how many depth maps lack confidence."""
+    images = {path.stem: path for path in (home / "rgb").iterdir() if path.suffix in _PHOTOS}
+    pictures, bare = [], 0
+    for number in metadata.frames(set(images)):
+        depth = home / "depth" / f"{number}.exr"
+        bare += depth.is_file()
+        pictures.append(
+            PosedFrame(
+                f"{number}.jpg",
+                images.get(str(number), home / "rgb" / f"{number}.jpg"),
+                metadata.lens(number),
+                metadata.pose(number),
+                depth,
+                partial(exr_depth, channels=_CHANNELS),
+            )
+        )
+    return pictures, bare
+
+
+def _from_archive(path: Path, metadata: Record3dMetadata) -> tuple[list[PosedFrame], int]:
+    """The frames, and how many depth maps lack confidence."""
+    held, packed = _members(path), path.is_file()
+    stems = {Path(name).stem for name in held if name.endswith(".jpg")}
+    size = _picture_size(path, held) if packed else None
+    pictures, bare = [], 0
+    for number in metadata.frames(stems):
+        image, depth, conf = (f"rgbd/{number}.{kind}" for kind in ("jpg", "depth", "conf"))
+        lens = metadata.lens(number)
+        bare += depth in held and conf not in held
+        maps = [name for name in (depth, conf) if name in held]
+        pictures.append(
+            PosedFrame(
+                f"{number}.jpg",
+                # What an archive lacks is given as a path that does not exist.
+                path if packed and image in held else path / image,
+                lens if lens is None or size is None else scaled_lens(lens, size),
+                metadata.pose(number),
+                path if packed and depth in held else path / depth,
+                partial(_lzfse_depth, path, maps, shape=(metadata.dh, metadata.dw)),
+                read=partial(_picture, member=image) if packed and image in held else None,
+            )
+        )
+    return pictures, bare
+
+
+def _members(path: Path) -> set[str]:
+    """Names of the frames' files, in an archive or the folder that it was unpacked into."""
+    if not path.is_file():
+        return {f"rgbd/{item.name}" for item in (path / "rgbd").iterdir()}
+    with reading(path, AGAIN), archive(path) as opened:
+        return {item.filename for item in opened.infolist() if item.file_size}
+
+
+def _stored(home: Path, name: str) -> bytes:
+    """A file of a folder or of an archive."""
+    with reading(home / name, AGAIN):
+        if not home.is_file():
+            return read_bytes(home / name)
+        with archive(home) as opened:
+            return opened.read(name)
+
+
+def _picture_size(path: Path, held: set[str]) -> tuple[int, int] | None:
+    """Width and height of an archive's first readable picture."""
+    for name in sorted(name for name in held if name.endswith(".jpg")):
+        with suppress(OSError, ValueError, ProjectError):
+            return open_picture(_stored(path, name)).size
+    return None
+
+
+def _picture(path: Path, *, member: str) -> Frame:
+    return decode_picture(_stored(path, member), where=str(path / member))
+
+
+def _lzfse_depth(home: Path, maps: list[str], _: Path, *, shape: tuple[int, int]) -> Depth:
+    """(h, w) depth; ``maps`` are names of it and, if there is any, its confidence in ``home``."""
+    depth = readings(_unpacked(home, maps[0], "<f4", shape=shape))
+    if len(maps) == 1:
+        return depth
+    return confident(depth, _unpacked(home, maps[1], "u1", shape=shape) > 0)
+
+
+def _unpacked(home: Path, name: str, dtype: str, *, shape: tuple[int, int]) -> NDArray[Any]:
+    lzfse = require(
+        "lzfse",
+        extra="phones",
+        purpose=f"{home}: depth compressed by LZFSE",
+        instead="or export EXR and JPG",
+    )
+    count = np.dtype(dtype).itemsize * shape[0] * shape[1]
+    expected = f"expected {shape[0]}x{shape[1]} values by LZFSE; {AGAIN}"
+    with reading(home / name, expected, also=(lzfse.error,)):
+        return np.frombuffer(_decompressed(_stored(home, name), count), dtype).reshape(shape)
+
+
+def _decompressed(data: bytes, size: int) -> bytes:
+    """What LZFSE packed, which has to be of so many bytes.
+
+    The package's own function takes ever more memory for damaged data. The library inside it, which
+    takes a buffer of fixed size, is called where it can be found.
+    """
+    import lzfse
+
+    try:
+        decode = ctypes.CDLL(lzfse.__file__).lzfse_decode_buffer
+    except (OSError, AttributeError):
+        return bytes(lzfse.decompress(data))
+    if size > _LZFSE_RATIO * len(data):
+        raise ValueError(f"{len(data)} bytes for {size}")
+    decode.restype = ctypes.c_size_t
+    decode.argtypes = [
+        ctypes.c_void_p, ctypes.c_size_t, ctypes.c_char_p, ctypes.c_size_t, ctypes.c_void_p,
+    ]  # fmt: skip
+    buffer = ctypes.create_string_buffer(size + 1)
+    found = decode(buffer, size + 1, data, len(data), None)
+    if found != size:
+        raise ValueError(f"damaged, or {found} bytes")
+    return buffer.raw[:size]
+
+
+RECORD3D = Layout.of_folder(
+    "Record3D",
+    f"an .r3d file, metadata with rgbd/, or {_EXPORT}/metadata.json",
+    matches=_is_record3d,
+    read=_read_record3d,
 )

@@ -17,8 +17,7 @@ from gvtools.scenes.collection import SceneCollection, of_scenes
 from gvtools.scenes.colmap_model import find_model
 from gvtools.scenes.layout import FORM, SPEC, is_address
 from gvtools.scenes.matching import named
-from gvtools.scenes.phones import POLYCAM, SCANNER_APP, STRAY_SCANNER
-from gvtools.scenes.record3d import RECORD3D
+from gvtools.scenes.phones import POLYCAM, RECORD3D, SCANNER_APP, STRAY_SCANNER
 from gvtools.scenes.rgbd import LAYOUTS, RgbdOptions, count_unposed
 from gvtools.scenes.scene import Finding, Scene
 from gvtools.scenes.transforms import FILE as TRANSFORMS
@@ -243,8 +242,7 @@ def open_collection(address: str, root: Path | None = None) -> SceneCollection:
             raise OptionError(
                 f"{address}: a root {root} is given; expected one for spec:NAME alone"
             )
-        from gvtools.scenes.shards.index import is_shards
-        from gvtools.scenes.shards.reader import open_shards
+        from gvtools.scenes.shards import is_shards, open_shards
 
         path = Path(address)
         return open_shards(path) if is_shards(path) else of_scenes([open_project(path)])

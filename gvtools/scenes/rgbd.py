@@ -16,7 +16,6 @@ their poses: every frame then stands at the identity.
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -34,6 +33,7 @@ from gvtools.scenes.calibration import (
     MILLIMETRES,
     Float64,
     corner_origin,
+    finite_array,
     intrinsics_beside,
     load_matrix,
     pinhole,
@@ -60,7 +60,7 @@ from gvtools.scenes.scene import Finding, Scene
 from gvtools.scenes.undistort import LensParameters
 from gvtools.settings import Settings, changes, with_file
 from gvtools.trajectory_files import read_poses
-from gvtools.untrusted import read_text
+from gvtools.untrusted import read_text, reading
 
 SIDECAR = "rgbd.json"
 Matrix = Annotated[list[list[float]], BeforeValidator(lambda value: np.asarray(value).tolist())]
@@ -271,23 +271,16 @@ class _Tum(RgbdFolder):
 
 def _stamped_files(path: Path) -> list[tuple[float, str]]:
     """Time stamps and names of a list of TUM RGB-D."""
-    try:
-        lines = read_text(path).splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise ProjectError(f"{path}: unreadable ({error})") from None
     entries = []
-    for number, line in enumerate(lines, start=1):
-        if not line.strip() or line.lstrip().startswith("#"):
-            continue
-        try:
-            time, name = line.replace(",", " ").split(maxsplit=1)
-            entries.append((float(time), name.strip()))
-            if not math.isfinite(entries[-1][0]):
-                raise ValueError
-        except ValueError:
-            raise ProjectError(
-                f"{path}, line {number}: {line!r}; expected a time stamp in seconds and a file"
-            ) from None
+    with reading(path, "expected a time stamp in seconds and a file in each line"):
+        for number, line in enumerate(read_text(path).splitlines(), start=1):
+            if not line.strip() or line.lstrip().startswith("#"):
+                continue
+            words = line.replace(",", " ").split(maxsplit=1)
+            stamp = finite_array(words[:1], 1)
+            if stamp is None or len(words) < 2:
+                raise ValueError(f"line {number}: {line!r}")
+            entries.append((float(stamp[0]), words[1].strip()))
     return entries
 
 
@@ -400,7 +393,7 @@ def read_log(path: Path) -> tuple[list[int], list[Float64]]:
     Returns:
         Each block's first integer and its (4, 4) matrix, as read.
     """
-    try:
+    with reading(path, "expected blocks of three integers and four lines of four numbers"):
         rows = [line.split() for line in read_text(path).splitlines()]
         rows = [row for row in rows if row]
         for at, row in enumerate(rows):
@@ -410,10 +403,6 @@ def read_log(path: Path) -> tuple[list[int], list[Float64]]:
             raise ValueError("the last block is not whole")
         numbers = [int(row[0]) for row in rows[::5]]
         matrices = np.array([row for at, row in enumerate(rows) if at % 5], np.float64)
-    except (OSError, ValueError) as error:
-        raise ProjectError(
-            f"{path}: {error}; expected blocks of three integers and four lines of four numbers"
-        ) from None
     return numbers, list(matrices.reshape(-1, 4, 4))
 
 

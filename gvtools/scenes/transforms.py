@@ -28,7 +28,7 @@ from gvtools.scenes.matching import given_folder
 from gvtools.scenes.photographs import PosedFrame, posed_scene
 from gvtools.scenes.scene import Scene, natural_key
 from gvtools.scenes.undistort import LensParameters, Undistortion
-from gvtools.untrusted import is_file, named_file, read_json
+from gvtools.untrusted import is_file, named_file, read_json, reading
 
 FILE = "transforms.json"
 EXPORTER = "gvtools"  # the value of ``exported_by`` in files written here
@@ -209,18 +209,14 @@ def _relative(file: str | Path, folder: Path) -> str:
 
 def load_frames(path: Path) -> dict[str, Any]:
     """The content of a ``transforms.json``, with at least one frame."""
-    try:
+    with reading(path, "expected a transforms.json"):
         data = read_json(path)
-    except FileNotFoundError:
-        raise ProjectError(f"{path}: no such file") from None
-    except (OSError, ValueError, RecursionError) as error:
-        raise ProjectError(f"{path}: no JSON ({error}); expected a transforms.json") from None
-    frames = data.get("frames") if isinstance(data, dict) else None
-    if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
-        raise ProjectError(f"{path}: no list 'frames'; expected a transforms.json")
-    if not frames:
-        raise ProjectError(f"{path}: no frames; expected at least one posed picture")
-    return data
+        frames = data.get("frames") if isinstance(data, dict) else None
+        if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
+            raise ValueError("no list 'frames'")
+        if not frames:
+            raise ValueError("no frames")
+        return data
 
 
 def _file_path(frame: Mapping[str, Any], what: str) -> str:

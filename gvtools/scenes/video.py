@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from gvtools.errors import ProjectError
 from gvtools.optional import require
 from gvtools.scenes.scene import Frame
-from gvtools.untrusted import regular
+from gvtools.untrusted import reading, regular
 
 
 @dataclass(frozen=True)
@@ -44,66 +45,62 @@ def frame_seconds(path: Path, *, edits: bool = True) -> NDArray[np.float64]:
 
     With ``edits``, frames that the file's edit list hides are left out.
     """
-    try:
-        with _opened(path, edits=edits) as container:
-            stream = container.streams.video[0]
-            ticks = sorted(
-                packet.pts
-                for packet in container.demux(stream)
-                if packet.pts is not None and not packet.is_discard
-            )
-            begin = stream.start_time or 0
-            return (np.array(ticks, np.float64) - begin) * float(stream.time_base)
-    except _av().error.FFmpegError as error:
-        raise ProjectError(f"{path}: no readable video ({error}); copy it again") from None
+    with _reading(path), _opened(path, edits=edits) as container:
+        stream = container.streams.video[0]
+        ticks = sorted(
+            packet.pts
+            for packet in container.demux(stream)
+            if packet.pts is not None and not packet.is_discard
+        )
+        begin = stream.start_time or 0
+        return (np.array(ticks, np.float64) - begin) * float(stream.time_base)
 
 
 def read_frame(path: Path, *, seconds: float, edits: bool = True) -> Frame:
     """The frame whose time stamp is nearest, in seconds from the video's beginning."""
     best, best_off = None, np.inf
-    try:
-        with _opened(path, edits=edits) as container:
-            stream = container.streams.video[0]
-            begin = (stream.start_time or 0) * stream.time_base
-            target = round((seconds + float(begin)) / float(stream.time_base))
-            container.seek(max(target, 0), stream=stream, backward=True)
-            for frame in container.decode(stream):
-                if frame.pts is None:
-                    continue
-                off = abs(frame.pts - target)
-                if off >= best_off:
-                    break
-                best, best_off = frame, off
-            else:
-                # The last frame stands for its own time alone, or a copy that was cut off would
-                # give it for all that is missing.
-                rate = stream.average_rate or stream.guessed_rate or 30
-                if best is not None and best_off * stream.time_base > 0.75 / float(rate):
-                    best = None
-            if best is not None:
-                return Frame(np.ascontiguousarray(best.to_ndarray(format="rgb24")))
-    except (_av().error.FFmpegError, IndexError) as error:
-        raise ProjectError(f"{path}: unreadable at {seconds:.3f} s ({error})") from None
-    raise ProjectError(f"{path}: no frame at {seconds:.3f} s; copy the video again")
+    with _reading(path, f" at {seconds:.3f} s"), _opened(path, edits=edits) as container:
+        stream = container.streams.video[0]
+        begin = (stream.start_time or 0) * stream.time_base
+        target = round((seconds + float(begin)) / float(stream.time_base))
+        container.seek(max(target, 0), stream=stream, backward=True)
+        for frame in container.decode(stream):
+            if frame.pts is None:
+                continue
+            off = abs(frame.pts - target)
+            if off >= best_off:
+                break
+            best, best_off = frame, off
+        else:
+            # The last frame stands for its own time alone, or a copy that was cut off would give
+            # it for all that is missing.
+            rate = stream.average_rate or stream.guessed_rate or 30
+            if best is not None and best_off * stream.time_base > 0.75 / float(rate):
+                best = None
+        if best is None:
+            raise ValueError("no frame")
+        return Frame(np.ascontiguousarray(best.to_ndarray(format="rgb24")))
 
 
 def _opened(path: Path, *, edits: bool = True) -> Any:
-    av = _av()
-    try:
+    with _reading(path):
         # Text of the file's own, which may be no UTF-8, is not looked at.
-        container = av.open(
+        container = _av().open(
             str(regular(path)),
             options={} if edits else {"ignore_editlist": "1"},
             metadata_errors="replace",
         )
-    except (av.error.FFmpegError, OSError, ValueError) as error:
-        raise ProjectError(f"{path}: no readable video ({error}); copy it again") from None
     streams = container.streams.video
     if not streams or streams[0].codec_context is None:
         container.close()
         what = "whose codec is not known" if streams else "without video stream"
         raise ProjectError(f"{path}: a file {what}; expected a video")
     return container
+
+
+def _reading(path: Path, place: str = "") -> AbstractContextManager[None]:
+    errors = (_av().error.FFmpegError,)
+    return reading(f"{path}{place}", "expected a whole video; copy it again", also=errors)
 
 
 def _av() -> Any:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 from gvtools.errors import OptionError, ProjectError
 
 if TYPE_CHECKING:
-    from gvtools.scenes.shards.index import Skipped
-    from gvtools.scenes.shards.writer import WrittenShard
+    from gvtools.scenes.shard_writer import WrittenShard
+    from gvtools.scenes.shards import Skipped
     from pipelines.commands.data import ShardsArguments, VerifyArguments
     from pipelines.console import Console
 
@@ -22,7 +22,7 @@ def shards(args: ShardsArguments, console: Console) -> None:
     from gvtools.scenes.data_sets.catalogue import spec_names
     from gvtools.scenes.layout import SPEC
     from gvtools.scenes.project import open_collection
-    from gvtools.scenes.shards.writer import MEGABYTE, ShardOptions, write_shards
+    from gvtools.scenes.shard_writer import MEGABYTE, ShardOptions, write_shards
     from gvtools.specs import name_key
 
     address = args.scenes_of
@@ -62,8 +62,8 @@ def _warn(skipped: tuple[Skipped, ...], console: Console) -> None:
 
 def verify(args: VerifyArguments, console: Console) -> None:
     """Compare shards with their checksums."""
-    from gvtools.scenes.shards.index import read_index
-    from gvtools.scenes.shards.reader import verify as problems_of
+    from gvtools.scenes.shards import read_index
+    from gvtools.scenes.shards import verify as problems_of
 
     problems = problems_of(args.folder)
     count = len(read_index(args.folder).shards)

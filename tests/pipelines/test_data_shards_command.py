@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from tiny_scan import write_scan
 
-from gvtools.scenes.shards.reader import open_shards
+from gvtools.scenes.shards import open_shards
 from pipelines.cli import main
 
 

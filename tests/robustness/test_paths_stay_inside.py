@@ -13,7 +13,7 @@ from gvtools.errors import CheckpointError, GvError, ProjectError
 from gvtools.networks.tensors import TensorFiles
 from gvtools.runs.run import load_run
 from gvtools.scenes.project import open_project
-from gvtools.scenes.shards.reader import open_shards
+from gvtools.scenes.shards import open_shards
 
 OUT = "lies outside of"
 

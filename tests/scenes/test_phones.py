@@ -169,7 +169,7 @@ def test_stray_without_rows_or_a_video(tmp_path: Path) -> None:
         open_project(tmp_path)
     (tmp_path / "odometry.csv").write_text(text)
     (tmp_path / "rgb.mp4").write_bytes(b"none")
-    with pytest.raises(ProjectError, match="no readable video"):
+    with pytest.raises(ProjectError, match="expected a whole video"):
         open_project(tmp_path)
 
 
@@ -269,8 +269,8 @@ def test_record3d_intrinsics_follow_pictures_of_another_size(tmp_path: Path) -> 
     ("changed", "message"),
     [
         ({"poses": [[0, 0, 0, 1, 0, 0, 0]] * 4}, "no frame has a pose, as in .* selfie camera"),
-        ({"K": [1, 2]}, r"metadata of another form \(K: .*expected Record3D's"),
-        ({"poses": "none"}, r"metadata of another form \(poses: "),
+        ({"K": [1, 2]}, r"metadata: unreadable \(K: .*expected Record3D's"),
+        ({"poses": "none"}, r"metadata: unreadable \(poses: "),
     ],
 )
 def test_record3d_metadata_that_is_of_no_use(

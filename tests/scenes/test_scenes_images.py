@@ -109,7 +109,7 @@ def test_depth_that_is_none(tmp_path):
     with pytest.raises(ProjectError, match="unreadable"):
         read_depth(tmp_path / "o.npy")
     np.savez(tmp_path / "k.npz", z=np.zeros(3))
-    with pytest.raises(ProjectError, match="expected the key 'depth'"):
+    with pytest.raises(ProjectError, match="with the key 'depth'"):
         read_depth(tmp_path / "k.npz")
 
 

@@ -66,7 +66,7 @@ def test_sevenscenes_intrinsics_in_the_parent_or_nowhere(tmp_path):
         (lambda pose: pose * np.array([[2.0], [2], [2], [1]]), r"scale 2"),
         (lambda pose: pose * np.array([1, 1, -1.0, 1]), "determinant -1"),
         (lambda pose: pose + np.where(np.eye(4) > 0, np.nan, 0), "NaN"),
-        (lambda pose: pose[:2], "2x4 numbers; expected 4x4 or 3x4"),
+        (lambda pose: pose[:2], "2x4 numbers\\); expected 4x4 or 3x4"),
     ],
 )
 def test_impossible_poses_name_their_file(tmp_path, change, told):

@@ -269,7 +269,7 @@ def test_absolute_and_relative_pictures_may_be_mixed(tmp_path, monkeypatch):
 )
 def test_malformed_files(tmp_path, text):
     (tmp_path / "transforms.json").write_text(text)
-    with pytest.raises(ProjectError, match=r"transforms\.json: no"):
+    with pytest.raises(ProjectError, match=r"\.json: unreadable \(.+\); expected a transforms"):
         read_transforms(tmp_path)
 
 

@@ -19,7 +19,7 @@ from gvtools.completers.geoverse.config import named
 from gvtools.errors import OptionError, ProjectError
 from gvtools.scenes.data_sets.catalogue import load_spec
 from gvtools.scenes.project import open_collection
-from gvtools.scenes.shards.writer import ShardOptions, write_shards
+from gvtools.scenes.shard_writer import ShardOptions, write_shards
 from gvtools.settings import with_texts
 from gvtools.training.data import Mixture, TrainingSamples
 from gvtools.training.loop import load_state

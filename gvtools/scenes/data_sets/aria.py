@@ -23,13 +23,13 @@ from numpy.typing import NDArray
 from gvtools.cameras import invert_rigid
 from gvtools.errors import ProjectError
 from gvtools.optional import require
-from gvtools.scenes.calibration import MILLIMETRES, Float64, json_file, quaternion_pose
+from gvtools.scenes.calibration import MILLIMETRES, Float64, quaternion_pose
 from gvtools.scenes.layout import Layout
 from gvtools.scenes.matching import pose_at, scenes_holding
 from gvtools.scenes.photographs import Depth, PosedFrame, posed_scene
 from gvtools.scenes.scene import Finding, Frame, Scene
 from gvtools.scenes.undistort import LensParameters
-from gvtools.untrusted import read_text
+from gvtools.untrusted import read_json, read_text, reading
 
 if TYPE_CHECKING:
     import pycolmap
@@ -74,10 +74,8 @@ def _version(folder: Path) -> str:
     """The data set's version, which tells the order of quaternions."""
     for path in (home / name for home in (folder, folder.parent) for name in METADATA):
         if path.is_file():
-            data = json_file(path)
-            if not isinstance(data, dict):
-                raise ProjectError(f"{path}: no JSON object; copy it again")
-            return str(data.get("dataset_version", FIRST_VERSION))
+            with reading(path, "expected a JSON object; copy it again"):
+                return str(read_json(path).get("dataset_version", FIRST_VERSION))
     raise ProjectError(
         f"{folder}: neither {' nor '.join(METADATA)}, which tell the order of quaternions; "
         "complete the download"
@@ -86,13 +84,11 @@ def _version(folder: Path) -> str:
 
 def read_trajectory(path: Path, *, version: str) -> tuple[Float64, Float64]:
     """The glasses' trajectory: (N,) nanoseconds, increasing, and (N, 4, 4) world_from_device."""
-    try:
+    with reading(path, "expected a head, 20 columns and a pose in each row; copy it again"):
         rows = list(csv.reader(read_text(path).splitlines()))[1:]
         values = np.array([[row[1], *row[3:10]] for row in rows if row], np.float64)
-    except (OSError, ValueError, IndexError, csv.Error) as error:
-        raise ProjectError(f"{path}: {error}; expected a head and 20 columns") from None
-    if not len(values):
-        raise ProjectError(f"{path}: no pose; complete the download")
+        if not len(values):
+            raise ValueError("no pose")
     values = values[np.argsort(values[:, 0], kind="stable")]
     quaternions = values[:, 4:]
     if version != FIRST_VERSION:
@@ -231,12 +227,10 @@ def _array(data: Any, path: Path) -> NDArray[Any]:
 @lru_cache(maxsize=OPEN_FILES)
 def _provider(path: Path) -> Any:
     """What reads a VRS file; opening one reads its whole index."""
-    try:
+    with reading(path, "expected a VRS file; copy it again"):
         provider = _tools().data_provider.create_vrs_data_provider(str(path))
-    except RuntimeError as error:
-        raise ProjectError(f"{path}: no readable VRS file ({error}); copy it again") from None
-    if provider is None:
-        raise ProjectError(f"{path}: no readable VRS file; copy it again")
+        if provider is None:
+            raise ValueError("no recording")
     return provider
 
 

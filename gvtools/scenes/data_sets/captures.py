@@ -37,7 +37,7 @@ from gvtools.scenes.photographs import Depth, PosedFrame, Registration, first_si
 from gvtools.scenes.rgbd import SCANNET, SCANNET_FOLDER, SEVENSCENES, RgbdOptions, rgbd_scene
 from gvtools.scenes.scene import Finding, Frame, Scene
 from gvtools.scenes.undistort import LensParameters
-from gvtools.untrusted import read_text, regular
+from gvtools.untrusted import read_text, reading, regular
 
 # --- 7-Scenes as published: ``SCENE/seq-NN/frame-NNNNNN.{color.png, depth.png, pose.txt}`` ------
 
@@ -135,28 +135,24 @@ class SensFile:
     @staticmethod
     def open(path: Path) -> SensFile:
         """The head and the index of a file, which may end early."""
-        try:
+        with reading(path, "expected a .sens file; copy it again"):
             with regular(path).open("rb") as file:
                 (version,) = _unpack(file, "<I")
                 if version != VERSION:
-                    raise ProjectError(
-                        f"{path}: version {version}; expected {VERSION} of a .sens file"
-                    )
+                    raise ValueError(f"version {version}, not {VERSION}")
                 (length,) = _unpack(file, "<Q")
                 file.seek(length, io.SEEK_CUR)
                 matrices = np.array(_unpack(file, "<64f")).reshape(4, 4, 4)
                 color_code, depth_code, *sizes = _unpack(file, "<iiIIII")
                 shift, count = _unpack(file, "<fQ")
                 frames = _sens_index(file, count, path.stat().st_size)
-        except (OSError, OverflowError, ValueError, struct.error) as error:
-            raise ProjectError(f"{path}: no readable .sens file ({error}); copy it again") from None
-        if not shift > 0:
-            raise ProjectError(f"{path}: {shift:g} depth steps a metre; expected a positive number")
-        if color_code not in (PNG, JPEG) or depth_code not in (ZLIB_USHORT, RAW_USHORT):
-            raise ProjectError(
-                f"{path}: colour of compression {color_code} and depth of {depth_code}; expected "
-                "PNG or JPEG, and zlib or none"
-            )
+            if not shift > 0:
+                raise ValueError(f"{shift:g} depth steps a metre; expected a positive number")
+            if color_code not in (PNG, JPEG) or depth_code not in (ZLIB_USHORT, RAW_USHORT):
+                raise ValueError(
+                    f"colour of compression {color_code} and depth of {depth_code}; expected PNG "
+                    "or JPEG, and zlib or none"
+                )
         color_size, depth_size = (sizes[0], sizes[1]), (sizes[2], sizes[3])
         return SensFile(
             matrices, color_size, depth_size, depth_code, 1.0 / shift, count, tuple(frames)
@@ -189,28 +185,24 @@ def _sens_index(file: BinaryIO, count: int, end: int) -> list[SensFrame]:
 
 def read_sens_color(path: Path, *, frame: SensFrame) -> Frame:
     """The picture of a frame."""
-    try:
-        with regular(path).open("rb") as file:
-            file.seek(frame.offset)
-            data = file.read(frame.color_bytes)
-    except OSError as error:
-        raise ProjectError(f"{path}: unreadable ({error}); copy it again") from None
+    data = _sens_bytes(path, frame.offset, frame.color_bytes)
     return decode_picture(data, where=str(path))
 
 
 def read_sens_depth(path: Path, *, frame: SensFrame, sens: SensFile) -> Depth:
     """(h, w) float32 z-depth of the depth camera, metres, 0 for none."""
-    width, height = sens.depth_size
-    try:
-        with regular(path).open("rb") as file:
-            file.seek(frame.offset + frame.color_bytes)
-            data = file.read(frame.depth_bytes)
+    data = _sens_bytes(path, frame.offset + frame.color_bytes, frame.depth_bytes)
+    with reading(path):
         if sens.depth_code == ZLIB_USHORT:
             data = zlib.decompress(data)
-        raw = np.frombuffer(data, "<u2").reshape(height, width)
-    except (OSError, ValueError, zlib.error) as error:
-        raise ProjectError(f"{path}: unreadable depth ({error}); copy it again") from None
+        raw = np.frombuffer(data, "<u2").reshape(sens.depth_size[::-1])
     return readings(raw, unit=sens.depth_unit)
+
+
+def _sens_bytes(path: Path, offset: int, count: int) -> bytes:
+    with reading(path), regular(path).open("rb") as file:
+        file.seek(offset)
+        return file.read(count)
 
 
 # --- ARKitScenes ------------------------------------------------------------------------------
@@ -282,10 +274,8 @@ def _read_arkit(root: Path, scene: str) -> Scene:
 
 
 def _stamp(name: str) -> float:
-    try:
+    with reading(name, "expected a time stamp, VIDEO_SECONDS.png"):
         return float(name.rpartition(".")[0].rpartition("_")[2])
-    except ValueError:
-        raise ProjectError(f"{name}: no time stamp; expected VIDEO_SECONDS.png") from None
 
 
 def _pincams(folder: Path) -> dict[int, LensParameters]:
@@ -349,7 +339,7 @@ def _read_mapfree(root: Path, scene: str) -> Scene:
 def _named_numbers(path: Path, columns: int) -> dict[str, Float64]:
     """Lines of a picture's path and numbers; comments begin with #."""
     rows = {}
-    try:
+    with reading(path, f"expected a picture's path and {columns} numbers a line"):
         for line in read_text(path).splitlines():
             words = line.split()
             if not words or line.startswith("#"):
@@ -358,10 +348,6 @@ def _named_numbers(path: Path, columns: int) -> dict[str, Float64]:
             if len(values) != columns:
                 raise ValueError(f"{words[0]} has {len(values)} numbers")
             rows[words[0].replace("\\", "/")] = values
-    except (OSError, ValueError) as error:
-        raise ProjectError(
-            f"{path}: {error}; expected a picture's path and {columns} numbers a line"
-        ) from None
     return rows
 
 

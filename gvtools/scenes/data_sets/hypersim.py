@@ -38,14 +38,13 @@ from gvtools.scenes.calibration import (
     pinhole_lens,
     rigid_poses,
 )
-from gvtools.scenes.depth_files import hdf5_array
-from gvtools.scenes.images import read_image, readings
+from gvtools.scenes.images import hdf5_array, read_image, readings
 from gvtools.scenes.layout import Layout
 from gvtools.scenes.matching import natural
 from gvtools.scenes.photographs import Depth, PosedFrame, posed_scene
 from gvtools.scenes.scene import Finding, Frame, Scene
 from gvtools.scenes.undistort import LensParameters
-from gvtools.untrusted import read_text
+from gvtools.untrusted import read_text, reading
 
 PARAMETERS = "metadata_camera_parameters.csv"
 SIZE = (1024, 768)  # width, height of the pictures where the file of parameters is absent
@@ -230,15 +229,12 @@ def _projection(parameters: dict[str, str]) -> tuple[Float64, tuple[int, int], l
         line = f"no {PARAMETERS} with this scene: 60 degrees across are taken, without lens shift"
         uv = np.diag([x, x * SIZE[1] / SIZE[0], -1.0])
         return uv, SIZE, [Finding("warning", line)]
-    try:
+    with reading(PARAMETERS, "copy the file again"):
         names = [f"M_cam_from_uv_{row}{column}" for row in range(3) for column in range(3)]
         uv = np.array([float(parameters[name]) for name in names]).reshape(3, 3)
-        size = [
-            int(float(parameters[f"settings_output_img_{side}"])) for side in ("width", "height")
-        ]
-    except (KeyError, OverflowError, TypeError, ValueError) as error:
-        raise ProjectError(f"{PARAMETERS}: {error}; copy the file again") from None
-    return uv, (size[0], size[1]), []
+        sides = (parameters[f"settings_output_img_{side}"] for side in ("width", "height"))
+        width, height = (int(float(side)) for side in sides)
+        return uv, (width, height), []
 
 
 def _metres_per_unit(path: Path, parameters: dict[str, str]) -> float:

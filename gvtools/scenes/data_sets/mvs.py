@@ -19,13 +19,13 @@ from gvtools.errors import ProjectError
 from gvtools.scenes.calibration import MILLIMETRES, Float64, load_matrix, pinhole_lens
 from gvtools.scenes.colmap_model import find_model
 from gvtools.scenes.data_sets.reconstructed import MIPNERF360
-from gvtools.scenes.depth_files import read_pfm_depth
+from gvtools.scenes.images import read_pfm_depth
 from gvtools.scenes.layout import Layout
 from gvtools.scenes.matching import natural, pictures_by_stem
 from gvtools.scenes.photographs import PosedFrame, first_size, posed_scene
 from gvtools.scenes.rgbd import read_log
 from gvtools.scenes.scene import Finding, Scene
-from gvtools.untrusted import load_arrays, read_text
+from gvtools.untrusted import load_arrays, read_text, reading
 
 SUFFIX = "_cam.txt"
 # How far a principal point may be from the middle, as a share of a side, to be of that picture.
@@ -54,17 +54,13 @@ class MvsCamera:
 
 def read_camera(path: Path) -> MvsCamera:
     """A camera file of MVSNet."""
-    try:
+    form = "expected 'extrinsic' with 4x4 and 'intrinsic' with 3x3 numbers"
+    with reading(path, f"{form}; copy it again"):
         words = read_text(path).split()
         at = words.index("extrinsic") + 1
         pose = np.array(words[at : at + 16], np.float64).reshape(4, 4)
         at = words.index("intrinsic") + 1
-        K = np.array(words[at : at + 9], np.float64).reshape(3, 3)
-    except (OSError, ValueError) as error:
-        raise ProjectError(
-            f"{path}: {error}; expected 'extrinsic' with 4x4 and 'intrinsic' with 3x3 numbers"
-        ) from None
-    return MvsCamera(K, pose)
+        return MvsCamera(np.array(words[at : at + 9], np.float64).reshape(3, 3), pose)
 
 
 def size_of_intrinsics(
@@ -162,26 +158,20 @@ def _rectified(root: Path, folder: Path) -> list[PosedFrame]:
 def _idr(folder: Path) -> list[PosedFrame]:
     """Of IDR's form."""
     prefix = "world_mat_"
-    try:
+    with reading(folder / NPZ, f"expected projection matrices {prefix}0, ...; copy it again"):
         matrices = {
             int(key.removeprefix(prefix)): np.asarray(matrix, np.float64)[:3, :4].reshape(3, 4)
             for key, matrix in load_arrays(folder / NPZ).items()
             if re.fullmatch(prefix + r"\d{1,9}", key)
         }
-    except (OSError, ValueError, TypeError, IndexError) as error:
-        raise ProjectError(f"{folder / NPZ}: {error}; expected world_mat_0, ...") from None
     home = folder / "image"
     by_stem = pictures_by_stem(home).items()
     by_number = {int(stem): path for stem, path in by_stem if stem.isdecimal()}
     frames = []
     for number in sorted(matrices):
         image = by_number.get(number, home / f"{number:06d}.png")
-        try:
+        with reading(f"{folder / NPZ}: {prefix}{number}", "expected a projection; copy it again"):
             camera = decomposed(matrices[number])
-        except ValueError as error:  # of NumPy's linear algebra, too
-            raise ProjectError(
-                f"{folder / NPZ}: {prefix}{number} is no projection matrix ({error}); copy it again"
-            ) from None
         frames.append(camera.frame(image, sizes=DTU_SIZES, unit=MILLIMETRES))
     return frames
 

@@ -19,7 +19,6 @@ from gvtools.errors import ProjectError
 from gvtools.scenes.calibration import (
     MILLIMETRES,
     finite_array,
-    json_file,
     pinhole_lens,
 )
 from gvtools.scenes.colmap import colmap_frames, colmap_scene, model_in
@@ -43,7 +42,7 @@ from gvtools.scenes.scene import Finding, Scene
 from gvtools.scenes.transforms import FILE as TRANSFORMS
 from gvtools.scenes.transforms import transforms_frames
 from gvtools.scenes.undistort import Undistortion
-from gvtools.untrusted import is_file, load_array, regular
+from gvtools.untrusted import is_file, load_array, read_json, reading, regular
 
 FULL = "images"
 
@@ -141,15 +140,13 @@ def _llff_scenes(root: Path) -> tuple[str, ...]:
 def _read_llff(root: Path, scene: str) -> Scene:
     folder, home = chosen_folder(root, scene)
     path = folder / POSES_BOUNDS
-    try:
+    with reading(path, "expected an array of N x 17 numbers; copy it again"):
         rows = load_array(path).astype(np.float64)
-    except (OSError, ValueError, TypeError) as error:
-        raise ProjectError(f"{path}: {error}; expected an array of N x 17 numbers") from None
-    if rows.ndim != 2 or rows.shape[1] != 17:
-        raise ProjectError(f"{path}: shape {rows.shape}; expected N x 17")
-    rows = rows[:, :15].reshape(-1, 3, 5)
-    if not np.isfinite(rows[..., 4]).all():
-        raise ProjectError(f"{path}: a picture's size or focal length is not finite; copy it again")
+        if rows.ndim != 2 or rows.shape[1] != 17:
+            raise ValueError(f"shape {rows.shape}")
+        rows = rows[:, :15].reshape(-1, 3, 5)
+        if not np.isfinite(rows[..., 4]).all():
+            raise ValueError("a picture's size or focal length is not finite")
     frames = []
     for row, file in zip(rows, _llff_files(folder, home, len(rows)), strict=True):
         height, width, focal = (float(value) for value in row[:, 4])
@@ -293,15 +290,10 @@ def read_raw_depth(path: Path, *, size: tuple[int, int], lens: Undistortion | No
         lens: from the original camera to that of the picture at hand; None for the original.
     """
     width, height = size
-    try:
+    with reading(path, f"expected floats of the original camera's size in {ORIGINAL}; copy again"):
         values = np.fromfile(regular(path), "<f4")
-    except OSError as error:
-        raise ProjectError(f"{path}: unreadable ({error}); copy it again") from None
-    if values.size != width * height:
-        raise ProjectError(
-            f"{path}: {values.size} floats; expected {width} x {height}, as the original camera "
-            f"in {ORIGINAL} says; copy it again"
-        )
+        if values.size != width * height:
+            raise ValueError(f"{values.size} floats, not {width} x {height}")
     depth = readings(values.reshape(height, width))
     return depth if lens is None else np.ascontiguousarray(lens.nearest(depth))
 
@@ -361,11 +353,10 @@ def _read_iphone(folder: Path) -> Scene:
             f"{folder}: no folder rgb; extract it from rgb.mp4 (and depth from depth.bin) with the "
             "data set's own tool, iphone.prepare_iphone_data"
         )
-    records = json_file(folder / IPHONE_POSES)
-    if not isinstance(records, dict) or not all(
-        isinstance(record, dict) for record in records.values()
-    ):
-        raise ProjectError(f"{folder / IPHONE_POSES}: expected a record for each frame")
+    with reading(folder / IPHONE_POSES, "expected a record for each frame; copy it again"):
+        records = read_json(folder / IPHONE_POSES)
+        if not all(isinstance(record, dict) for record in records.values()):
+            raise ValueError("values that are no records")
     size = first_size(home / f"{name}.jpg" for name in records) or (1920, 1440)
     frames = []
     for name, record in records.items():

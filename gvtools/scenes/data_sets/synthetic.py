@@ -23,20 +23,24 @@ from gvtools.scenes.calibration import (
     renderer_lens,
     rigid_poses,
 )
-from gvtools.scenes.depth_files import (
+from gvtools.scenes.images import (
+    UNREADABLE,
+    decode_picture,
     exr_depth,
     hdf5_array,
     hdf5_depth,
     hdf5_file,
     read_dataset,
+    read_depth,
+    read_mask,
+    readings,
 )
-from gvtools.scenes.images import UNREADABLE, decode_picture, read_depth, read_mask, readings
 from gvtools.scenes.layout import Layout
 from gvtools.scenes.matching import natural, numbers_in, scenes_holding
 from gvtools.scenes.photographs import Depth, PosedFrame, first_size, posed_scene
 from gvtools.scenes.scene import Finding, Frame, Scene
 from gvtools.scenes.undistort import LensParameters
-from gvtools.untrusted import open_picture, read_json
+from gvtools.untrusted import open_picture, read_json, reading
 
 LensOf = Callable[[Sequence[float], tuple[int, int]], LensParameters | None]
 # Of each frame the stored pose and fx, fy, cx, cy, pixels.
@@ -115,13 +119,10 @@ def packed_depth(path: Path) -> Depth:
 
 def _pixels(path: Path, mode: str, expected: str) -> Any:
     """The values of a picture whose mode begins like that."""
-    try:
-        with open_picture(path) as image:
-            found, values = image.mode, np.asarray(image)
-    except UNREADABLE as error:
-        raise ProjectError(f"{path}: unreadable ({error}); download it again") from None
-    if not found.startswith(mode):
-        raise ProjectError(f"{path}: depth as {found}; expected {expected}")
+    with reading(path), open_picture(path) as image:
+        if not image.mode.startswith(mode):
+            raise ProjectError(f"{path}: depth as {image.mode}; expected {expected}")
+        values = np.asarray(image)
     return values
 
 
@@ -333,14 +334,10 @@ def _synth_scenes(root: Path) -> tuple[str, ...]:
 
 def _synth_camera(path: Path) -> tuple[Float64, tuple[float, ...]]:
     """cam_from_world and fx, fy, cx, cy of a pose file."""
-    try:
+    with reading(path, "expected extrinsic, f_x, f_y, c_x and c_y; copy it again"):
         values = read_json(path)
         pose = np.array(values["extrinsic"], np.float64).reshape(4, 4)
         lens = tuple(float(values[key]) for key in ("f_x", "f_y", "c_x", "c_y"))
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ProjectError(
-            f"{path}: {type(error).__name__} ({error}); expected extrinsic, f_x, f_y, c_x and c_y"
-        ) from None
     return (pose @ MIRRORED if np.linalg.det(pose[:3, :3]) < 0 else pose), lens
 
 
@@ -398,7 +395,8 @@ def _read_omniworld(root: Path, scene: str) -> Scene:
     above, _, split = scene.rpartition("/")
     folder = root / above
     info, path = folder / "split_info.json", folder / "camera" / f"{split}.json"
-    try:
+    expected = f"expected quats, trans, focals, cx and cy of the split's frames in {info.name}"
+    with reading(path, f"{expected}; download both again"):
         number = int(split.removeprefix("split_"))
         numbers = [int(frame) for frame in json_file(info)["split"][number]]
         values, count = json_file(path), len(numbers)
@@ -407,11 +405,6 @@ def _read_omniworld(root: Path, scene: str) -> Scene:
         poses = rigid_poses(Rotation.from_quat(turns).as_matrix(), centres)
         stored = [np.broadcast_to(values[k], count) for k in ("focals", "focals", "cx", "cy")]
         lenses = np.stack(stored, axis=-1).astype(np.float64)
-    except (ValueError, KeyError, IndexError, OverflowError, TypeError) as error:
-        raise ProjectError(
-            f"{path}: does not fit {info.name} ({type(error).__name__}: {error}); expected quats, "
-            "trans, focals, cx and cy of the split's frames; download both again"
-        ) from None
     frames = numbered_frames(
         folder / "color",
         dict(zip(numbers, zip(poses, lenses, strict=True), strict=True)),

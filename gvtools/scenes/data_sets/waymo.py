@@ -17,16 +17,15 @@ from typing import Any
 
 import numpy as np
 
-from gvtools.errors import ProjectError
 from gvtools.optional import require
 from gvtools.scenes.calibration import Float64
-from gvtools.scenes.images import UNREADABLE, decode_picture
+from gvtools.scenes.images import decode_picture
 from gvtools.scenes.layout import Layout
 from gvtools.scenes.matching import natural
 from gvtools.scenes.photographs import PosedFrame, posed_scene
 from gvtools.scenes.scene import Finding, Frame, Scene
 from gvtools.scenes.undistort import LensParameters
-from gvtools.untrusted import regular
+from gvtools.untrusted import reading, regular
 
 CAMERAS = {1: "front", 2: "front_left", 3: "front_right", 4: "side_left", 5: "side_right"}
 TIME, CAMERA = "key.frame_timestamp_micros", "key.camera_name"
@@ -83,39 +82,33 @@ def _read(root: Path, scene: str) -> Scene:
 
 def read_picture(path: Path, *, group: int, row: int) -> Frame:
     """The picture in a row of a row group of a ``camera_image`` file."""
-    try:
-        with _parquet().ParquetFile(regular(path)) as file:
-            seen = 0
-            for batch in file.iter_batches(
-                batch_size=PICTURES_AT_ONCE, row_groups=[group], columns=[IMAGE]
-            ):
-                if row < seen + batch.num_rows:
-                    data = batch.column(0)[row - seen].as_py()
-                    return decode_picture(data, where=f"{path}, row {row} of group {group}")
-                seen += batch.num_rows
-    except UNREADABLE as error:
-        raise ProjectError(f"{path}: unreadable picture ({error}); copy it again") from None
-    raise ProjectError(f"{path}: no row {row} in row group {group}; copy it again")
+    with reading(path), _parquet().ParquetFile(regular(path)) as file:
+        for batch in file.iter_batches(
+            batch_size=PICTURES_AT_ONCE, row_groups=[group], columns=[IMAGE]
+        ):
+            if row < batch.num_rows:
+                data = batch.column(0)[row].as_py()
+                return decode_picture(data, where=f"{path}, row {row} of group {group}")
+            row -= batch.num_rows
+        raise ValueError(f"no such row in row group {group}")
 
 
 def _rows(path: Path, columns: tuple[str, ...]) -> Iterator[tuple[int, int, dict[str, Any]]]:
     """Row group, row within it, and the values of the columns that a file has."""
-    try:
-        with _parquet().ParquetFile(regular(path)) as file:
-            known = set(file.schema_arrow.names)
-            wanted = [name for name in columns if name in known]
-            if lost := {CAMERA, TIME}.intersection(columns) - known:
-                raise ValueError(f"without the column {min(lost)}")
-            for group in range(file.num_row_groups):
-                row = 0
-                for batch in file.iter_batches(
-                    batch_size=ROWS_AT_ONCE, row_groups=[group], columns=wanted
-                ):
-                    for record in batch.to_pylist():
-                        yield group, row, record
-                        row += 1
-    except (OSError, NotImplementedError, ValueError) as error:
-        raise ProjectError(f"{path}: no readable Parquet file ({error}); copy it again") from None
+    advice = "expected a Parquet file; copy it again"
+    with reading(path, advice), _parquet().ParquetFile(regular(path)) as file:
+        known = set(file.schema_arrow.names)
+        wanted = [name for name in columns if name in known]
+        if lost := {CAMERA, TIME}.intersection(columns) - known:
+            raise ValueError(f"without the column {min(lost)}")
+        for group in range(file.num_row_groups):
+            row = 0
+            for batch in file.iter_batches(
+                batch_size=ROWS_AT_ONCE, row_groups=[group], columns=wanted
+            ):
+                for record in batch.to_pylist():
+                    yield group, row, record
+                    row += 1
 
 
 def _calibrations(path: Path) -> dict[int, tuple[LensParameters, Float64 | None]]:

@@ -17,12 +17,11 @@ from shard_rooms import small_collection, small_scene
 from gvtools.errors import OptionError, ProjectError
 from gvtools.scenes.collection import of_scenes
 from gvtools.scenes.project import open_project
-from gvtools.scenes.shards.index import is_shards, read_index
-from gvtools.scenes.shards.reader import open_shards, verify
-from gvtools.scenes.shards.writer import ShardOptions, write_shards
+from gvtools.scenes.shard_writer import ShardOptions, write_shards
+from gvtools.scenes.shards import is_shards, open_shards, read_index, verify
 
 SMALL = ShardOptions(megabytes=0.08)
-ROOT = Path(__file__).resolve().parents[3]
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(scope="module")
@@ -112,7 +111,7 @@ _KILLED = """
 import os, signal, sys
 from pathlib import Path
 from shard_rooms import Pixels, small_collection
-from gvtools.scenes.shards.writer import ShardOptions, write_shards
+from gvtools.scenes.shard_writer import ShardOptions, write_shards
 
 load = Pixels.__call__
 

@@ -20,7 +20,7 @@ from gvtools.files import make_folder, replaced_when_written, write_text
 from gvtools.scenes.collection import SceneCollection
 from gvtools.scenes.resized import check_max_side, reduced
 from gvtools.scenes.scene import Scene, View
-from gvtools.scenes.shards.index import (
+from gvtools.scenes.shards import (
     INDEX,
     ListedScene,
     ListedShard,
@@ -30,12 +30,12 @@ from gvtools.scenes.shards.index import (
     ShardsIndex,
     Skipped,
     ViewRecord,
+    encoded,
     read_index,
     read_record,
     sha256_of,
     shard_name,
 )
-from gvtools.scenes.shards.members import encoded
 from gvtools.untrusted import read_json
 
 CONVERSION = "conversion.json"

@@ -11,8 +11,8 @@ import pytest
 from PIL import Image
 from shard_rooms import small_collection
 
-from gvtools.scenes.shards.index import read_index
-from gvtools.scenes.shards.writer import ShardOptions, write_shards
+from gvtools.scenes.shard_writer import ShardOptions, write_shards
+from gvtools.scenes.shards import read_index
 
 wds = pytest.importorskip("webdataset")
 torch = pytest.importorskip("torch")
