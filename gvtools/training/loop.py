@@ -33,22 +33,10 @@ from gvtools.training.samples import Draws, TrainingBatch
 from gvtools.untrusted import archive
 
 Batches = Callable[[Iterable[range]], Generator[TrainingBatch, None, None]]
-Record = Callable[[int, dict[str, float]], None]
 
-# Saving takes at most one part in so many of the time.
-SAVING_SHARE = 20
-
-
-@dataclass(frozen=True)
-class Reporting:
-    """When and to whom the loop reports."""
-
-    log_every: int = 20  # steps between records
-    save_seconds: float = 60.0  # seconds between checkpoints; more where saving takes long
-    sheet_every: int = 0  # steps between sample sheets
-    record: Record | None = None  # gets (step, values), means over all processes
-    # gets the step, in every process; the averaged weights are in place meanwhile
-    sheet: Callable[[int], None] | None = None
+LOG_EVERY = 20  # steps between records
+SAVE_SECONDS = 60.0  # between checkpoints; more where saving takes long:
+SAVING_SHARE = 20  # it takes at most one part in so many of the time
 
 
 class Trainer:
@@ -122,7 +110,7 @@ class Trainer:
 
     def save(self) -> None:
         """Write the state, from the first process; called by all of them."""
-        self._merged_notes()
+        self._merge_notes()
         model, optimizer, ema = (
             self.distributed.gather(part)
             for part in (
@@ -134,68 +122,72 @@ class Trainer:
         if self.processes.first:
             save_state(StageState(self.identity, self.progress, model, optimizer, ema), self.folder)
 
-    def _merged_notes(self) -> dict[str, float]:
-        """How often what happened when samples were drawn, in all processes since the start.
-
-        Called by all processes.
-        """
-        drawn = Counter(self.progress.drawn)
-        drawn.update(self.processes.total(self._notes))
+    def _merge_notes(self) -> dict[str, float]:
+        """Counts of what happened when samples were drawn; called by all processes."""
+        total = Counter(self.progress.drawn)
+        total.update(self.processes.total(self._notes))
         self._notes.clear()
-        self.progress.drawn = dict(sorted(drawn.items()))
-        found = {name: float(count) for name, count in self.progress.drawn.items()}
-        if found:
-            invalid = sum(n for name, n in drawn.items() if name.startswith(f"{RESAMPLED}/"))
-            found[RESAMPLED] = float(invalid)
-        return found
+        self.progress.drawn = dict(sorted(total.items()))
+        counts = {name: float(count) for name, count in self.progress.drawn.items()}
+        if counts:
+            invalid = sum(n for name, n in total.items() if name.startswith(f"{RESAMPLED}/"))
+            counts[RESAMPLED] = float(invalid)
+        return counts
 
-    def train(self, reporting: Reporting, *, until: int | None = None) -> None:
-        """Make steps up to ``until`` (all of them by default) and save at the end."""
-        with closing(self.batches(self._parts_ahead())) as stream:
-            self._train(stream, reporting, until)
-        self.save()
-
-    def _train(
-        self, stream: Iterator[TrainingBatch], reporting: Reporting, until: int | None
+    def train(
+        self,
+        *,
+        until: int | None = None,  # step to stop after; None makes all steps
+        # gets (step, values), means over all processes
+        record: Callable[[int, dict[str, float]], None] | None = None,
+        # gets the step, in every process; the averaged weights are in place meanwhile
+        sheet: Callable[[int], None] | None = None,
+        sheet_every: int = 0,  # steps between sample sheets
     ) -> None:
+        """Make steps, and save now and then and at the end."""
         last = min(until or self.options.steps, self.options.steps)
         saved = begun = time.monotonic()
-        pause = reporting.save_seconds
-        before = self.progress.seconds
-        kept: list[dict[str, float]] = []
-        while self.progress.step < last:
-            kept.append(self.step(stream))
-            self.progress.seconds = before + time.monotonic() - begun
-            step = self.progress.step
-            if step % reporting.log_every == 0 or step == last:
-                values = self.processes.mean(_averaged(kept))
-                values |= {
-                    "rate": self.options.rate_at(step - 1),
-                    "skipped": float(self.progress.skipped),
-                    "seconds": self.progress.seconds,
-                    **self._merged_notes(),
-                }
-                if reporting.record is not None:
-                    reporting.record(step, values)
-                kept = []
-            if reporting.sheet is not None and step % reporting.sheet_every == 0:
-                with self.ema.swapped_in(), torch.no_grad():
-                    reporting.sheet(step)
-            # The clocks of the processes differ, and all of them save.
-            if self.processes.any(time.monotonic() - saved > pause):
-                now = time.monotonic()
-                self.save()
-                saved = time.monotonic()
-                pause = max(reporting.save_seconds, SAVING_SHARE * (saved - now))
+        pause, before = SAVE_SECONDS, self.progress.seconds
+        values: list[dict[str, float]] = []
+        parts = itertools.chain.from_iterable(map(self.parts, itertools.count(self.progress.step)))
+        with closing(self.batches(parts)) as stream:
+            while self.progress.step < last:
+                values.append(self.step(stream))
+                self.progress.seconds = before + time.monotonic() - begun
+                step = self.progress.step
+                if step % LOG_EVERY == 0 or step == last:
+                    means = self.processes.mean(_averaged(values))
+                    means |= {
+                        "rate": self.options.rate_at(step - 1),
+                        "skipped": float(self.progress.skipped),
+                        "seconds": self.progress.seconds,
+                        **self._merge_notes(),
+                    }
+                    if record is not None:
+                        record(step, means)
+                    values = []
+                if sheet is not None and step % sheet_every == 0:
+                    with self.ema.swapped_in(), torch.no_grad():
+                        sheet(step)
+                # The clocks of the processes differ, and all of them save.
+                if self.processes.any(time.monotonic() - saved > pause):
+                    now = time.monotonic()
+                    self.save()
+                    saved = time.monotonic()
+                    pause = max(SAVE_SECONDS, SAVING_SHARE * (saved - now))
+        self.save()
 
     def parts(self, step: int) -> list[range]:
         """Numbers of the samples of this process's parts of a step."""
         start = step * self.options.batch
         mine = self.processes.share(range(start, start + self.options.batch))
-        return _parts(mine, self.options.accumulate)
+        # Contiguous, as equal as can be.
+        count = min(self.options.accumulate, len(mine))
+        ends = [mine.start + round(i * len(mine) / count) for i in range(count + 1)]
+        return [range(a, b) for a, b in pairwise(ends)]
 
     def check_parts(self, group: int) -> None:
-        """Whether the samples of each part of each step have context views of one number."""
+        """Refuse parts whose samples have different numbers of context views."""
         for part in itertools.chain.from_iterable(map(self.parts, range(group))):
             if part[0] // group != part[-1] // group:
                 raise OptionError(
@@ -206,15 +198,11 @@ class Trainer:
                     f"{group}, or a multiple of {group} in as many parts"
                 )
 
-    def _parts_ahead(self) -> Iterator[range]:
-        for step in itertools.count(self.progress.step):
-            yield from self.parts(step)
-
     def step(self, stream: Iterator[TrainingBatch]) -> dict[str, float]:
         """One optimiser step; returns what it logs. A bad batch is skipped and counted."""
         options, number = self.options, self.progress.step
         for group in self.optimizer.param_groups:
-            group["lr"] = self.options.rate_at(number)
+            group["lr"] = options.rate_at(number)
         values: list[dict[str, float]] = []
         good = True
         parts = self.parts(number)
@@ -246,13 +234,6 @@ class Trainer:
         self.optimizer.zero_grad(set_to_none=True)
         self.progress.step += 1
         return _averaged(values)
-
-
-def _parts(samples: range, count: int) -> list[range]:
-    """Contiguous parts, as equal as can be."""
-    count = min(count, len(samples))
-    ends = [samples.start + round(i * len(samples) / count) for i in range(count + 1)]
-    return [range(a, b) for a, b in pairwise(ends)]
 
 
 def _averaged(values: Sequence[dict[str, float]]) -> dict[str, float]:
@@ -292,12 +273,12 @@ class AveragedWeights:
     @contextmanager
     def swapped_in(self) -> Iterator[None]:
         """The parameters hold their averages within the block."""
-        kept = {name: p.detach().clone() for name, p in self._parameters.items()}
+        own = {name: p.detach().clone() for name, p in self._parameters.items()}
         self._put(self.shadow)
         try:
             yield
         finally:
-            self._put(kept)
+            self._put(own)
 
     @torch.no_grad()
     def _put(self, values: Mapping[str, Tensor]) -> None:
@@ -336,7 +317,7 @@ class StageState:
     """What is saved."""
 
     identity: dict[str, Any]  # what must not change between the parts of a training
-    progress: TrainingProgress = field(default_factory=TrainingProgress)  # see TrainingProgress
+    progress: TrainingProgress = field(default_factory=TrainingProgress)
     model: dict[str, Any] = field(default_factory=dict)  # trainable parameters by name
     optimizer: dict[str, Any] = field(default_factory=dict)  # the optimiser's state
     ema: dict[str, Any] = field(default_factory=dict)  # the averages' state
@@ -365,7 +346,10 @@ def load_state(
     try:
         with archive(path):
             pass  # its members claim what they may
-        _check_sums(path)
+        with zipfile.ZipFile(path) as members:
+            # Torch's reader leaves the CRC-32 of the members out.
+            if (damaged := members.testzip()) is not None:
+                raise ValueError(f"{damaged} is damaged")
         content = torch.load(path, map_location="cpu", weights_only=True, mmap=mapped)
         state = StageState(**{**content, "progress": TrainingProgress(**content["progress"])})
     except Exception as error:
@@ -382,16 +366,8 @@ def load_state(
     return state
 
 
-def _check_sums(path: Path) -> None:
-    """Compare each member with its CRC-32, which torch's reader leaves out."""
-    with zipfile.ZipFile(path) as archive:
-        damaged = archive.testzip()
-    if damaged is not None:
-        raise ValueError(f"{damaged} is damaged")
-
-
 def saved_identity(folder: Path) -> dict[str, Any]:
-    """Of the saved state; empty where there is none that can be read, which is said later."""
+    """Of the saved state; empty where there is none that can be read, which ``load_state`` says."""
     try:
         with archive(folder / FILE):
             content = torch.load(folder / FILE, map_location="cpu", weights_only=True, mmap=True)
@@ -405,8 +381,8 @@ def _difference(before: Any, now: Any, where: str = "") -> tuple[str, Any, Any] 
     if isinstance(before, dict) and isinstance(now, dict):
         for name in now:
             inside = f"{where}.{name}" if where else str(name)
-            found = _difference(before.get(name), now[name], inside)
-            if found is not None:
-                return found
+            difference = _difference(before.get(name), now[name], inside)
+            if difference is not None:
+                return difference
         return None
     return None if before == now else (where, before, now)

@@ -15,7 +15,6 @@ from torch import Tensor
 
 from gvtools.completers.geoverse.composition import compose
 from gvtools.completers.geoverse.conditioning import encode_views, fill_holes
-from gvtools.completers.geoverse.config import FlowConfig, GeoVerseConfig
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.completers.geoverse.refiner import Refiner
 from gvtools.completers.geoverse.video_prior import VideoPrior
@@ -34,8 +33,8 @@ from gvtools.procedural.textures import photograph_names
 from gvtools.runs.digests import folder_digest
 from gvtools.training.data import NOTE_PREFIXES, TrainingSamples, sampling_report
 from gvtools.training.distributed import Processes, Replicated, models_of
-from gvtools.training.loop import FILE, Record, Reporting, Trainer, saved_identity
-from gvtools.training.options import ReflowStageOptions, TrainingSettings
+from gvtools.training.loop import FILE, Trainer, saved_identity
+from gvtools.training.options import TrainingSettings
 from gvtools.training.records import STAGES, TrainingLog, read_log
 from gvtools.training.samples import TrainingBatch
 from gvtools.training.small_model_stages import (
@@ -97,21 +96,21 @@ class StageRun:
         sheet_every: int = 0,
         say: Callable[[str], None] = print,
     ) -> dict[str, float]:
-        """Train, and write ``OUT/STAGE/weights`` from the averaged weights when all is done.
-
-        Returns:
-            The last record.
-        """
+        """Train, and write ``OUT/STAGE/weights`` when all is done; gives the last record."""
         if (self.folder / FILE).exists() and not resume:
             raise CheckpointError(
                 f"{self.folder}: a training is there already; continue it with --resume, or "
                 "choose another --out"
             )
-        self._settle_precision(resume, say)
-        model = self._start(say)
+
+        def report(text: str) -> None:
+            say(f"{self.stage}: {text}")
+
+        self._settle_precision(resume, report)
+        model = self._start(report)
         distributed = self._distributed(STAGE_OF[self.stage](model, self.options), model.video)
         if distributed.about:
-            say(f"{self.stage}: {distributed.about}")
+            report(distributed.about)
         samples = TrainingSamples(self.config, self.model_config)
         identity = self._identity()
         if samples.sources is not None:
@@ -128,28 +127,29 @@ class StageRun:
             if trainer.finished and (self.folder / WEIGHTS / WHOLE_FILE).is_file():
                 # Keep them: rewritten weights could differ by rounding, and a later stage that
                 # started from these would refuse to resume.
-                say(f"{self.stage}: finished before, weights in {self.folder / WEIGHTS}")
-                return _last_record(self.folder)
-            say(f"{self.stage}: goes on after step {trainer.progress.step}")
+                report(f"finished before, weights in {self.folder / WEIGHTS}")
+                return read_log(self.folder)[-1]
+            report(f"goes on after step {trainer.progress.step}")
         if self.processes.first:
             self.folder.mkdir(parents=True, exist_ok=True)
             text = json.dumps(self.config.to_dict(), indent=2) + "\n"
             write_text(self.folder / SETTINGS, text)
         trainer.check_parts(samples.group)
-        reporting = Reporting(
+        trainer.train(
+            until=until,
             record=self._recorder(trainer.progress.step, say),
             sheet_every=sheet_every,
             sheet=self._sheet_writer(model, distributed, samples) if sheet_every else None,
         )
-        trainer.train(reporting, until=until)
         for line in sampling_report(trainer.progress.drawn):
-            say(f"{self.stage}: {line}")
+            report(line)
         if trainer.finished:
             self._write_weights(model, trainer, samples)
-            say(f"{self.stage}: weights in {self.folder / WEIGHTS}")
-        return _last_record(self.folder)
+            report(f"weights in {self.folder / WEIGHTS}")
+        records = read_log(self.folder)
+        return records[-1] if records else {}
 
-    def _settle_precision(self, resume: bool, say: Callable[[str], None]) -> None:
+    def _settle_precision(self, resume: bool, report: Callable[[str], None]) -> None:
         """Put what ``auto`` means here into the options; a continued stage stays with its own."""
         optimizer = self.options.optimizer
         if optimizer.precision != "auto":
@@ -157,14 +157,16 @@ class StageRun:
         before = saved_identity(self.folder) if resume else {}
         name = before.get("options", {}).get("optimizer", {}).get("precision", "auto")
         if name == "auto":
-            found = training_type("auto", self.processes.device)
+            measured = training_type("auto", self.processes.device)
             # Times differ between processes; the first one's count.
-            rounded = self.processes.any(self.processes.first and found == torch.bfloat16)
+            rounded = self.processes.any(self.processes.first and measured == torch.bfloat16)
             name = name_of(torch.bfloat16 if rounded else torch.float32)
         self.options = self.options.replaced(optimizer=optimizer.replaced(precision=name))
-        say(f"{self.stage}: products in {name}")
+        report(f"products in {name}")
 
-    def _recorder(self, step: int, say: Callable[[str], None]) -> Record | None:
+    def _recorder(
+        self, step: int, say: Callable[[str], None]
+    ) -> Callable[[int, dict[str, float]], None] | None:
         """Writes and says a record; None in all processes but the first."""
         if not self.processes.first:
             return None
@@ -202,7 +204,7 @@ class StageRun:
 
         return sheet
 
-    def _start(self, say: Callable[[str], None]) -> GeoVerse:
+    def _start(self, report: Callable[[str], None]) -> GeoVerse:
         """Build the model from ``init``, else the last earlier stage with weights, else at random.
 
         Sets ``_source`` (the weights' folder, None for random weights); for stages "heads" and
@@ -212,9 +214,7 @@ class StageRun:
         before = STAGES[: STAGES.index(self.stage)]
         source = self.init
         if source is None:
-            self._refuse_unfinished(before)
-            weights = [self.out / name / WEIGHTS for name in reversed(before)]
-            source = next((folder for folder in weights if folder.exists()), None)
+            source = self._weights_before(before)
         if source is None and before:
             raise CheckpointError(
                 f"stage {self.stage} needs weights to start from; run --stage {before[-1]} first, "
@@ -223,17 +223,20 @@ class StageRun:
         if source is None:
             torch.manual_seed(self.config.seed)
             return GeoVerse(self.model_config)
-        say(f"{self.stage}: starts from {source}")
+        report(f"starts from {source}")
         self._source = source
         if self.stage in AFTER_DENOISER:
-            found = config_of(source)
-            if not found.trained:
+            made_for = config_of(source)
+            if not made_for.trained:
                 raise CheckpointError(
                     f"{source}: its denoisers are untrained, and stage {self.stage} learns "
                     "from what they make; run --stage denoiser to its end first"
                 )
             if self.stage in ("heads", "refiner"):
-                self.model_config = _with_sampling_of(self.model_config, found.flow)
+                # The interval bounds and cfg_scale that the weights were made for.
+                own, flow = self.model_config.flow, made_for.flow
+                flow = replace(own, level1=flow.level1, cfg_scale=flow.cfg_scale)
+                self.model_config = replace(self.model_config, flow=flow)
         model = self._model_of(source)
         if model.without_video:
             raise CheckpointError(
@@ -255,17 +258,18 @@ class StageRun:
         model.config = self.model_config
         return model
 
-    def _refuse_unfinished(self, before: Sequence[str]) -> None:
-        """A stage that was begun and not finished must not be passed over for one before it."""
+    def _weights_before(self, before: Sequence[str]) -> Path | None:
+        """The weights of the last earlier stage; one that was begun and not finished is refused."""
         for name in reversed(before):
             folder = self.out / name
             if (folder / WEIGHTS).exists():
-                return
+                return folder / WEIGHTS
             if (folder / FILE).exists():
                 raise CheckpointError(
                     f"{folder}: stage {name} was begun and is not finished; run --stage {name} "
                     f"--resume to its end, remove that folder, or name weights with --init DIR"
                 )
+        return None
 
     def _distributed(self, module: Stage, video: VideoPrior | None) -> Replicated:
         """Wrap the stage for data-parallel or sharded training."""
@@ -321,45 +325,23 @@ class StageRun:
                 # ``trained`` says whether these weights can complete views; an encoder's cannot.
                 config = self.model_config
                 if self.stage == "reflow":
-                    config = _student_config(config, self.options)
+                    # One Euler step for each distilled interval; a teacher's guidance is learnt.
+                    flow = replace(config.flow, level1=self.options.bounds or config.flow.level1)
+                    if self.options.cfg_scale != 1:
+                        flow = replace(flow, cfg_scale=1.0)
+                    config = replace(config, flow=flow)
                 whole.config = replace(config, trained=self.stage in GENERATIVE)
                 save_pretrained(whole, self.folder / WEIGHTS)
-                self._link_video()
+                if config.video is not None and self._source is not None:
+                    # It is not trained, so it is not copied.
+                    link = self.folder / WEIGHTS / VIDEO_FOLDER
+                    if link.is_symlink():
+                        link.unlink()
+                    if not link.exists():
+                        target = (self._source / VIDEO_FOLDER).resolve()
+                        link.symlink_to(target, target_is_directory=True)
         # No process may read the weights before the first one has written them.
         self.processes.wait()
-
-    def _link_video(self) -> None:
-        """Link to the start weights' video prior; it is not trained, so it is not copied."""
-        link = self.folder / WEIGHTS / VIDEO_FOLDER
-        if self.model_config.video is None or self._source is None:
-            return
-        if link.is_symlink():
-            link.unlink()
-        if not link.exists():
-            link.symlink_to((self._source / VIDEO_FOLDER).resolve(), target_is_directory=True)
-
-
-def _with_sampling_of(config: GeoVerseConfig, flow: FlowConfig) -> GeoVerseConfig:
-    """``config`` with the level-1 interval bounds and cfg_scale that the weights were made for."""
-    sampling = replace(config.flow, level1=flow.level1, cfg_scale=flow.cfg_scale)
-    return replace(config, flow=sampling)
-
-
-def _student_config(config: GeoVerseConfig, options: ReflowStageOptions) -> GeoVerseConfig:
-    """``config`` with the distilled interval bounds, one Euler step each.
-
-    cfg_scale becomes 1 if the teacher was sampled with another one: the student has learnt it.
-    """
-    flow = replace(config.flow, level1=options.bounds or config.flow.level1)
-    if options.cfg_scale != 1:
-        flow = replace(flow, cfg_scale=1.0)
-    return replace(config, flow=flow)
-
-
-def _last_record(folder: Path) -> dict[str, float]:
-    """The stage's last record."""
-    records = read_log(folder)
-    return records[-1] if records else {}
 
 
 GAP = 4
@@ -367,57 +349,39 @@ GAP = 4
 
 @torch.no_grad()
 def completion_sheet(model: GeoVerse, batch: TrainingBatch, *, seed: int = 0) -> NDArray[np.uint8]:
-    """A row for each sample: its views as the model gets them, what it makes of them, the truth.
+    """(H, W, 3) picture of six bands a sample: hints, completions, truth; then of their depth.
 
-    Three bands a sample: given pictures and projections, completions (context pictures stay), true
-    pictures; then the same for depth, each sample in its own range.
-
-    Returns:
-        (H, W, 3).
+    Context pictures stay; the depth of each sample is shown in its own range.
     """
     training = model.training
     model.eval()
-    made = model.generate(batch.views, seed=seed)
+    generated = model.generate(batch.views, seed=seed)
     model.train(training)
     context = batch.views.context
-    shown = fill_holes(batch.views, model.config.hints)
-    rgb, found = compose(shown, made.decoded, made.hint)
+    hints = fill_holes(batch.views, model.config.hints)
+    rgb, lengths = compose(hints, generated.decoded, generated.hint)
     pictures = batch.images.clone()
     pictures[:, context:] = rgb.clamp(0, 1)
-    depth = made.decoded.geometry.depth[:, :, None].float()
-    depth[:, context:] = found[:, :, None]
-    rows = []
-    for index in range(len(batch)):
-        rows += [
-            _band(shown.images[index]),
-            _band(pictures[index]),
-            _band(batch.images[index]),
-            _depth_band(shown.depth[index]),
-            _depth_band(depth[index]),
-            _depth_band(batch.depth[index]),
-        ]
-    return np.concatenate(rows)
+    depth = generated.decoded.geometry.depth[:, :, None].float()
+    depth[:, context:] = lengths[:, :, None]
+    return _bands((hints.images, pictures, batch.images), (hints.depth, depth, batch.depth))
 
 
 @torch.no_grad()
 def encoder_sheet(model: GeoVerse, batch: TrainingBatch) -> NDArray[np.uint8]:
-    """Four bands a sample: pictures decoded from their own features, true ones, depth likewise.
-
-    Returns:
-        (H, W, 3).
-    """
+    """(H, W, 3) four bands a sample: pictures decoded from their own features, true ones, depth."""
     levels = encode_views(model.geometry, batch.true_views, slice(None), config=model.config.hints)
-    geometry, rgb = decode_heads(model, head_features(model, levels, batch), batch)
-    depth = geometry.depth[:, :, None]
-    rows = []
-    for index in range(len(batch)):
-        rows += [
-            _band(rgb[index].clamp(0, 1)),
-            _band(batch.images[index]),
-            _depth_band(depth[index]),
-            _depth_band(batch.depth[index]),
-        ]
-    return np.concatenate(rows)
+    geometry, rgb = decode_heads(model, head_features(model, levels, batch)[0], batch)
+    return _bands((rgb.clamp(0, 1), batch.images), (geometry.depth[:, :, None], batch.depth))
+
+
+def _bands(pictures: Sequence[Tensor], depths: Sequence[Tensor]) -> NDArray[np.uint8]:
+    """The bands of each sample under each other, of (B, V, 3, H, W) and (B, V, 1, H, W)."""
+    bands: list[NDArray[np.uint8]] = []
+    for index in range(len(pictures[0])):
+        bands += [_band(values[index]) for values in pictures]
+        bands += [_depth_band(values[index]) for values in depths]
+    return np.concatenate(bands)
 
 
 def write_png(path: Path, image: NDArray[np.uint8]) -> None:
@@ -432,7 +396,7 @@ def write_png(path: Path, image: NDArray[np.uint8]) -> None:
 def _band(pictures: Tensor) -> NDArray[np.uint8]:
     """(V, 3, H, W) in [0, 1] side by side."""
     tiles = (pictures.cpu().permute(0, 2, 3, 1).numpy() * 255).round().clip(0, 255)
-    return _joined(tiles.astype(np.uint8))
+    return _side_by_side(tiles.astype(np.uint8))
 
 
 def _depth_band(depth: Tensor) -> NDArray[np.uint8]:
@@ -442,10 +406,10 @@ def _depth_band(depth: Tensor) -> NDArray[np.uint8]:
     inverse = np.where(known, 1 / np.where(known, values, 1), 0)
     top = np.percentile(inverse[known], 98) if known.any() else 1.0
     grey = np.clip(inverse / max(top, 1e-12), 0, 1) * 255
-    return _joined(np.repeat(grey[..., None], 3, axis=-1).astype(np.uint8))
+    return _side_by_side(np.repeat(grey[..., None], 3, axis=-1).astype(np.uint8))
 
 
-def _joined(tiles: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def _side_by_side(tiles: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """(V, H, W, 3) to (H + gap, V (W + gap), 3)."""
     padded = np.pad(tiles, ((0, 0), (0, GAP), (0, GAP), (0, 0)), constant_values=255)
     return np.concatenate(list(padded), axis=1)

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from torch import Tensor, nn
@@ -43,7 +43,7 @@ CONFIDENCE_REWARD = 0.2
 
 
 class EncoderStage(Stage):
-    """Loss of stage 0; see the module."""
+    """A geometric encoder from scratch, with its geometry, ray, pose and RGB heads."""
 
     name = "encoder"
 
@@ -56,17 +56,18 @@ class EncoderStage(Stage):
     def forward(self, batch: TrainingBatch, draws: Draws) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss, and its terms for the log."""
         model, options = self.model, self.options
-        features = noisy_features(model, batch, draws, options=options)
-        geometry, rgb = decode_heads(model, features, batch)
+        levels, token = noisy_features(model, batch, draws, options=options)
+        geometry, rgb = decode_heads(model, levels, batch)
         unit = scene_unit(batch)
         depth = batch.depth[:, :, 0] / unit[:, None, None, None]
+        direction, origin = _ray_errors(geometry, batch)
         terms = {
             "depth": _depth_error(geometry, depth),
             "gradient": _gradient_error(geometry.depth, depth),
-            "ray": ray_error(geometry.ray, geometry.ray_confidence, batch),
+            "ray": _with_confidence((direction + origin) / 2, geometry.ray_confidence),
             "rgb": (rgb - batch.images).abs().mean(),
             "hf": high_gradient_loss(rgb, batch.images).mean(),
-            "pose": self._pose_error(features.token, batch, unit),
+            "pose": self._pose_error(token, batch, unit),
         }
         total = sum(getattr(options, name) * value for name, value in terms.items())
         with torch.no_grad():
@@ -83,23 +84,21 @@ class EncoderStage(Stage):
         return (self.model.geometry.cam_dec(token.float()) - truth).abs().mean()
 
 
-@dataclass(frozen=True)
-class HeadFeatures:
-    """What the heads get."""
-
-    levels: list[Tensor]  # four (B, V, N, C), normed, without token 0
-    token: Tensor  # (B, V, C) token 0 of the last one
-
-
 def noisy_features(
     model: GeoVerse,
     batch: TrainingBatch,
     draws: Draws,
     *,
     options: EncoderStageOptions | HeadsStageOptions,
-) -> HeadFeatures:
-    """Features of all views; noise on levels 0 and 1, level 0 of some samples at its mean."""
-    views = _shown(model, batch, draws, share=options.hints)
+) -> tuple[list[Tensor], Tensor]:
+    """``head_features`` of all views; noise on levels 0 and 1, level 0 of some at its mean."""
+    # True pictures; a share of the targets shows its projection, filled as inference fills it.
+    views = batch.true_views
+    hints = fill_holes(batch.views, model.config.hints).images
+    swap = draws.uniform("hints", views.images.shape[1]).to(hints.device) < options.hints
+    swap[:, : views.context] = False
+    images = torch.where(swap[:, :, None, None, None], hints, views.images)
+    views = replace(views, images=images)
     levels = encode_views(model.geometry, views, slice(None), config=model.config.hints)
     amount = options.noise * draws.uniform("noise", 1, 1, 1).to(views.images.device)
     noisy = []
@@ -113,31 +112,26 @@ def noisy_features(
     return head_features(model, noisy, batch)
 
 
-def head_features(model: GeoVerse, levels: Sequence[Tensor], batch: TrainingBatch) -> HeadFeatures:
-    """What the heads get of levels 0 and 1, the deeper levels made of level 1."""
+def head_features(
+    model: GeoVerse, levels: Sequence[Tensor], batch: TrainingBatch
+) -> tuple[list[Tensor], Tensor]:
+    """What the heads get of levels 0 and 1, the deeper levels made of level 1.
+
+    Four (B, V, N, C), normed, without token 0; and (B, V, C) token 0 of the last one.
+    """
     encoder = model.geometry.encoder
     pyramid = [*levels, *encoder.propagate(levels[1], encoder.grid(*batch.views.size))]
     normed = [encoder.normed(level[:, :, 1:].float()) for level in pyramid]
-    return HeadFeatures(normed, pyramid[-1][:, :, 0])
+    return normed, pyramid[-1][:, :, 0]
 
 
 def decode_heads(
-    model: GeoVerse, features: HeadFeatures, batch: TrainingBatch
+    model: GeoVerse, levels: list[Tensor], batch: TrainingBatch
 ) -> tuple[ViewGeometry, Tensor]:
     """The geometry and the colour (B, V, 3, H, W) that the heads make of features."""
     grid = model.geometry.encoder.grid(*batch.views.size)
-    rgb = model.rgb_head(torch.cat(features.levels, dim=-1).flatten(0, 1), grid)
-    return model.geometry.head(features.levels, grid), rgb.unflatten(0, batch.images.shape[:2])
-
-
-def _shown(model: GeoVerse, batch: TrainingBatch, draws: Draws, *, share: float) -> ViewBatch:
-    """True pictures; a share of the targets shows its projection, filled as inference fills it."""
-    views = batch.true_views
-    hints = fill_holes(batch.views, model.config.hints).images
-    swap = draws.uniform("hints", views.images.shape[1]).to(hints.device) < share
-    swap[:, : views.context] = False
-    images = torch.where(swap[:, :, None, None, None], hints, views.images)
-    return replace(views, images=images)
+    rgb = model.rgb_head(torch.cat(levels, dim=-1).flatten(0, 1), grid)
+    return model.geometry.head(levels, grid), rgb.unflatten(0, batch.images.shape[:2])
 
 
 def scene_unit(batch: TrainingBatch) -> Tensor:
@@ -147,44 +141,34 @@ def scene_unit(batch: TrainingBatch) -> Tensor:
     return (depth * known).sum(dim=(1, 2, 3, 4)) / known.sum(dim=(1, 2, 3, 4)).clamp_min(1)
 
 
-def true_rays(batch: TrainingBatch, unit: Tensor, grid: tuple[int, int]) -> Tensor:
-    """(B, V, h, w, 6) directions (z = 1 in the camera) and origins, frame of the first view.
+def _ray_errors(geometry: ViewGeometry, batch: TrainingBatch) -> tuple[Tensor, Tensor]:
+    """(B, V, h, w) L1 of the rays' directions (z = 1 in the camera), and of their origins.
 
-    A ray belongs to the middle of its cell of the ray grid.
+    In the frame of the first view; a ray belongs to the middle of its cell of the ray grid.
     """
+    grid = (geometry.ray.shape[-3], geometry.ray.shape[-2])
     rays = patch_rays(batch.relative.float(), batch.views.K, grid, size=batch.views.size)[..., :6]
     direction, origin = rays.unflatten(2, grid).split(3, dim=-1)
-    return torch.cat((direction, origin / unit[:, None, None, None, None]), dim=-1)
-
-
-def ray_error(
-    ray: Tensor, confidence: Tensor, batch: TrainingBatch, *, origin: float = 1.0
-) -> Tensor:
-    """L1 of directions and origins, and the confidence's loss.
-
-    ``ray``: (B, V, h, w, 6). ``confidence``: (B, V, h, w).
-    """
-    error = (ray - true_rays(batch, scene_unit(batch), (ray.shape[-3], ray.shape[-2]))).abs()
-    direction, place = error.split(3, dim=-1)
-    return _weighted((direction.mean(-1) + origin * place.mean(-1)) / 2, confidence)
+    unit = scene_unit(batch)[:, None, None, None, None]
+    return (
+        (geometry.ray[..., :3] - direction).abs().mean(-1),
+        (geometry.ray[..., 3:] - origin / unit).abs().mean(-1),
+    )
 
 
 def _depth_error(geometry: ViewGeometry, depth: Tensor) -> Tensor:
     """L1 of the logarithm where depth is known, and the confidence's loss."""
     known = depth > 0
     error = (geometry.depth.log() - torch.where(known, depth, 1.0).log()).abs()
-    return _weighted(error, geometry.depth_confidence, known)
+    return _with_confidence(error, geometry.depth_confidence, known)
 
 
-def _weighted(error: Tensor, confidence: Tensor, known: Tensor | None = None) -> Tensor:
+def _with_confidence(error: Tensor, confidence: Tensor, known: Tensor | None = None) -> Tensor:
     """Error and its confidence's loss, mean over samples of each one's mean over known values."""
     # The confidence learns from the error, and does not weigh it: small errors, whose confidence is
     # high, would otherwise rule the gradient.
-    learned = confidence * error.detach() - CONFIDENCE_REWARD * confidence.log()
-    value = error + learned
-    if known is None:
-        return value.mean()
-    return masked_mean(value, known)
+    value = error + confidence * error.detach() - CONFIDENCE_REWARD * confidence.log()
+    return value.mean() if known is None else masked_mean(value, known)
 
 
 def masked_mean(value: Tensor, known: Tensor) -> Tensor:
@@ -229,7 +213,7 @@ def measure_statistics(model: GeoVerse, batches: list[TrainingBatch]) -> None:
 
 
 class HeadsStage(Stage):
-    """Loss of the heads; see the module."""
+    """The heads, on what the frozen denoisers make."""
 
     name = "heads"
 
@@ -244,36 +228,31 @@ class HeadsStage(Stage):
 
     def forward(self, batch: TrainingBatch, draws: Draws) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss, and its terms for the log."""
-        options = self.options
+        model, options = self.model, self.options
         total = batch.images.new_zeros(())
         terms: dict[str, Tensor] = {}
         if options.ray:
-            loss, terms = self._rays(batch, draws)
-            total = total + options.ray * loss
+            with torch.no_grad():
+                levels, _ = noisy_features(model, batch, draws, options=options)
+            geometry = model.geometry.head(levels, model.geometry.encoder.grid(*batch.views.size))
+            direction, origin = _ray_errors(geometry, batch)
+            terms = {"direction": direction.mean(), "origin": origin.mean()}
+            error = (direction + options.origin * origin) / 2
+            total = total + options.ray * _with_confidence(error, geometry.ray_confidence)
         if options.rgb or options.depth:
-            found = self._completions(batch, draws)
-            color = found["rgb"] + options.hf * found["hf"] + options.decoded * found["rgb_decoded"]
-            length = found["depth"] + options.decoded * found["depth_decoded"]
+            errors = self._completion_errors(batch, draws)
+            color = errors["rgb"] + options.hf * errors["hf"]
+            color = color + options.decoded * errors["rgb_decoded"]
+            length = errors["depth"] + options.decoded * errors["depth_decoded"]
             total = total + options.rgb * color + options.depth * length
-            terms |= found
+            terms |= errors
         return total, terms
 
-    def _rays(self, batch: TrainingBatch, draws: Draws) -> tuple[Tensor, dict[str, Tensor]]:
-        model, options = self.model, self.options
-        with torch.no_grad():
-            levels = noisy_features(model, batch, draws, options=options).levels
-        found = model.geometry.head(levels, model.geometry.encoder.grid(*batch.views.size))
-        with torch.no_grad():
-            cells = (found.ray.shape[-3], found.ray.shape[-2])
-            error = (found.ray - true_rays(batch, scene_unit(batch), cells)).abs()
-        loss = ray_error(found.ray, found.ray_confidence, batch, origin=options.origin)
-        return loss, {"direction": error[..., :3].mean(), "origin": error[..., 3:].mean()}
-
-    def _completions(self, batch: TrainingBatch, draws: Draws) -> dict[str, Tensor]:
+    def _completion_errors(self, batch: TrainingBatch, draws: Draws) -> dict[str, Tensor]:
         """Errors of the targets as inference makes them; gradients reach the heads alone."""
         model, context = self.model, batch.views.context
         with torch.no_grad():
-            prepared = model.prepare(batch.views, seed=draws.seeds("video", batch.images.shape[1]))
+            prepared = self.prepare(batch, draws, model)
             like = prepared.hints.level1
             level1 = model.sample1(
                 prepared,
@@ -325,7 +304,7 @@ CUT = 0.6
 
 
 class RefinerStage(Stage):
-    """Loss of the refiner; see the module."""
+    """The refiner, on completions that the frozen core makes once a sample."""
 
     name = "refiner"
 

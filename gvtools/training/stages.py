@@ -30,12 +30,7 @@ from gvtools.completers.geoverse.flow import (
     velocity_target,
 )
 from gvtools.completers.geoverse.model import GeoVerse, Prepared
-from gvtools.completers.geoverse.objective import (
-    PredictedTerms,
-    ReferenceTerms,
-    flow_matching_loss,
-    objective,
-)
+from gvtools.completers.geoverse.objective import flow_matching_loss, objective
 from gvtools.networks.compute import set_recompute
 from gvtools.networks.depth_anything.rays import camera_centres
 from gvtools.training.options import DenoiserStageOptions, ReflowStageOptions
@@ -144,8 +139,8 @@ class DenoiserStage(Stage):
                 holes = ~batch.views.valid[:, context:, 0]
                 truth |= {"image_valid": holes, "depth_valid": holes}
         result = objective(
-            PredictedTerms(**predicted),
-            ReferenceTerms(**truth),
+            predicted,
+            truth,
             context=batch.views.context,
             weights=options.weights,
             context_weight=options.context_weight,

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import json
 import math
-import os
-import pickle
-import subprocess
-import sys
 from collections import Counter
 from pathlib import Path
 
 import pytest
 import torch
 from tiny_scan import write_scan
+from training_runs import on_two, sets
 
 from gvtools.completers.geoverse.config import named
 from gvtools.errors import OptionError, ProjectError
@@ -115,13 +112,12 @@ def home(tmp_path_factory) -> Path:
 
 
 def settings(*entries: object, share: float = 0.5) -> list[str]:
-    return [f"data.scenes={json.dumps(entries)}", f"data.scene_share={share}"]
+    scenes = [f"data.scenes={json.dumps(entries)}", f"data.scene_share={share}"]
+    return [*scenes, "data.scene_overlap=0.1"]
 
 
 def samples(*entries: object, share: float = 0.5, more: tuple[str, ...] = ()) -> TrainingSamples:
-    config, folder = shipped_or_read("micro")
-    config = with_texts(config, [*settings(*entries, share=share), "data.scene_overlap=0.1", *more])
-    return TrainingSamples(config, config.network(folder))
+    return micro_samples(*settings(*entries, share=share), *more)
 
 
 def equal(a: TrainingBatch, b: TrainingBatch) -> bool:
@@ -186,19 +182,21 @@ def test_a_damaged_file_costs_its_windows_alone_and_is_counted(home, tmp_path):
     assert again.batch(range(24, 32)).notes == again.batch(range(24, 32)).notes == batch.notes
 
 
-def test_sources_that_cannot_be_are_one_line_before_training(home, tmp_path):
-    with pytest.raises(OptionError, match=r"spec:7-Scenes: no root; give the folder"):
-        samples("spec:7-Scenes")
-    with pytest.raises(OptionError, match="expected one for spec:NAME alone"):
-        samples({"project": str(home / "kitchen"), "root": str(home)})
-    with pytest.raises(ProjectError, match="no such folder"):
-        samples(str(tmp_path / "absent"))
-    with pytest.raises(OptionError, match="expected both or none"):
-        samples(str(home / "kitchen"), share=0)
-    with pytest.raises(OptionError, match=r"data\.scenes.*weight"):
-        samples({"project": str(home / "kitchen"), "weight": -1})
-    with pytest.raises(OptionError, match=r"data\.scenes: every weight is 0"):
-        samples({"project": str(home / "kitchen"), "weight": 0})
+@pytest.mark.parametrize(
+    ("entry", "share", "said"),
+    [
+        ("spec:7-Scenes", 0.5, r"spec:7-Scenes: no root; give the folder"),
+        ({"project": "kitchen", "root": "."}, 0.5, "expected one for spec:NAME alone"),
+        ("absent", 0.5, "no such folder"),
+        ("kitchen", 0, "expected both or none"),
+        ({"project": "kitchen", "weight": -1}, 0.5, r"data\.scenes.*weight"),
+        ({"project": "kitchen", "weight": 0}, 0.5, r"data\.scenes: every weight is 0"),
+    ],
+)
+def test_sources_that_cannot_be_are_one_line_before_training(home, monkeypatch, entry, share, said):
+    monkeypatch.chdir(home)
+    with pytest.raises((OptionError, ProjectError), match=said):
+        samples(entry, share=share)
 
 
 def test_the_papers_rule_is_taken_from_the_spec(home, monkeypatch):
@@ -225,26 +223,20 @@ def test_the_papers_rule_is_taken_from_the_spec(home, monkeypatch):
     assert isinstance(samples(twin, share=1.0)._train, Mixture)
 
 
-def test_samples_travel_to_workers_small(home):
-    data = samples(str(home / "shards"))._train
-    before = [data.sample(index) for index in range(6)]
-    text = pickle.dumps(data)
-    assert len(text) < 20_000
-    again = pickle.loads(text)
-    for index, sample in enumerate(before):
-        assert torch.equal(again.sample(index).hint, sample.hint)
-        assert again.sample(index).notes == sample.notes
-
-
 def words(out: Path, home: Path) -> list[str]:
     start = ["train", "micro", "--stage", "encoder", "--out", str(out), "--device", "cpu"]
-    texts = [*settings(str(home / "shards")), "data.scene_overlap=0.1", "encoder.statistics=1"]
+    texts = [*settings(str(home / "shards")), "encoder.statistics=1"]
     texts += ["encoder.optimizer.steps=5", "encoder.optimizer.batch=2"]
-    return [*start, "--sheets", "0", *(word for text in texts for word in ("--set", text))]
+    return [*start, "--sheets", "0", *sets(*texts)]
 
 
 def train(out: Path, home: Path, *more: str) -> int:
     return main([*words(out, home), *more])
+
+
+def counts(stage: Path) -> dict[str, float]:
+    """Of the last record: what happened when samples were drawn."""
+    return {name: count for name, count in read_log(stage)[-1].items() if "/" in name}
 
 
 @pytest.mark.slow
@@ -254,9 +246,8 @@ def test_a_continued_training_sees_the_same_samples_and_counts(home, tmp_path, c
     assert "samples (" in said and "of 7-Scenes" in said and "of rooms" in said
     assert train(tmp_path / "parts", home, "--until", "2") == 0
     assert train(tmp_path / "parts", home, "--resume") == 0
-    one, two = (read_log(tmp_path / name / "encoder")[-1] for name in ("whole", "parts"))
-    counted = {name: count for name, count in one.items() if "/" in name}
-    assert counted == {name: count for name, count in two.items() if "/" in name}
+    counted = counts(tmp_path / "whole" / "encoder")
+    assert counted == counts(tmp_path / "parts" / "encoder")
     assert counted["drawn/rooms"] + counted["drawn/7-Scenes"] == 10
     weights = [
         torch.load(tmp_path / name / "encoder" / "state.pt", weights_only=True)["model"]
@@ -284,20 +275,7 @@ def test_two_processes_count_together(home, tmp_path, capsys):
     """Each its own samples, with the totals of one process."""
     more = ("--set", "data.workers=1", "--quiet")
     assert train(tmp_path / "one", home, *more) == 0
-    command = [
-        *(sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"),
-        *("-m", "pipelines.cli", *words(tmp_path / "two", home), *more),
-    ]
-    done = subprocess.run(
-        command,
-        cwd=Path(__file__).resolve().parents[2],
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-    assert done.returncode == 0, done.stderr[-2000:]
-    one, two = (read_log(tmp_path / name / "encoder")[-1] for name in ("one", "two"))
-    counted = {name: count for name, count in one.items() if "/" in name}
-    assert counted and counted == {name: count for name, count in two.items() if "/" in name}
-    assert two["loss"] == pytest.approx(one["loss"], rel=1e-4)
+    on_two(*words(tmp_path / "two", home), *more)
+    one, two = (tmp_path / name / "encoder" for name in ("one", "two"))
+    assert counts(one) and counts(one) == counts(two)
+    assert read_log(two)[-1]["loss"] == pytest.approx(read_log(one)[-1]["loss"], rel=1e-4)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from training_runs import ROOT, child
 
 from gvtools.errors import DegenerateError
 from gvtools.training.loader import batches
@@ -47,29 +48,39 @@ class Refusing:
         return {}
 
 
-_ORPHANS = """
-import os, time
-from gvtools.training.views import ContextChoice
-from gvtools.training.views import ProceduralViews
+# A process with a worker, as it goes on.
+_PARENT = """
+import multiprocessing, os, signal, time
+from gvtools.errors import ProjectError
 from gvtools.training.loader import batches
+from gvtools.training.views import ContextChoice, ProceduralViews
 
 if __name__ == "__main__":
     data = ProceduralViews(views=3, size=(24, 24), context=ContextChoice(most=2, group=4))
-    made = batches(data, [range(2), range(2, 4)], workers=1)
+    made = batches(data, (range(2 * i, 2 * i + 2) for i in range(10_000)), workers=1)
     next(made)
-    import multiprocessing
-    print(*(child.pid for child in multiprocessing.active_children()), flush=True)
+    workers = [child.pid for child in multiprocessing.active_children()]
+"""
+_WAITING = """
+    print(*workers, flush=True)
     time.sleep(600)
+"""
+_KILLING = """
+    os.kill(workers[0], signal.SIGKILL)
+    try:
+        for batch in made:
+            pass
+    except ProjectError as error:
+        print(error)
 """
 
 
 @pytest.mark.slow
 def test_workers_end_with_a_process_that_is_killed(tmp_path):
-    (tmp_path / "parent.py").write_text(_ORPHANS)
-    root = Path(__file__).resolve().parents[2]
+    (tmp_path / "parent.py").write_text(_PARENT + _WAITING)
     parent = subprocess.Popen(
         [sys.executable, str(tmp_path / "parent.py")],
-        env={**os.environ, "PYTHONPATH": str(root), "OMP_NUM_THREADS": "1"},
+        env={**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
         stdout=subprocess.PIPE,
         text=True,
     )
@@ -85,36 +96,10 @@ def test_workers_end_with_a_process_that_is_killed(tmp_path):
     assert not any(_runs(worker) for worker in workers)
 
 
-_DEATH = """
-import multiprocessing, os, signal
-from gvtools.errors import ProjectError
-from gvtools.training.views import ContextChoice
-from gvtools.training.views import ProceduralViews
-from gvtools.training.loader import batches
-
-if __name__ == "__main__":
-    data = ProceduralViews(views=3, size=(24, 24), context=ContextChoice(most=2, group=4))
-    made = batches(data, (range(2 * i, 2 * i + 2) for i in range(10_000)), workers=1)
-    next(made)
-    os.kill(multiprocessing.active_children()[0].pid, signal.SIGKILL)
-    try:
-        for batch in made:
-            pass
-    except ProjectError as error:
-        print(error)
-"""
-
-
 @pytest.mark.slow
 def test_a_worker_that_dies_is_one_line(tmp_path):
-    (tmp_path / "parent.py").write_text(_DEATH)
-    root = Path(__file__).resolve().parents[2]
-    done = subprocess.run(
-        [sys.executable, str(tmp_path / "parent.py")],
-        env={**os.environ, "PYTHONPATH": str(root), "OMP_NUM_THREADS": "1"},
-        capture_output=True, text=True, timeout=300, check=False,
-    )  # fmt: skip
-    (line,) = done.stdout.splitlines()
+    (tmp_path / "parent.py").write_text(_PARENT + _KILLING)
+    (line,) = child(tmp_path / "parent.py").splitlines()
     assert "a process that makes samples has died" in line and "--resume" in line
 
 

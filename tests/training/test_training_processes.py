@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from training_runs import on_two
 
 pytestmark = pytest.mark.slow
 
@@ -40,16 +38,5 @@ def test_no_thread_of_the_group_outlives_it(tmp_path):
     """One that did could abort the process at its end."""
     program = tmp_path / "program.py"
     program.write_text(PROGRAM)
-    done = subprocess.run(
-        [
-            *(sys.executable, "-m", "torch.distributed.run", "--standalone"),
-            *("--nproc-per-node", "2", str(program)),
-        ],
-        cwd=Path(__file__).resolve().parents[2],
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-    assert done.returncode == 0, done.stderr[-2000:]
-    assert done.stdout.count("then 0.") == 2 and "threads 0" not in done.stdout
+    said = on_two(program)
+    assert said.count("then 0.") == 2 and "threads 0" not in said

@@ -8,12 +8,14 @@ import os
 import shutil
 import subprocess
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
+from training_runs import ROOT, on_two, sets
 
 from gvtools.completers.geoverse import from_pretrained
 from gvtools.training.loop import load_state
@@ -31,7 +33,7 @@ SAMPLES: list[str] = []
 @pytest.fixture(scope="module", autouse=True)
 def samples(tmp_path_factory):
     """The same few samples for every training, made once."""
-    SAMPLES[:] = ["--set", "data.pool=24", "--set", f"data.cache={tmp_path_factory.mktemp('pool')}"]
+    SAMPLES[:] = sets("data.pool=24", f"data.cache={tmp_path_factory.mktemp('pool')}")
 
 
 def train(out: Path, stage: str, *more: str) -> int:
@@ -40,11 +42,15 @@ def train(out: Path, stage: str, *more: str) -> int:
 
 
 def steps(stage: str, count: int) -> list[str]:
-    return ["--set", f"{stage}.optimizer.steps={count}"]
+    return sets(f"{stage}.optimizer.steps={count}")
 
 
 def weights_of(folder: Path) -> dict[str, torch.Tensor]:
     return from_pretrained(folder / "weights").state_dict()
+
+
+# Steps of each stage.
+COUNTS = {"encoder": 24, "denoiser": 6, "reflow": 3, "heads": 4, "refiner": 3}
 
 
 @pytest.fixture(scope="module")
@@ -52,11 +58,8 @@ def trained(tmp_path_factory) -> Path:
     """All stages, a few steps each."""
     out = tmp_path_factory.mktemp("training")
     torch.set_num_threads(1)
-    assert train(out, "encoder", *steps("encoder", 24)) == 0
-    assert train(out, "denoiser", *steps("denoiser", 6)) == 0
-    assert train(out, "reflow", *steps("reflow", 3)) == 0
-    assert train(out, "heads", *steps("heads", 4)) == 0
-    assert train(out, "refiner", *steps("refiner", 3)) == 0
+    for stage, count in COUNTS.items():
+        assert train(out, stage, *steps(stage, count)) == 0
     return out
 
 
@@ -67,19 +70,10 @@ def test_the_loss_falls_and_every_stage_leaves_weights_that_load(trained):
     encoder = from_pretrained(trained / "encoder" / "weights")
     assert not encoder.config.trained
     assert float(encoder.level_statistics[1].var.std()) > 0
-    student = from_pretrained(trained / "reflow" / "weights")
-    assert student.config.trained
+    assert from_pretrained(trained / "reflow" / "weights").config.trained
     # The student's stage moves level 1 alone.
-    teacher = weights_of(trained / "denoiser")
-    for name, tensor in student.state_dict().items():
-        same = torch.equal(tensor, teacher[name])
-        if not name.startswith("level1."):
-            assert same, name
-    assert any(
-        not torch.equal(tensor, teacher[name])
-        for name, tensor in student.state_dict().items()
-        if name.startswith("level1.")
-    )
+    names = moved(trained / "denoiser", trained / "reflow")
+    assert names and all(name.startswith("level1.") for name in names)
 
 
 def moved(before: Path, after: Path) -> set[str]:
@@ -161,22 +155,13 @@ def test_a_resumed_training_is_the_uninterrupted_one(trained, tmp_path):
     assert train(again, "encoder", *steps("encoder", 24), "--until", "9") == 0
     assert not (again / "encoder" / "weights").exists()
     assert train(again, "encoder", *steps("encoder", 24), "--resume") == 0
-    whole, parts = weights_of(trained / "encoder"), weights_of(again / "encoder")
-    assert all(torch.equal(whole[name], parts[name]) for name in whole)
-
-
-LATER = {
-    "denoiser": ("encoder", 6),
-    "reflow": ("denoiser", 3),
-    "heads": ("reflow", 4),
-    "refiner": ("heads", 3),
-}
+    assert not moved(trained / "encoder", again / "encoder")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("stage", LATER)
-def test_a_later_stage_resumes_exactly_as_well(trained, tmp_path, stage):
-    before, count = LATER[stage]
+@pytest.mark.parametrize(("before", "stage"), pairwise(COUNTS))
+def test_a_later_stage_resumes_exactly_as_well(trained, tmp_path, before, stage):
+    count = COUNTS[stage]
     shutil.copytree(trained / before, tmp_path / before)
     assert train(tmp_path, stage, *steps(stage, count), "--until", "2") == 0
     assert not (tmp_path / stage / "weights").exists()
@@ -187,13 +172,12 @@ def test_a_later_stage_resumes_exactly_as_well(trained, tmp_path, stage):
 @pytest.mark.slow
 def test_a_killed_training_goes_on_to_the_uninterrupted_one(tmp_path):
     """Killed in the middle of whatever it does after its first state."""
-    root = Path(__file__).resolve().parents[2]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
 
     def started(out: str, *more: str) -> subprocess.Popen[bytes]:
         command = [sys.executable, "-m", "pipelines.cli", "train", "micro", "--stage", "encoder"]
         command += ["--out", str(tmp_path / out), *SHORT, *steps("encoder", 24), *more]
-        return subprocess.Popen(command, cwd=root, env=environment)
+        return subprocess.Popen(command, cwd=ROOT, env=environment)
 
     assert started("whole").wait() == 0
     assert started("killed", "--until", "4").wait() == 0
@@ -209,14 +193,13 @@ def test_a_killed_training_goes_on_to_the_uninterrupted_one(tmp_path):
 def test_finished_stages_are_left_as_they_are(trained, tmp_path, capsys):
     """Else the next stage, whose state names its start by its bytes, might not go on."""
     shutil.copytree(trained, tmp_path / "out")
-    out, counts = tmp_path / "out", {"encoder": 24, "denoiser": 6, "reflow": 3, "heads": 4}
-    counts["refiner"] = 3
+    out = tmp_path / "out"
     files = sorted(path for path in out.rglob("*") if path.is_file())
     before = {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in files}
-    more = [word for stage, count in counts.items() for word in steps(stage, count)]
+    more = [word for stage, count in COUNTS.items() for word in steps(stage, count)]
     loud = [word for word in SHORT if word != "--quiet"]
     assert main(["train", "micro", "--out", str(out), *loud, *SAMPLES, *more, "--resume"]) == 0
-    assert capsys.readouterr().out.count("finished before") == len(counts)
+    assert capsys.readouterr().out.count("finished before") == len(COUNTS)
     assert {p: (p.stat().st_mtime_ns, p.read_bytes()) for p in files} == before
 
 
@@ -325,14 +308,7 @@ def test_two_processes_see_what_one_would(tmp_path):
     arguments = ["train", "micro", "--stage", "encoder", *SHORT, *steps("encoder", 4)]
     arguments += ["--set", "encoder.statistics=1"]
     assert main([*arguments, "--out", str(tmp_path / "one")]) == 0
-    command = [
-        *(sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"),
-        *("-m", "pipelines.cli", *arguments, "--out", str(tmp_path / "two")),
-    ]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    root = Path(__file__).resolve().parents[2]
-    done = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr[-2000:]
+    on_two(*arguments, "--out", tmp_path / "two")
     one, two = (read_log(tmp_path / name / "encoder")[-1] for name in ("one", "two"))
     for name in ("loss", "depth", "rgb", "ray", "pose"):
         assert two[name] == pytest.approx(one[name], rel=1e-4), json.dumps([one, two])

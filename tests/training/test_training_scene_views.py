@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from tiny_scan import render, world_from_cam, write_colmap_scan
 
 from gvtools.cameras import Cameras
 from gvtools.errors import DegenerateError, ProjectError
@@ -118,26 +117,6 @@ def test_scenes_that_cannot_be_used_are_refused() -> None:
         _views(scenes=())
     with pytest.raises(DegenerateError, match="lower the overlap"):
         _views(overlap=0.9999).sample(0)
-
-
-def test_a_colmap_project_with_depth_maps_gives_samples(tmp_path):
-    home = write_colmap_scan(tmp_path / "colmap", views=10)
-    folder = home / "stereo" / "depth_maps"
-    folder.mkdir(parents=True)
-    for index, view in enumerate(open_project(home)):
-        depth = render(world_from_cam(index))[1].astype(np.float32)
-        np.save(folder / f"{view.name}.npy", depth)
-    data = SceneViews(
-        scenes=of_scenes([open_project(home)]), faults=None, views=4, size=(32, 32), overlap=0.0,
-        context=ContextChoice(most=2),
-    )  # fmt: skip
-    sample = data.sample(0)
-    k = sample.context
-    both = sample.valid[k:] & (sample.depth[k:] > 0)
-    assert both.float().mean() > 0.1
-    ratio = sample.hint_depth[k:][both] / sample.depth[k:][both] - 1
-    assert float(ratio.abs().median()) < 0.02
-    assert sample.images.std() > 0.01
 
 
 @pytest.mark.data

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import re
 import shutil
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from training_runs import on_two, sets
 
 from gvtools.completers.geoverse import GeoVerse, from_pretrained
 from gvtools.completers.geoverse.config import GeoVerseConfig, read
@@ -30,30 +28,19 @@ from pipelines.cli import main
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("one_thread")]
 
-REPOSITORY = Path(__file__).resolve().parents[2]
-SHARDED = ("--set", "parallel=sharded")
+SHARDED = sets("parallel=sharded")
 STEPS = 3
 # Two processes' samples lie in different groups, so that their numbers of context views differ.
-LARGE = ("--set", f"denoiser.optimizer.steps={STEPS}", "--set", "denoiser.optimizer.batch=16")
-PARTS = ("--set", "denoiser.optimizer.accumulate=2")
+LARGE = sets(f"denoiser.optimizer.steps={STEPS}", "denoiser.optimizer.batch=16")
+PARTS = sets("denoiser.optimizer.accumulate=2")
 
 
 def arguments(training: str, stage: str, out: Path, *more: str) -> list[str]:
     return ["train", training, "--stage", stage, "--out", str(out), "--device", "cpu", *more]
 
 
-def on_two(training: str, stage: str, out: Path, *more: str) -> str:
-    """Train on two processes; what the first one says."""
-    command = [
-        *(sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"),
-        *("-m", "pipelines.cli", *arguments(training, stage, out, *more)),
-    ]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(
-        command, cwd=REPOSITORY, env=environment, capture_output=True, text=True, timeout=600
-    )
-    assert done.returncode == 0, done.stderr[-3000:]
-    return done.stdout
+def train_on_two(training: str, stage: str, out: Path, *more: str) -> str:
+    return on_two(*arguments(training, stage, out, *more))
 
 
 def same_record(found: Path, wanted: Path) -> None:
@@ -127,7 +114,7 @@ def two(start, tmp_path_factory) -> tuple[Path, str]:
     """What two processes come to, and what they say."""
     out = tmp_path_factory.mktemp("two")
     more = ["--init", str(start), "--sheets", str(STEPS), *LARGE, *PARTS, *SHARDED]
-    return out / "denoiser", on_two("micro", "denoiser", out, *more)
+    return out / "denoiser", train_on_two("micro", "denoiser", out, *more)
 
 
 def test_two_processes_that_share_parameters_out_see_what_one_would(one, two):
@@ -163,12 +150,12 @@ def test_each_of_them_holds_its_half_of_what_is_trained(start, two):
 
 def test_what_they_save_goes_on_exactly_and_in_one_process(start, one, two, tmp_path):
     more = ["--init", str(start), *LARGE, *PARTS]
-    on_two("micro", "denoiser", tmp_path / "a", *more, *SHARDED, "--until", "1")
+    train_on_two("micro", "denoiser", tmp_path / "a", *more, *SHARDED, "--until", "1")
     assert not (tmp_path / "a" / "denoiser" / "weights").exists()
     shutil.copytree(tmp_path / "a", tmp_path / "b")
 
     more += ["--resume", "--sheets", "0"]
-    on_two("micro", "denoiser", tmp_path / "a", *more, *SHARDED)
+    train_on_two("micro", "denoiser", tmp_path / "a", *more, *SHARDED)
     whole, parts = tensors(two[0]), tensors(tmp_path / "a" / "denoiser")
     assert all(torch.equal(whole[name], parts[name]) for name in whole)
     # One process shares nothing out, whatever the setting.
@@ -191,15 +178,15 @@ def test_a_batch_that_is_bad_in_one_process_is_skipped_by_both(start, tmp_path):
     more += ["--set", "denoiser.optimizer.steps=4"]
     more += ["--set", f"denoiser.optimizer.largest_loss={most}"]
     assert main(arguments("micro", "denoiser", tmp_path / "one", *more, *PARTS, "--quiet")) == 0
-    on_two("micro", "denoiser", tmp_path / "two", *more, *SHARDED)
+    train_on_two("micro", "denoiser", tmp_path / "two", *more, *SHARDED)
     assert 0 < read_log(tmp_path / "one" / "denoiser")[-1]["skipped"] < 4
     same_record(tmp_path / "two" / "denoiser", tmp_path / "one" / "denoiser")
 
 
 def test_the_encoders_stage_is_shared_out_as_well(tmp_path):
-    more = ["--set", "encoder.optimizer.steps=2", "--set", "encoder.statistics=1"]
+    more = sets("encoder.optimizer.steps=2", "encoder.statistics=1")
     assert main(arguments("micro", "encoder", tmp_path / "one", *more, "--quiet")) == 0
-    on_two("micro", "encoder", tmp_path / "two", *more, *SHARDED)
+    train_on_two("micro", "encoder", tmp_path / "two", *more, *SHARDED)
     same_record(tmp_path / "two" / "encoder", tmp_path / "one" / "encoder")
     same_weights(tmp_path / "two" / "encoder", tmp_path / "one" / "encoder")
 
@@ -236,7 +223,7 @@ def test_teacher_and_video_prior_are_shared_out_as_well(tmp_path):
     both = [f"{stage}.optimizer.accumulate=2" for stage in stages]
     parts = [*(word for text in both for word in ("--set", text)), "--quiet"]
     assert main(arguments(str(training), "all", tmp_path / "one", *more, *parts)) == 0
-    on_two(str(training), "all", tmp_path / "two", *more, *SHARDED)
+    train_on_two(str(training), "all", tmp_path / "two", *more, *SHARDED)
     for stage in stages:
         same_record(tmp_path / "two" / stage, tmp_path / "one" / stage)
         # A later stage starts from weights that are the same but for rounding (``same_weights``).
@@ -250,6 +237,6 @@ def test_layers_that_are_computed_again_are_put_together_again(start, tmp_path):
     more = ["--init", str(start), "--sheets", "0", "--until", "1"]
     more += ["--set", "denoiser.optimizer.batch=8", "--set", "denoiser.optimizer.accumulate=2"]
     assert main(arguments("micro", "denoiser", tmp_path / "one", *more, "--quiet")) == 0
-    again = ("--set", "denoiser.optimizer.recompute=true")
-    on_two("micro", "denoiser", tmp_path / "two", *more, *SHARDED, *again)
+    again = sets("denoiser.optimizer.recompute=true")
+    train_on_two("micro", "denoiser", tmp_path / "two", *more, *SHARDED, *again)
     same_gradients(tmp_path / "two" / "denoiser", tmp_path / "one" / "denoiser", 1e-4)

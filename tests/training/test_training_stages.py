@@ -106,17 +106,6 @@ def test_views_and_truth_are_changed_alike(step):
         assert torch.allclose(found.mean[0], truth[0, :, row, column])
 
 
-def test_steps_change_views_differently():
-    picture = torch.rand(2, 3, 16, 16, generator=torch.Generator().manual_seed(0))
-    one = torch.ones(2, 1, 16, 16)
-    views = CompletedViews(
-        picture, one, one > 0, one.expand(2, 2, 16, 16), picture, one[:, :, 0, 0].expand(2, 3)
-    )
-    shown = [augment(views, picture, [], draws=draws(step))[1] for step in (1, 1, 2)]
-    assert torch.equal(shown[0], shown[1])
-    assert shown[0].shape != shown[2].shape or not torch.equal(shown[0], shown[2])
-
-
 def test_errors_are_of_holes_alone():
     truth = torch.zeros(2, 3, 4, 4)
     made, holes = truth.clone(), torch.zeros(2, 1, 4, 4, dtype=torch.bool)

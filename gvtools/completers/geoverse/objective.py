@@ -17,7 +17,7 @@ are NaN.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, fields
 from functools import partial
@@ -26,7 +26,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from gvtools.errors import OptionError
 from gvtools.networks.config_json import check_range
 
 DELTA = 1e-6
@@ -94,13 +93,9 @@ ROUNDINGS = 4
 
 @dataclass(frozen=True, eq=False)
 class CenterSimilarity:
-    """reference ≈ scale · rotation · predicted + translation, for each sample."""
+    """The scale of reference ≈ scale · rotation · predicted + translation, for each sample."""
 
     scale: Tensor  # (B,) reference units per predicted unit; NaN where not ``ok``
-    # (B, 3, 3) in SO(3); any of the best ones where the centres leave it open; NaN where not
-    # ``ok``.
-    rotation: Tensor
-    translation: Tensor  # (B, 3), reference units; NaN where not ``ok``
     ok: Tensor  # (B,) bool, whether the scale holds
     defect: Tensor  # (B,) int64, index into ``DEFECTS``
     used: Tensor  # (B,) int64, centres the fit stands on
@@ -124,16 +119,16 @@ def center_similarity(predicted: Tensor, reference: Tensor) -> CenterSimilarity:
     x, y = (z.to("cpu").to(torch.float64) for z in (predicted, reference))
     use = (x.isfinite() & y.isfinite()).all(-1)
     count = use.sum(1)
-    x, x_center, x_flat = _centered(x, use, torch.finfo(predicted.dtype).eps)
-    y, y_center, y_flat = _centered(y, use, torch.finfo(reference.dtype).eps)
+    x, x_flat = _centered(x, use, torch.finfo(predicted.dtype).eps)
+    y, y_flat = _centered(y, use, torch.finfo(reference.dtype).eps)
     x_spread, y_spread = (x**2).sum((1, 2)), (y**2).sum((1, 2))
 
     covariance = y.mT @ x
     u, _, vt = torch.linalg.svd(covariance)
     sign = torch.ones_like(u[..., 0])
     sign[:, 2] = torch.where(torch.linalg.det(u) * torch.linalg.det(vt) < 0, -1.0, 1.0)
-    rotation = (u * sign[:, None, :]) @ vt
-    matched = (rotation * covariance).sum((1, 2))  # d_0 + d_1 ± d_2 >= 0
+    # Of the rotation and the covariance: d_0 + d_1 ± d_2 >= 0.
+    matched = (((u * sign[:, None, :]) @ vt) * covariance).sum((1, 2))
     size = (x_spread * y_spread).sqrt()
     coarsest = max(torch.finfo(z.dtype).eps for z in (predicted, reference))
     unrelated = matched <= ROUNDINGS * coarsest * size
@@ -142,34 +137,22 @@ def center_similarity(predicted: Tensor, reference: Tensor) -> CenterSimilarity:
     for index, holds in ((4, unrelated), (3, y_flat), (2, x_flat), (1, count < 2)):
         defect = torch.where(holds, index, defect)
     ok = defect == 0
-    scale = matched / x_spread
-    translation = y_center - scale[:, None] * (rotation @ x_center[..., None])[..., 0]
     wide = torch.promote_types(predicted.dtype, torch.float32)
-    fitted = (
-        torch.where(ok.reshape(-1, *(1,) * (value.ndim - 1)), value, torch.nan)
-        for value in (scale, rotation, translation, (matched / size).clamp(max=1))
+    scale, correlation = (
+        torch.where(ok, value, torch.nan).to(wide).to(predicted.device)
+        for value in (matched / x_spread, (matched / size).clamp(max=1))
     )
-    scale, rotation, translation, correlation = (
-        value.to(wide).to(predicted.device) for value in fitted
-    )
-    return CenterSimilarity(
-        scale, rotation, translation, ok.to(predicted.device), defect, count, correlation
-    )
+    return CenterSimilarity(scale, ok.to(predicted.device), defect, count, correlation)
 
 
-def _centered(points: Tensor, use: Tensor, eps: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Points about their centroid (0 where unused), the centroid, and whether they coincide."""
+def _centered(points: Tensor, use: Tensor, eps: float) -> tuple[Tensor, Tensor]:
+    """Points about their centroid (0 where unused), and whether they coincide."""
     points = torch.where(use[..., None], points, 0.0)
     count = use.sum(1).clamp(min=1)
     center = points.sum(1) / count[:, None]
     moved = torch.where(use[..., None], points - center[:, None], 0.0)
     rms = (moved.square().sum((1, 2)) / count).sqrt()
-    return moved, center, rms <= ROUNDINGS * eps * points.abs().amax((1, 2))
-
-
-def view_errors(predicted: Tensor, target: Tensor) -> Tensor:
-    """Squared error (B, V) of each view's velocity (B, V, C, h, w), the mean over C h w."""
-    return (_wide(predicted) - _wide(target.detach())).square().flatten(2).mean(-1)
+    return moved, rms <= ROUNDINGS * eps * points.abs().amax((1, 2))
 
 
 def flow_matching_loss(
@@ -181,7 +164,7 @@ def flow_matching_loss(
     The paper's sum is divided by V C h w here, a constant factor: the paper names no coefficient.
     With ``context_weight`` 1 it is Geometric Latent Diffusion's loss.
     """
-    errors = view_errors(predicted, target)
+    errors = (_wide(predicted) - _wide(target.detach())).square().flatten(2).mean(-1)
     alpha = torch.ones_like(errors)
     alpha[:, :context] = context_weight
     return (errors * alpha).mean(1)
@@ -273,25 +256,6 @@ class LossWeights:
 
 
 @dataclass(frozen=True, eq=False)
-class PredictedTerms:
-    """What the model gave; what is None has no term. V views, context first; T target views."""
-
-    level1: Tensor | None = None  # (B, V, C, h, w) velocity
-    level0: Tensor | None = None  # (B, V, C, h, w) velocity
-    image: Tensor | None = None  # (B, T, 3, H, W)
-    depth: Tensor | None = None  # (B, T, H, W) z-depth, model units
-    centers: Tensor | None = None  # (B, V, 3) camera centres, model units; ``depth`` needs them
-
-
-@dataclass(frozen=True, eq=False)
-class ReferenceTerms(PredictedTerms):
-    """The truth of each; lengths in scene units, depth that is not finite or not above 0 = none."""
-
-    image_valid: Tensor | None = None  # (B, T, H, W) bool, None = all
-    depth_valid: Tensor | None = None  # (B, T, H, W) bool, None = all
-
-
-@dataclass(frozen=True, eq=False)
 class Objective:
     """The objective of one mini-batch."""
 
@@ -304,75 +268,53 @@ class Objective:
     # centres gave no scale.
     counts: dict[str, Tensor]
 
-    def record(self) -> dict[str, float]:
-        """Everything as numbers for a log: ``loss``, ``loss/TERM``, ``count/NAME``."""
-        values = {"loss": self.total}
-        values |= {f"loss/{name}": value for name, value in self.terms.items()}
-        values |= {f"count/{name}": value for name, value in self.counts.items()}
-        return {name: float(value.detach()) for name, value in values.items()}
-
 
 def objective(
-    prediction: PredictedTerms,  # see ``PredictedTerms``
-    reference: ReferenceTerms,  # has to hold whatever is predicted
+    # What the model gave, of V views, context first, and T target views: velocities "level1" and
+    # "level0" (B, V, C, h, w); "image" (B, T, 3, H, W); z-depth "depth" (B, T, H, W) with the
+    # camera "centers" (B, V, 3), in the model's units. What is absent has no term.
+    predicted: Mapping[str, Tensor],
+    # The truth of each, lengths in scene units; "image_valid" and "depth_valid" (B, T, H, W) bool
+    # where some pixels do not count.
+    reference: Mapping[str, Tensor],
     *,
-    context: int,  # number of context views, which come first
-    weights: LossWeights | None = None,  # None is ``LossWeights()``
+    context: int,  # number of context views
+    weights: LossWeights,
     context_weight: float = 0.25,  # see ``flow_matching_loss``
 ) -> Objective:
     """Every term that has a prediction, their weighted sum, and their counts."""
-    weights = weights or LossWeights()
-    parts, counts = _parts(prediction, reference, context, context_weight=context_weight)
-    if not parts:
-        raise OptionError("objective: nothing was predicted; give at least one term")
+    losses: dict[str, Callable[[], Tensor]] = {}
+    counts: dict[str, Tensor] = {}
+    for level in ("level1", "level0"):
+        if level in predicted:
+            losses[level] = partial(
+                flow_matching_loss,
+                predicted[level],
+                reference[level],
+                context=context,
+                context_weight=context_weight,
+            )
+    if "image" in predicted:
+        images, valid = (predicted["image"], reference["image"]), reference.get("image_valid")
+        losses["rgb"] = partial(rgb_loss, *images, valid=valid)
+        losses["hf"] = partial(high_gradient_loss, *images, valid=valid)
+        _count(counts, "rgb", rgb_mask(reference["image"], valid))
+    if "depth" in predicted:
+        depths, valid = (predicted["depth"], reference["depth"]), reference.get("depth_valid")
+        similarity = center_similarity(predicted["centers"], reference["centers"])
+        losses["depth"] = partial(depth_loss, *depths, similarity=similarity, valid=valid)
+        _count(counts, "depth", depth_mask(reference["depth"], valid))
+        counts["depth_without_scale"] = (~similarity.ok).sum()
     terms, total = {}, None
-    for name, part in parts.items():
+    for name, loss in losses.items():
         weight = getattr(weights, name)
         with nullcontext() if weight > 0 else torch.no_grad():
-            terms[name] = part().mean()
+            terms[name] = loss().mean()
         if weight > 0:
             total = weight * terms[name] if total is None else total + weight * terms[name]
     if total is None:
         total = torch.zeros_like(next(iter(terms.values())))
     return Objective(total, terms, counts)
-
-
-def _parts(
-    prediction: PredictedTerms, reference: ReferenceTerms, context: int, *, context_weight: float
-) -> tuple[dict[str, Callable[[], Tensor]], dict[str, Tensor]]:
-    """The terms, not yet computed, and what they stand on."""
-    parts: dict[str, Callable[[], Tensor]] = {}
-    counts: dict[str, Tensor] = {}
-    for level in ("level1", "level0"):
-        if (found := getattr(prediction, level)) is not None:
-            parts[level] = partial(
-                flow_matching_loss,
-                found,
-                _wanted(reference, level),
-                context=context,
-                context_weight=context_weight,
-            )
-    if (image := prediction.image) is not None:
-        wanted, valid = _wanted(reference, "image"), reference.image_valid
-        parts["rgb"] = partial(rgb_loss, image, wanted, valid=valid)
-        parts["hf"] = partial(high_gradient_loss, image, wanted, valid=valid)
-        _count(counts, "rgb", rgb_mask(wanted, valid))
-    if (depth := prediction.depth) is not None:
-        wanted, valid = _wanted(reference, "depth"), reference.depth_valid
-        if prediction.centers is None:
-            raise OptionError("predicted depth without predicted camera centres; give both")
-        similarity = center_similarity(prediction.centers, _wanted(reference, "centers"))
-        parts["depth"] = partial(depth_loss, depth, wanted, similarity=similarity, valid=valid)
-        _count(counts, "depth", depth_mask(wanted, valid))
-        counts["depth_without_scale"] = (~similarity.ok).sum()
-    return parts, counts
-
-
-def _wanted(reference: ReferenceTerms, name: str) -> Tensor:
-    value: Tensor | None = getattr(reference, name)
-    if value is None:
-        raise OptionError(f"objective: {name} was predicted but the reference has none")
-    return value
 
 
 def _count(counts: dict[str, Tensor], name: str, mask: Tensor) -> None:

@@ -4,13 +4,10 @@ import math
 from itertools import pairwise
 
 import numpy as np
-import oracle_flow_cases as cases
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from oracle import ABSENT, ORACLE
-from oracle_networks import Fixture
 
 from gvtools.completers.geoverse.flow import (
     GLD_END,
@@ -50,25 +47,6 @@ def _pair(seed: int = 0, dtype: torch.dtype = torch.float64) -> tuple[torch.Tens
     return clean, noise
 
 
-# --- reference values ---------------------------------------------------------------------------
-
-
-@pytest.mark.data
-@pytest.mark.skipif(not (ORACLE / "gld_time.json").is_file(), reason=ABSENT)
-@pytest.mark.parametrize(
-    "check", [cases.check_shifts, cases.check_grids, cases.check_training_shift, cases.check_path]
-)
-def test_times_and_path_equal_the_reference_values(check):
-    check(Fixture("gld_time"))
-
-
-@pytest.mark.data
-@pytest.mark.skipif(not (ORACLE / "gld_sampler.json").is_file(), reason=ABSENT)
-@pytest.mark.parametrize("check", [cases.check_sampler_grids, cases.check_losses])
-def test_sampler_grids_and_latent_losses_equal_the_reference_values(check):
-    check(Fixture("gld_sampler"))
-
-
 @pytest.mark.parametrize("shift", [1.0, 3.0, 31.176914536239792])
 @pytest.mark.parametrize("steps", [1, 3, 20])
 def test_euler_steps_equal_those_of_diffusers(steps, shift):
@@ -91,9 +69,6 @@ def test_euler_steps_equal_those_of_diffusers(steps, shift):
     np.testing.assert_allclose(bounds, scheduler.sigmas.numpy(), atol=1e-6)
     ours = sample(velocity, noise, bounds)
     assert float((ours - expected).abs().max() / expected.abs().max()) <= 1e-6
-
-
-# --- time ---------------------------------------------------------------------------------------
 
 
 @given(st.integers(1, 60), SHIFTS)
@@ -146,9 +121,6 @@ def test_training_times_follow_the_shifted_uniform_distribution():
     assert float((uniform - steps).abs().max()) < 1.63 / math.sqrt(20000)  # Kolmogorov, 1 %
 
 
-# --- path ---------------------------------------------------------------------------------------
-
-
 @given(st.floats(0, 1))
 def test_the_path_is_straight(t):
     clean, noise = _pair()
@@ -177,9 +149,6 @@ def test_a_prediction_of_the_clean_state_gives_the_velocity():
     torch.testing.assert_close(found[0], (noise - clean)[0])
     torch.testing.assert_close(found[1], (noise - clean)[1] * 0.01 / 0.05)
     torch.testing.assert_close(velocity_from_clean(clean[1], state[1], 0.01), found[1])
-
-
-# --- sampling -----------------------------------------------------------------------------------
 
 
 def test_each_step_is_evaluated_at_its_beginning():

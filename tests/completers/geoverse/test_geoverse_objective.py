@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-from dataclasses import fields, replace
-
 import geoverse_loss_reference as formula
 import numpy as np
 import pytest
@@ -15,8 +13,6 @@ from torch import Tensor
 from gvtools.completers.geoverse.objective import (
     DEFECTS,
     LossWeights,
-    PredictedTerms,
-    ReferenceTerms,
     center_similarity,
     depth_loss,
     flow_matching_loss,
@@ -31,113 +27,78 @@ from gvtools.errors import OptionError
 from gvtools.similarity import fit_similarity
 
 B, V, CONTEXT = 2, 5, 2
-
-
 T = V - CONTEXT
-
-
 TERMS = ["level1", "level0", "rgb", "hf", "depth"]
 
 
-def _batch(seed: int = 0) -> tuple[PredictedTerms, ReferenceTerms]:
-    generator = torch.Generator().manual_seed(seed)
-
-    def values(*shape: int, grad: bool = False) -> torch.Tensor:
-        return torch.rand(shape, generator=generator).requires_grad_(grad)
-
-    def all_of(grad: bool) -> dict[str, torch.Tensor]:
-        return {
-            "level1": values(B, V, 4, 3, 3, grad=grad),
-            "level0": values(B, V, 4, 3, 3, grad=grad),
-            "image": values(B, T, 3, 6, 6, grad=grad),
-            "depth": values(B, T, 6, 6, grad=grad),
-            "centers": values(B, V, 3, grad=grad),
-        }
-
-    return PredictedTerms(**all_of(True)), ReferenceTerms(**all_of(False))
+def _batch() -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    generator = torch.Generator().manual_seed(0)
+    shapes = {
+        "level1": (B, V, 4, 3, 3),
+        "level0": (B, V, 4, 3, 3),
+        "image": (B, T, 3, 6, 6),
+        "depth": (B, T, 6, 6),
+        "centers": (B, V, 3),
+    }
+    predicted, reference = (
+        {name: torch.rand(shape, generator=generator) for name, shape in shapes.items()}
+        for _ in range(2)
+    )
+    return {name: values.requires_grad_() for name, values in predicted.items()}, reference
 
 
 def test_the_total_is_the_weighted_sum_of_the_terms():
-    prediction, reference = _batch()
+    predicted, reference = _batch()
     weights = LossWeights(level1=0.5, level0=2.0, rgb=3.0, hf=4.0, depth=5.0)
-    found = objective(prediction, reference, context=CONTEXT, weights=weights)
-    pairs = {
-        field.name: (getattr(prediction, field.name), getattr(reference, field.name))
-        for field in fields(PredictedTerms)
-    }
-    similarity = center_similarity(*pairs["centers"])
+    found = objective(predicted, reference, context=CONTEXT, weights=weights)
+    pairs = {name: (values, reference[name]) for name, values in predicted.items()}
     expected = {
         "level1": flow_matching_loss(*pairs["level1"], context=CONTEXT),
         "level0": flow_matching_loss(*pairs["level0"], context=CONTEXT),
         "rgb": rgb_loss(*pairs["image"]),
         "hf": high_gradient_loss(*pairs["image"]),
-        "depth": depth_loss(*pairs["depth"], similarity=similarity),
+        "depth": depth_loss(*pairs["depth"], similarity=center_similarity(*pairs["centers"])),
     }
     assert list(found.terms) == TERMS
     for name, value in expected.items():
         torch.testing.assert_close(found.terms[name], value.mean())
     total = sum(getattr(weights, name) * expected[name].mean() for name in TERMS)
     torch.testing.assert_close(found.total, total)
-    record = found.record()
-    assert record["loss"] == pytest.approx(float(total))
-    assert set(record) == {
-        "loss",
-        *(f"loss/{name}" for name in TERMS),
-        *(f"count/{name}" for name in ("rgb_pixels", "rgb_empty", "depth_pixels", "depth_empty")),
-        "count/depth_without_scale",
-    }
-
-
-def test_what_is_not_predicted_has_no_term():
-    prediction, reference = _batch()
-    only = PredictedTerms(level1=prediction.level1)
-    found = objective(only, reference, context=CONTEXT)
-    assert list(found.terms) == ["level1"] and not found.counts
-    torch.testing.assert_close(found.total, found.terms["level1"])
-    with pytest.raises(OptionError, match="nothing was predicted"):
-        objective(PredictedTerms(), reference, context=CONTEXT)
-    for field in fields(PredictedTerms):
-        if field.name != "centers":
-            with pytest.raises(OptionError, match=f"{field.name} was predicted"):
-                absent = replace(reference, **{field.name: None})
-                objective(prediction, absent, context=CONTEXT)
-    with pytest.raises(OptionError, match="without predicted camera centres"):
-        objective(replace(prediction, centers=None), reference, context=CONTEXT)
+    only = objective(
+        {"level1": predicted["level1"]}, reference, context=CONTEXT, weights=LossWeights()
+    )
+    assert list(only.terms) == ["level1"] and not only.counts
+    torch.testing.assert_close(only.total, only.terms["level1"])
 
 
 def test_a_term_of_coefficient_zero_is_logged_but_pulls_at_nothing():
-    prediction, reference = _batch()
-    broken = replace(prediction, depth=torch.full((B, T, 6, 6), torch.nan, requires_grad=True))
+    predicted, reference = _batch()
+    broken = torch.full((B, T, 6, 6), torch.nan, requires_grad=True)
     weights = LossWeights(depth=0.0, hf=0.0)
-    found = objective(broken, reference, context=CONTEXT, weights=weights)
+    found = objective({**predicted, "depth": broken}, reference, context=CONTEXT, weights=weights)
     assert bool(found.terms["depth"].isnan()) and not found.terms["depth"].requires_grad
     assert bool(found.total.isfinite()) and found.terms["hf"] > 0
     found.total.backward()
-    assert broken.depth is not None and broken.depth.grad is None
+    assert broken.grad is None
     nothing = LossWeights(level1=0, level0=0, rgb=0, hf=0, depth=0)
-    assert float(objective(prediction, reference, context=CONTEXT, weights=nothing).total) == 0
+    assert float(objective(predicted, reference, context=CONTEXT, weights=nothing).total) == 0
 
 
 def test_missing_targets_are_counted_and_give_zero_within_the_graph():
-    prediction, reference = _batch()
-    assert reference.centers is not None
-    found = objective(
-        prediction,
-        replace(
-            reference,
-            image_valid=torch.zeros(B, T, 6, 6, dtype=torch.bool),
-            depth=torch.zeros(B, T, 6, 6),
-            centers=torch.where(
-                torch.arange(B * V).view(B, V, 1) > V, torch.nan, reference.centers
-            ),
-        ),
-        context=CONTEXT,
-        weights=LossWeights(level1=0, level0=0),
-    )
+    predicted, reference = _batch()
+    known = torch.arange(B * V).view(B, V, 1) <= V
+    reference |= {
+        "image_valid": torch.zeros(B, T, 6, 6, dtype=torch.bool),
+        "depth": torch.zeros(B, T, 6, 6),
+        "centers": torch.where(known, reference["centers"], torch.nan),
+    }
+    weights = LossWeights(level1=0, level0=0)
+    found = objective(predicted, reference, context=CONTEXT, weights=weights)
     assert float(found.total) == 0 and found.total.requires_grad
     found.total.backward()
-    for leaf in (prediction.image, prediction.depth):
-        assert leaf is not None and leaf.grad is not None and not bool(leaf.grad.any())
+    for name in ("image", "depth"):
+        gradient = predicted[name].grad
+        assert gradient is not None and not bool(gradient.any())
     assert {name: int(value) for name, value in found.counts.items()} == {
         "rgb_pixels": 0,
         "rgb_empty": B,
@@ -150,15 +111,14 @@ def test_missing_targets_are_counted_and_give_zero_within_the_graph():
 @pytest.mark.gpu
 def test_the_device_changes_neither_the_terms_nor_the_gradients():
     def on(device: str) -> tuple[dict[str, float], list[torch.Tensor]]:
-        values = [
-            {name: x.detach().to(device) for name, x in vars(part).items() if x is not None}
-            for part in _batch()
-        ]
-        prediction = PredictedTerms(**{name: x.requires_grad_() for name, x in values[0].items()})
-        found = objective(prediction, ReferenceTerms(**values[1]), context=CONTEXT)
+        predicted, reference = (
+            {name: x.detach().to(device) for name, x in part.items()} for part in _batch()
+        )
+        leaves = {name: x.requires_grad_() for name, x in predicted.items()}
+        found = objective(leaves, reference, context=CONTEXT, weights=LossWeights())
         found.total.backward()
-        pulled = [x.grad for x in vars(prediction).values() if x.grad is not None]
-        return found.record(), [x.cpu() for x in pulled]
+        pulled = [x.grad for x in leaves.values() if x.grad is not None]
+        return {name: float(x) for name, x in found.terms.items()}, [x.cpu() for x in pulled]
 
     (ours, gradients), (expected, wanted) = on("cuda"), on("cpu")
     assert ours == pytest.approx(expected, rel=1e-5)
@@ -173,8 +133,6 @@ def test_wrong_coefficients_are_refused(value):
 
 
 H, W = 5, 6
-
-
 SEEDS = st.integers(0, 2**32 - 1)
 
 
@@ -190,9 +148,6 @@ def _outside(values: Tensor, mask: Tensor, poison: float) -> Tensor:
     return torch.where(mask, values, poison)
 
 
-# --- flow matching ------------------------------------------------------------------------------
-
-
 @settings(deadline=None)
 @given(SEEDS, st.integers(0, V), st.floats(0, 2))
 def test_the_flow_loss_is_a_constant_factor_of_the_papers_formula(seed, context, alpha):
@@ -206,9 +161,6 @@ def test_the_flow_loss_is_a_constant_factor_of_the_papers_formula(seed, context,
             predicted[b].numpy(), clean[b].numpy(), noise[b].numpy(), weights
         )
         assert float(found[b]) * (3 * 2 * 2 * V) == pytest.approx(expected)
-
-
-# --- pictures -----------------------------------------------------------------------------------
 
 
 @settings(deadline=None, max_examples=50)
@@ -255,9 +207,6 @@ def test_half_precision_pictures_are_compared_in_float32():
     assert found.dtype == torch.float32
     exact = ((half + 0.125).double() - half.double()).abs().mean()
     assert float(found) == pytest.approx(float(exact), rel=1e-6)
-
-
-# --- depth --------------------------------------------------------------------------------------
 
 
 def _depths(rng: np.random.Generator) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -309,9 +258,6 @@ def test_what_lies_outside_the_mask_poisons_neither_depth_loss_nor_gradient(pois
     found.sum().backward()
     assert damaged.grad is not None and bool(damaged.grad.isfinite().all())
     assert not bool(damaged.grad[~known].any()) and bool(damaged.grad[known].all())
-
-
-# --- gradients ----------------------------------------------------------------------------------
 
 
 def test_references_receive_no_gradient():
@@ -385,10 +331,6 @@ def test_a_similarity_is_recovered_from_two_centres_on(seed, count, scale):
     assert fit.status == ("aligned",)
     assert float(fit.scale) == pytest.approx(scale, rel=1e-9)
     assert float(fit.correlation) == pytest.approx(1)
-    if count >= 4:
-        np.testing.assert_allclose(fit.rotation[0], q, atol=1e-6)
-        np.testing.assert_allclose(fit.translation[0], b, atol=1e-6 * (1 + scale))
-    assert float(torch.linalg.det(fit.rotation)) == pytest.approx(1)
 
 
 @settings(deadline=None)
@@ -401,8 +343,6 @@ def test_noisy_centres_give_the_scale_of_the_numpy_fit(seed, count, noise):
     fit = _fit(predicted, reference)
     if expected.ok:
         assert float(fit.scale) == pytest.approx(expected.scale, rel=1e-9)
-        np.testing.assert_allclose(fit.rotation[0], expected.rotation, atol=1e-6)
-        np.testing.assert_allclose(fit.translation[0], expected.translation, atol=1e-6)
         spread = reference - reference.mean(axis=0)
         left = (expected.residuals**2).sum() / (spread**2).sum()
         assert 1 - float(fit.correlation) ** 2 == pytest.approx(left, abs=1e-9)
@@ -415,7 +355,6 @@ def test_mirrored_centres_are_not_matched_by_a_reflection(seed):
     predicted = rng.normal(size=(6, 3))
     reference = 2 * predicted * np.array([-1.0, 1, 1])
     fit = _fit(predicted, reference)
-    assert float(torch.linalg.det(fit.rotation)) == pytest.approx(1)
     singular = np.linalg.svd((predicted - predicted.mean(0)).T @ (predicted - predicted.mean(0)))[1]
     expected = 2 * (singular[0] + singular[1] - singular[2]) / singular.sum()
     assert float(fit.scale) == pytest.approx(expected, rel=1e-9)
@@ -461,7 +400,7 @@ def test_what_leaves_the_scale_open_is_said(predicted, reference, defect, dtype)
         torch.tensor(predicted, dtype=dtype)[None], torch.tensor(reference, dtype=dtype)[None]
     )
     assert fit.status == (DEFECTS[defect],)
-    assert not bool(fit.ok) and bool(fit.scale.isnan()) and bool(fit.rotation.isnan().all())
+    assert not bool(fit.ok) and bool(fit.scale.isnan())
 
 
 def test_small_baselines_far_out_are_geometry_as_long_as_the_dtype_resolves_them():
