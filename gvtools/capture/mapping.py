@@ -11,7 +11,7 @@ is kept.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -19,16 +19,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gvtools.capture.matching import flat_pairs, match_pictures, only_turned, verified
+from gvtools.capture.matching import (
+    MappingTask,
+    flat_pairs,
+    match_pictures,
+    only_turned,
+    verified,
+)
 from gvtools.errors import ProjectError
 from gvtools.features import quiet_colmap
 from gvtools.poses.colmap import SEED, adjust, fix_cameras
 
 if TYPE_CHECKING:
     import pycolmap
-
-    from gvtools.capture.panoramas import FaceRig
-    from gvtools.features import FeatureMatcher
 
 # If a smaller share of the verified matches became points of the global model, incremental mapping
 # is tried, too.
@@ -47,7 +50,7 @@ LOST = 64.0
 # of a camera that only turned, 10 of a walk past something almost flat.
 STEEP = 5.0
 
-Say = Callable[[str], object]
+Pairs = Mapping[tuple[str, str], int]  # number of verified matches of pairs of pictures, by names
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,79 +63,50 @@ class Mapped:
     # Names of the pictures of each further model, the largest model first.
     others: tuple[tuple[str, ...], ...]
     matching: str  # how pairs were chosen, in words
-    # Number of verified matches of each pair of pictures, by their names.
-    pairs: Mapping[tuple[str, str], int]
+    pairs: Pairs
     explained: float  # share of the matches of pairs in one model that became points, 0 to 1
     flat: bool = False  # every pair is explained by a plane, so that intrinsics hang by little
 
 
-def find_cameras(
-    images: Path,
-    cameras: Sequence[Sequence[str]],
-    *,
-    work: Path,
-    source: Path | None = None,
-    in_order: bool = False,
-    masks: Path | None = None,
-    learned: FeatureMatcher | None = None,
-    rigs: Sequence[FaceRig] = (),
-    fisheye: str = "",
-    say: Say = lambda text: None,
-) -> Mapped:
-    """Find intrinsics and poses of pictures.
-
-    Args:
-        cameras: names of the pictures that each camera took; they share its intrinsics.
-        work: a folder without files yet, for COLMAP's database and models.
-        source: the user's folder for messages, if ``images`` holds copies.
-        in_order: the pictures follow a path in the order of their names, as frames of a video do;
-            neighbours are then matched even if there are too many pictures to match all pairs.
-        masks: folder of masks as COLMAP has them, ``a.jpg.png`` for ``a.jpg``, black where no
-            features are to be found; None for none.
-        learned: finds and matches features; None takes COLMAP's SIFT.
-        rigs: faces of panoramas, whose names ``cameras`` holds face by face; their intrinsics and
-            relative rotations are fixed.
-        fisheye: initial parameters of OPENCV_FISHEYE as COLMAP writes them; "" for other lenses.
-    """
+def find_cameras(task: MappingTask) -> Mapped:
+    """Find intrinsics and poses of pictures."""
     import pycolmap
 
+    source, count = task.source or task.images, len(task.names)
     with quiet_colmap(errors=False):
         pycolmap.set_random_seed(SEED)
-        say(f"finding features in {sum(map(len, cameras))} pictures")
-        database, matching = match_pictures(
-            images, cameras, work=work, in_order=in_order, masks=masks, learned=learned,
-            rigs=rigs, fisheye=fisheye, say=say,
-        )  # fmt: skip
+        task.say(f"finding features in {count} pictures")
+        database, matching = match_pictures(task)
         pairs = verified(database)
         if not pairs:
             raise ProjectError(
-                f"{source or images}: no two of the {sum(map(len, cameras))} pictures show enough "
-                "of the same; expected neighbours that share at least half of what they show; "
-                "take more pictures between these, and sharp ones"
+                f"{source}: no two of the {count} pictures show enough of the same; expected "
+                "neighbours that share at least half of what they show; take more pictures between "
+                "these, and sharp ones"
             )
         flat = flat_pairs(database)
         if only_turned(flat):
-            raise _no_depth(source or images, len(pairs))
-        say(f"finding cameras from {len(pairs)} pairs that overlap")
-        found = _map(database, images, work, pairs=pairs, refine=not rigs, say=say)
+            raise _no_depth(source, len(pairs))
+        task.say(f"finding cameras from {len(pairs)} pairs that overlap")
+        found = _map(database, task, pairs)
     if not found:
         best = max(pairs, key=lambda pair: pairs[pair])
         raise ProjectError(
-            f"{source or images}: {len(pairs)} pairs of pictures overlap (best {best[0]} and "
-            f"{best[1]}, {pairs[best]} matches), and no model comes of them; expected views "
-            "from different places; take pictures while walking, not while turning on the spot"
+            f"{source}: {len(pairs)} pairs of pictures overlap (best {best[0]} and {best[1]}, "
+            f"{pairs[best]} matches), and no model comes of them; expected views from different "
+            "places; take pictures while walking, not while turning on the spot"
         )
     how, models, share = found
     largest, *rest = sorted(models, key=lambda model: -model.num_reg_images())
     if flat and _angle(largest) < STEEP:
-        raise _no_depth(source or images, len(pairs))
-    others = tuple(
-        tuple(sorted(image.name for image in model.images.values() if image.has_pose))
-        for model in rest
-    )
-    return Mapped(
-        largest, how, others, matching, pairs=pairs, explained=share, flat=bool(flat)
-    )  # fmt: skip
+        raise _no_depth(source, len(pairs))
+    others = tuple(tuple(sorted(_names(model))) for model in rest)
+    return Mapped(largest, how, others, matching, pairs=pairs, explained=share, flat=bool(flat))
+
+
+def _names(model: pycolmap.Reconstruction) -> set[str]:
+    """The pictures that have a camera."""
+    return {image.name for image in model.images.values() if image.has_pose}
 
 
 def _no_depth(source: Path, pairs: int) -> ProjectError:
@@ -156,115 +130,80 @@ def _angle(model: pycolmap.Reconstruction) -> float:
 
 
 def _map(
-    database: Path,
-    images: Path,
-    work: Path,
-    *,
-    pairs: Mapping[tuple[str, str], int],
-    refine: bool,
-    say: Say,
+    database: Path, task: MappingTask, pairs: Pairs
 ) -> tuple[str, list[pycolmap.Reconstruction], float] | None:
-    """The better of global and incremental mapping; None where neither gives a model.
+    """The better of "global" and "incremental" mapping, its models, and what they explain.
 
-    ``refine``: whether to refine intrinsics; those of faces, and their rotations, are fixed.
-
-    Returns:
-        "global" or "incremental", its models, and what they explain.
+    Intrinsics of faces, and their rotations, are fixed. None where neither gives a model.
     """
     import pycolmap
 
-    settings = pycolmap.GlobalPipelineOptions()
-    settings.random_seed = SEED
-    if not refine:
-        settings.mapper.refine_sensor_from_rig = False
-        fix_cameras(settings.mapper.bundle_adjustment)
-    best = None
-    models = _models(
-        pycolmap.global_mapping, database, images, out=work / "global", options=settings,
-        refine=refine,
-    )  # fmt: skip
-    if models:
-        share = _explained_by(models, pairs)
-        best = "global", models, share
-        if share >= ENOUGH:
-            return best
-        say(f"global mapping explains {share:.0%} of the matches; trying incremental mapping")
-    else:
-        say("global mapping gives no model; trying incremental mapping")
-    pipeline = pycolmap.IncrementalPipelineOptions()
-    pipeline.random_seed = SEED
+    globally, pipeline = pycolmap.GlobalPipelineOptions(), pycolmap.IncrementalPipelineOptions()
+    globally.random_seed = pipeline.random_seed = SEED
     # COLMAP's default drops models of fewer than 10 pictures.
     pipeline.min_model_size = 2
-    if not refine:
+    if task.rigs:
+        globally.mapper.refine_sensor_from_rig = False
+        fix_cameras(globally.mapper.bundle_adjustment)
         pipeline.ba_refine_focal_length = False
         pipeline.ba_refine_extra_params = False
         pipeline.ba_refine_sensor_from_rig = False
-    models = _models(
-        pycolmap.incremental_mapping, database, images, out=work / "incremental",
-        options=pipeline, refine=refine,
-    )  # fmt: skip
-    if models:
-        share = _explained_by(models, pairs)
-        if best is None or share > best[2]:
-            best = "incremental", models, share
+    best = None
+    ways: tuple[tuple[str, Any, Any], ...] = (
+        ("global", pycolmap.global_mapping, globally),
+        ("incremental", pycolmap.incremental_mapping, pipeline),
+    )
+    for how, mapping, options in ways:
+        out = task.work / how
+        out.mkdir()
+        try:
+            models = list(mapping(database, task.images, out, options=options).values())
+        except (RuntimeError, ValueError):
+            models = []
+        for model in models:
+            _settle(model, refine=not task.rigs)
+        models = [model for model in models if model.num_reg_images() >= 2]
+        if models:
+            share = _explained(models, pairs)
+            if best is None or share > best[2]:
+                best = how, models, share
+        if how == "global" and not models:
+            task.say("global mapping gives no model; trying incremental mapping")
+        elif how == "global" and share >= ENOUGH:
+            break
+        elif how == "global":
+            task.say(
+                f"global mapping explains {share:.0%} of the matches; trying incremental mapping"
+            )
     return best
 
 
-def _explained_by(
-    models: Sequence[pycolmap.Reconstruction], pairs: Mapping[tuple[str, str], int]
-) -> float:
+def _explained(models: Sequence[pycolmap.Reconstruction], pairs: Pairs) -> float:
     """Share of the verified matches that became points of the largest model.
 
     Pairs of which another model has both pictures are of another place, and are no fault of it.
     """
     largest, *rest = sorted(models, key=lambda model: -model.num_reg_images())
-    elsewhere = [
-        {image.name for image in model.images.values() if image.has_pose} for model in rest
-    ]
-    own = {
-        pair: n
-        for pair, n in pairs.items()
-        if not any(names.issuperset(pair) for names in elsewhere)
-    }
-    return explained(largest, own)
-
-
-def explained(model: pycolmap.Reconstruction, pairs: Mapping[tuple[str, str], int]) -> float:
-    """Share of the verified matches of all pairs that became points of the model.
-
-    Args:
-        pairs: number of verified matches of each pair of pictures.
-    """
-    names = {image.image_id: image.name for image in model.images.values()}
+    elsewhere = [_names(model) for model in rest]
+    names = {image.image_id: image.name for image in largest.images.values()}
     shared: Counter[tuple[str, str]] = Counter()
-    for point in model.points3D.values():
+    for point in largest.points3D.values():
         seen = sorted({names[element.image_id] for element in point.track.elements})
         shared.update(combinations(seen, 2))
-    became = 0
-    for (first, second), count in pairs.items():
-        became += min(count, shared[min(first, second), max(first, second)])
-    return became / max(1, sum(pairs.values()))
-
-
-def _models(
-    mapping: Any, database: Path, images: Path, *, out: Path, options: Any, refine: bool
-) -> list[pycolmap.Reconstruction]:
-    """The models with at least two pictures that a mapping makes; none if it fails."""
-    out.mkdir()
-    try:
-        found = mapping(database, images, out, options=options)
-    except (RuntimeError, ValueError):
-        return []
-    models = [model for model in found.values() if model.num_reg_images() >= 2]
-    for model in models:
-        _settle(model, refine=refine)
-    return [model for model in models if model.num_reg_images() >= 2]
+    became = matches = 0
+    for pair, count in pairs.items():
+        if not any(others.issuperset(pair) for others in elsewhere):
+            matches += count
+            became += min(count, shared[min(pair), max(pair)])
+    return became / max(1, matches)
 
 
 def _settle(model: pycolmap.Reconstruction, *, refine: bool) -> None:
     """Deregister pictures that see too few points, then bundle-adjust the rest once more."""
     import pycolmap
 
+    if model.num_reg_images() < 2:
+        return
     # Counted by frame (COLMAP's word for one shot of a rig): a panorama's faces stay together.
     seen: Counter[int] = Counter()
     for image in model.images.values():

@@ -7,6 +7,7 @@ would take too long, pairs that look alike.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,8 +22,6 @@ from gvtools.poses.colmap import extract_sift, list_pairs, verification
 from gvtools.scenes.images import check_size, read_image, read_mask
 
 if TYPE_CHECKING:
-    import pycolmap
-
     from gvtools.capture.panoramas import FaceRig
 
 # Up to this many pictures, every pair is matched; fewer with LightGlue, which takes a second a pair
@@ -49,92 +48,100 @@ FOCALS, TURNED, SHARE, STILL = np.geomspace(0.4, 20, 40), 0.04, 0.5, 0.01
 Say = Callable[[str], object]
 
 
-def match_pictures(
-    images: Path,
-    cameras: Sequence[Sequence[str]],
-    *,
-    work: Path,
-    in_order: bool,
-    masks: Path | None,
-    learned: FeatureMatcher | None,
-    rigs: Sequence[FaceRig],
-    fisheye: str,
-    say: Say,
-) -> tuple[Path, str]:
-    """Fill a database with features and verified matches; see ``mapping.find_cameras``.
+@dataclass(frozen=True, eq=False)
+class MappingTask:
+    """Pictures whose cameras are to be found, and how."""
 
-    Returns:
-        The database, and in words how pairs were chosen.
-    """
+    images: Path
+    # Names of the pictures that each camera took; they share its intrinsics.
+    cameras: Sequence[Sequence[str]]
+    work: Path  # a folder without files yet, for COLMAP's database and models
+    source: Path | None = None  # the user's folder for messages, if ``images`` holds copies
+    # The pictures follow a path in the order of their names, as frames of a video do; neighbours
+    # are then matched even if there are too many pictures to match all pairs.
+    in_order: bool = False
+    # Folder of masks as COLMAP has them, ``a.jpg.png`` for ``a.jpg``, black where no features are.
+    masks: Path | None = None
+    learned: FeatureMatcher | None = None  # finds and matches features; None takes COLMAP's SIFT
+    # Faces of panoramas, whose names ``cameras`` holds face by face; their intrinsics and relative
+    # rotations are fixed.
+    rigs: Sequence[FaceRig] = ()
+    # Initial parameters of OPENCV_FISHEYE as COLMAP writes them; "" for other lenses.
+    fisheye: str = ""
+    say: Say = lambda text: None
+
+    @property
+    def names(self) -> list[str]:
+        """Of all pictures."""
+        return [name for group in self.cameras for name in group]
+
+
+def match_pictures(task: MappingTask) -> tuple[Path, str]:
+    """Fill a database with features and verified matches; returns it, and how pairs were chosen."""
     import pycolmap
 
-    database = work / "database.db"
+    database, learned, rigs = task.work / "database.db", task.learned, task.rigs
     given = {
         rig.names(face)[0]: ("PINHOLE", face.target.params_to_string())
         for rig in rigs
         for face in rig.faces
     }
-    if fisheye:
-        given = {group[0]: ("OPENCV_FISHEYE", fisheye) for group in cameras}
+    if task.fisheye:
+        given = {group[0]: ("OPENCV_FISHEYE", task.fisheye) for group in task.cameras}
     if learned is not None:
         pycolmap.Database.open(database).close()
-    for group in cameras:
+    for group in task.cameras:
         reader = pycolmap.ImageReaderOptions()
         if group[0] in given:
             reader.camera_model, reader.camera_params = given[group[0]]
         if learned is None:
-            extract_sift(database, images, group, masks=masks, reader=reader)
+            extract_sift(database, task.images, group, masks=task.masks, reader=reader)
         else:
             pycolmap.import_images(
-                database, images, pycolmap.CameraMode.SINGLE, image_names=list(group),
+                database, task.images, pycolmap.CameraMode.SINGLE, image_names=list(group),
                 options=reader,
             )  # fmt: skip
     if rigs:
         with pycolmap.Database.open(database) as opened:
             pycolmap.apply_rig_config([rig.config() for rig in rigs], opened)
     if learned is None:
-        count = sum(map(len, cameras))
-        options = pycolmap.FeatureMatchingOptions()
-        options.skip_image_pairs_in_same_frame = bool(rigs)
-        how = _match(database, work, options=options, count=count, in_order=in_order, say=say)
-        return database, how
-    names = [name for group in cameras for name in group]
-    features = learned_features(images, names, learned, masks=masks, say=say)
+        return database, _match_sift(database, task)
+    features = learned_features(task.images, task.names, learned, masks=task.masks, say=task.say)
     write_keypoints(database, features)
     described = {name: found.descriptors for name, found in features.items()}
-    chosen, how = _chosen(described, EXHAUSTIVE_LEARNED, in_order=in_order)
+    chosen, how = _choose_pairs(described, EXHAUSTIVE_LEARNED, in_order=task.in_order)
     if rigs:
         with pycolmap.Database.open(database) as opened:
             frame = {image.name: image.frame_id for image in opened.read_all_images()}
         chosen = [(a, b) for a, b in chosen if frame[a] != frame[b]]
-    say(f"matching {len(chosen)} pairs")
-    _write_matches(database, features, chosen, matcher=learned, say=say)
-    pycolmap.verify_matches(database, list_pairs(chosen, work), verification())
+    task.say(f"matching {len(chosen)} pairs")
+    with pycolmap.Database.open(database) as opened:
+        numbers = {image.name: image.image_id for image in opened.read_all_images()}
+        for number, (first, second) in enumerate(chosen, start=1):
+            rows = learned.match(features[first], features[second])
+            opened.write_matches(numbers[first], numbers[second], rows.astype(np.uint32))
+            if number % EVERY == 0:
+                task.say(f"{number} of {len(chosen)} pairs matched")
+    pycolmap.verify_matches(database, list_pairs(chosen, task.work), verification())
     return database, how
 
 
-def _match(
-    database: Path,
-    work: Path,
-    *,
-    options: pycolmap.FeatureMatchingOptions,
-    count: int,
-    in_order: bool,
-    say: Say,
-) -> str:
+def _match_sift(database: Path, task: MappingTask) -> str:
     """Match SIFT of pairs of pictures; returns in words how the pairs were chosen."""
     import pycolmap
 
+    options, count = pycolmap.FeatureMatchingOptions(), len(task.names)
+    options.skip_image_pairs_in_same_frame = bool(task.rigs)
     if count <= EXHAUSTIVE:
-        say(f"matching all {count * (count - 1) // 2} pairs")
+        task.say(f"matching all {count * (count - 1) // 2} pairs")
         pycolmap.match_exhaustive(
             database, matching_options=options, verification_options=verification()
         )
         return "all pairs"
-    pairs, how = _chosen(sift_descriptors(database), EXHAUSTIVE, in_order=in_order)
-    say(f"matching {len(pairs)} pairs")
+    pairs, how = _choose_pairs(sift_descriptors(database), EXHAUSTIVE, in_order=task.in_order)
+    task.say(f"matching {len(pairs)} pairs")
     pairing = pycolmap.ImportedPairingOptions()
-    pairing.match_list_path = list_pairs(pairs, work)
+    pairing.match_list_path = list_pairs(pairs, task.work)
     pycolmap.match_image_pairs(
         database, matching_options=options, pairing_options=pairing,
         verification_options=verification(),
@@ -142,16 +149,10 @@ def _match(
     return how
 
 
-def _chosen(
+def _choose_pairs(
     described: Mapping[str, NDArray[np.float32]], exhaustive: int, *, in_order: bool
 ) -> tuple[list[tuple[str, str]], str]:
-    """The pairs of pictures to match, and in words how they were chosen.
-
-    Args:
-        described: (N, D) descriptors of each picture by name.
-        exhaustive: up to how many pictures every pair is taken.
-        in_order: see ``mapping.find_cameras``.
-    """
+    """The pairs of pictures to match, all of them up to ``exhaustive`` pictures, and why these."""
     names = sorted(described)
     if len(names) <= exhaustive:
         return list(combinations(names, 2)), "all pairs"
@@ -175,11 +176,8 @@ def similar_pairs(
     """Pairs of pictures whose features are alike, by a descriptor learnt from these pictures.
 
     Each picture is described by VLAD (Jegou et al. 2010): the sum of its features' differences from
-    the nearest of WORDS centres, which k-means finds among all of them.
-
-    Args:
-        described: (N, D) unit descriptors of each picture's features; N may be 0.
-        nearest: how many partners each picture gets; it may be chosen by more.
+    the nearest of WORDS centres, which k-means finds among all of them. Each gets ``nearest``
+    partners, and may be chosen by more; ``described`` holds (N, D) unit descriptors by name.
     """
     import cv2
 
@@ -287,26 +285,6 @@ def write_keypoints(database: Path, features: Mapping[str, Features]) -> None:
             opened.write_keypoints(image.image_id, found.xy.astype(np.float32))
 
 
-def _write_matches(
-    database: Path,
-    features: Mapping[str, Features],
-    pairs: Sequence[tuple[str, str]],
-    *,
-    matcher: FeatureMatcher,
-    say: Say,
-) -> None:
-    """Match pairs of pictures and write the matches, not verified yet."""
-    import pycolmap
-
-    with pycolmap.Database.open(database) as opened:
-        numbers = {image.name: image.image_id for image in opened.read_all_images()}
-        for number, (first, second) in enumerate(pairs, start=1):
-            rows = matcher.match(features[first], features[second])
-            opened.write_matches(numbers[first], numbers[second], rows.astype(np.uint32))
-            if number % EVERY == 0:
-                say(f"{number} of {len(pairs)} pairs matched")
-
-
 def verified(database: Path) -> dict[tuple[str, str], int]:
     """Pairs of pictures that overlap, with the number of their verified matches."""
     import pycolmap
@@ -350,10 +328,8 @@ def flat_pairs(database: Path) -> list[tuple[NDArray[np.float64], tuple[int, int
 def only_turned(pairs: Sequence[tuple[NDArray[np.float64], tuple[int, int]]]) -> bool:
     """Whether homographies are those of a camera that turns on the spot, at some focal length.
 
-    Such a homography is K R K^-1 (R. Hartley and A. Zisserman, Multiple View Geometry, 8.4).
-
-    Args:
-        pairs: pixels to pixels, and the size of the pictures.
+    Such a homography is K R K^-1 (R. Hartley and A. Zisserman, Multiple View Geometry, 8.4). Each
+    takes pixels to pixels, and comes with the size of the pictures.
 
     >>> turned_by_2 = np.array([[0.999391, 0, 20.94], [0, 1, 0], [-5.8166e-5, 0, 0.999391]])
     >>> K = np.array([[1.0, 0, 320], [0, 1, 240], [0, 0, 1]])

@@ -17,7 +17,7 @@ import numpy as np
 from PIL import Image, ImageOps
 
 from gvtools.errors import ProjectError
-from gvtools.scenes.images import UNREADABLE
+from gvtools.scenes.images import UNREADABLE, read_mask
 from gvtools.scenes.matching import named
 from gvtools.scenes.project import PICTURES
 from gvtools.scenes.scene import Finding, natural_key
@@ -31,19 +31,8 @@ GPS_LATITUDE, GPS_LONGITUDE, GPS_ALTITUDE = 2, 4, 6
 # Quality of a JPEG that had to be turned.
 JPEG_QUALITY = 97
 # Pictures that cameras write and Pillow does not read.
-FOREIGN = (
-    ".heic",
-    ".heif",
-    ".avif",
-    ".dng",
-    ".cr2",
-    ".cr3",
-    ".nef",
-    ".arw",
-    ".raf",
-    ".orf",
-    ".rw2",
-)
+FOREIGN = (".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf",
+           ".rw2")  # fmt: skip
 # Pictures are judged at this height, and one whose sharpness is below this share of the median's is
 # called blurred. [pixels]
 JUDGED_HEIGHT, BLURRED = 480, 0.15
@@ -67,52 +56,42 @@ class CapturedPhotograph:
 
 def find_photographs(folder: Path) -> tuple[list[CapturedPhotograph], list[Finding]]:
     """The readable, different pictures below a folder in natural order, and what was met."""
-    paths = [
-        path
-        for path in folder.rglob("*")
-        if path.suffix.lower() in PICTURES and not path.name.startswith(".") and path.is_file()
-    ]
-    foreign = [
-        path.relative_to(folder).as_posix()
-        for path in sorted(folder.rglob("*"))
-        if path.suffix.lower() in FOREIGN and not path.name.startswith(".")
-    ]
-    paths.sort(key=lambda path: natural_key(path.relative_to(folder).as_posix()))
+    files = {path.relative_to(folder).as_posix(): path for path in sorted(folder.rglob("*"))
+             if not path.name.startswith(".")}  # fmt: skip
+    foreign = [name for name, path in files.items() if path.suffix.lower() in FOREIGN]
+    names = [n for n, path in files.items() if path.suffix.lower() in PICTURES and path.is_file()]
     found: list[CapturedPhotograph] = []
     damaged: list[str] = []
     copies: list[str] = []
     digests: set[bytes] = set()
-    for path in paths:
-        name = path.relative_to(folder).as_posix()
-        digest = hashlib.sha256(read_bytes(path)).digest()
+    for name in sorted(names, key=natural_key):
+        digest = hashlib.sha256(read_bytes(files[name])).digest()
         if digest in digests:
             copies.append(name)
             continue
         digests.add(digest)
         try:
-            found.append(_look_at(path, name))
+            found.append(_look_at(files[name], name))
         except UNREADABLE:
             damaged.append(name)
-    findings = [
-        Finding(
-            "warning", f"{len(names)} of {len(paths)} pictures {reason}: left out ({named(names)})"
-        )
-        for names, reason in ((damaged, "cannot be read"), (copies, "are copies of others"))
-        if names
+    total = len(names)
+    warnings = [
+        f"{len(some)} of {total} pictures {reason}: left out ({named(some)})"
+        for some, reason in ((damaged, "cannot be read"), (copies, "are copies of others"))
+        if some
     ]
     if foreign:
-        text = (
+        warnings.append(
             f"{len(foreign)} pictures are HEIC, AVIF or raw: left out ({named(foreign)}); convert "
             "them to JPEG"
         )
-        findings.append(Finding("warning", text))
     if len(found) < 2:
-        met = "; ".join(finding.message for finding in findings)
+        met = f" ({'; '.join(warnings)})" if warnings else ""
         raise ProjectError(
-            f"{folder}: {len(found)} readable pictures{f' ({met})' if met else ''}; expected at "
-            "least two photographs of one place, taken from different points"
+            f"{folder}: {len(found)} readable pictures{met}; expected at least two photographs of "
+            "one place, taken from different points"
         )
-    return found, [*findings, *_oddities(found)]
+    return found, [*(Finding("warning", text) for text in warnings), *_oddities(found)]
 
 
 def _look_at(path: Path, name: str) -> CapturedPhotograph:
@@ -157,37 +136,20 @@ def _location(gps: dict[int, object]) -> tuple[float, float, float] | None:
 
 def _oddities(found: Sequence[CapturedPhotograph]) -> list[Finding]:
     """What may keep pictures from being registered, or explains a model."""
-    findings = []
     middle = float(np.median([item.sharpness for item in found]))
     blurred = [item.name for item in found if item.sharpness < BLURRED * middle]
-    if blurred:
-        findings.append(
-            Finding(
-                "warning",
-                f"{len(blurred)} of {len(found)} pictures are blurred beside the others "
-                f"({named(blurred)}); they are tried all the same",
-            )
-        )
-    if middle < SOFT:
-        findings.append(
-            Finding(
-                "warning",
-                f"most of the {len(found)} pictures have hardly any edges: blurred, dark, or of "
-                "bare walls",
-            )
-        )
-    turned = [item.name for item in found if item.turned]
-    if turned:
-        findings.append(
-            Finding("info", f"{len(turned)} pictures were stored on their side: turned upright")
-        )
-    sizes = {item.size for item in found}
-    if len(sizes) > 1:
-        text = ", ".join(f"{width}x{height}" for width, height in sorted(sizes))
-        findings.append(
-            Finding("info", f"pictures of {len(sizes)} sizes ({text}): one camera each")
-        )
-    return findings
+    turned = sum(item.turned for item in found)
+    sizes = sorted({item.size for item in found})
+    shown = ", ".join(f"{width}x{height}" for width, height in sizes)
+    met = (
+        (bool(blurred), "warning", f"{len(blurred)} of {len(found)} pictures are blurred beside "
+         f"the others ({named(blurred)}); they are tried all the same"),
+        (middle < SOFT, "warning", f"most of the {len(found)} pictures have hardly any edges: "
+         "blurred, dark, or of bare walls"),
+        (turned > 0, "info", f"{turned} pictures were stored on their side: turned upright"),
+        (len(sizes) > 1, "info", f"pictures of {len(sizes)} sizes ({shown}): one camera each"),
+    )  # fmt: skip
+    return [Finding(level, text) for there, level, text in met if there]
 
 
 def copy_upright(photographs: Iterable[CapturedPhotograph], folder: Path) -> None:
@@ -209,3 +171,36 @@ def copy_upright(photographs: Iterable[CapturedPhotograph], folder: Path) -> Non
             upright.save(
                 target, format="JPEG" if form == "MPO" else form, exif=upright.getexif(), **options
             )
+
+
+def complete_masks(
+    photographs: Sequence[CapturedPhotograph], masks: Path, *, out: Path
+) -> list[Finding]:
+    """Write a mask for every picture: COLMAP finds nothing in a picture without one.
+
+    ``masks`` holds ``a.jpg.png`` for ``a.jpg``, black where nothing is to be matched; pictures
+    without a mask are used whole.
+    """
+    absent = [item.name for item in photographs if not (masks / f"{item.name}.png").is_file()]
+    if len(absent) == len(photographs):
+        raise ProjectError(
+            f"--masks {masks}: holds no mask of the {len(photographs)} pictures; expected "
+            f"{absent[0]}.png for {absent[0]}"
+        )
+    for item in photographs:
+        mask = Image.new("L", item.size, 255)
+        file = masks / f"{item.name}.png"
+        if file.is_file():
+            mask = Image.fromarray(read_mask(file))
+            if mask.size != item.size:
+                raise ProjectError(
+                    f"{file}: {mask.width}x{mask.height} pixels; expected those of the upright "
+                    f"picture, {item.size[0]}x{item.size[1]}"
+                )
+        target = out / f"{item.name}.png"
+        target.parent.mkdir(parents=True, exist_ok=True)
+        mask.convert("L").save(target)
+    text = (
+        f"{len(absent)} of {len(photographs)} pictures have no mask ({named(absent)}): used whole"
+    )
+    return [Finding("warning", text)] if absent else []

@@ -7,16 +7,16 @@ folder gets its name when it is complete.
 from __future__ import annotations
 
 import shutil
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
-from functools import partial
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gvtools.capture import video
 from gvtools.capture.mapping import Mapped, find_cameras
-from gvtools.capture.masks import complete_masks
+from gvtools.capture.matching import MappingTask, Say
 from gvtools.capture.panoramas import (
     fisheye_params,
     lens_of,
@@ -24,7 +24,12 @@ from gvtools.capture.panoramas import (
     rename_faces,
     write_faces,
 )
-from gvtools.capture.photographs import CapturedPhotograph, copy_upright, find_photographs
+from gvtools.capture.photographs import (
+    CapturedPhotograph,
+    complete_masks,
+    copy_upright,
+    find_photographs,
+)
 from gvtools.capture.placement import WorldPlacement, place
 from gvtools.errors import OptionError, ProjectError
 from gvtools.files import write_json
@@ -40,8 +45,6 @@ REPORT = "capture.json"
 IMAGES, MODEL = "images", "sparse/0"
 # A model in which a smaller share of the matches became points is likely to be wrong.
 DOUBTFUL = 0.75
-
-Say = Callable[[str], object]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,11 +73,7 @@ class CaptureReport:
     placed_by: str  # "GPS", "distance" or "cameras", see ``placement``
     # Latitude and longitude [degrees] and height [m] of the origin; None without GPS.
     origin: tuple[float, float, float] | None
-    findings: tuple[Finding, ...] = field(default=())  # notes and warnings
-
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-ready."""
-        return asdict(self)
+    findings: tuple[Finding, ...] = ()  # notes and warnings
 
 
 def capture_photographs(
@@ -114,17 +113,7 @@ def capture_photographs(
             picked = video.pick_frames(
                 source, folder, count=frames, progress=lambda n: say(f"{n} frames looked at")
             )
-            text = (
-                f"{len(picked.frames)} of {picked.total} frames taken, over a motion of "
-                f"{picked.motion:.1f} widths of the picture"
-            )
-            findings.append(Finding("info", text))
-            if picked.lost:
-                text = (
-                    f"{source.name}: about {picked.lost} frames at its end cannot be read; copy "
-                    "the video again if it was cut off"
-                )
-                findings.append(Finding("warning", text))
+            findings += picked.findings(source.name)
         photographs, met = find_photographs(folder)
         findings += met
         if masks is not None:
@@ -143,8 +132,9 @@ def capture_photographs(
             source, photographs, mapped=mapped, placement=placement, features=features,
             findings=findings,
         )  # fmt: skip
-        mapped.model.write_binary(str(_made(work / MODEL)))
-        write_json(work / REPORT, report.to_dict())
+        (work / MODEL).mkdir(parents=True)
+        mapped.model.write_binary(str(work / MODEL))
+        write_json(work / REPORT, asdict(report))
         for spare in ("mapping", "frames", "whole_masks"):
             shutil.rmtree(work / spare, ignore_errors=True)
         draw(work, report)
@@ -163,23 +153,26 @@ def _map(
     say: Say,
 ) -> Mapped:
     """Write the pictures of the project, and find their cameras."""
-    find = partial(
-        find_cameras, work / IMAGES, work=_made(work / "mapping"), source=source,
-        in_order=is_video, learned=learned, say=say,
+    (work / "mapping").mkdir()
+    task = MappingTask(
+        work / IMAGES, (), work / "mapping", source=source, in_order=is_video, masks=masks,
+        learned=learned, say=say,
     )  # fmt: skip
     if lens != "equirectangular":
         copy_upright(photographs, work / IMAGES)
         fisheye = fisheye_params(photographs) if lens == "fisheye" else ""
         if fisheye:
             say("pictures of a fisheye lens: mapped as OPENCV_FISHEYE")
-        return find(_by_camera(photographs, one=is_video), masks=masks, fisheye=fisheye)
+        groups: dict[str, list[str]] = {}
+        for item in photographs:
+            groups.setdefault("" if is_video else item.camera, []).append(item.name)
+        return find_cameras(replace(task, cameras=list(groups.values()), fisheye=fisheye))
     say(f"cutting {len(photographs)} panoramas into faces")
     face_masks = work / "masks"
     rigs = write_faces(photographs, work / IMAGES, masks=masks, face_masks=face_masks)
-    mapped = find(
-        [rig.names(face) for rig in rigs for face in rig.faces],
-        masks=None if masks is None else face_masks, rigs=rigs,
-    )  # fmt: skip
+    faces = [rig.names(face) for rig in rigs for face in rig.faces]
+    masks = None if masks is None else face_masks
+    mapped = find_cameras(replace(task, cameras=faces, masks=masks, rigs=rigs))
     rename_faces(mapped.model, rigs, images=work / IMAGES, face_masks=face_masks)
     return replace(mapped, pairs=panorama_pairs(mapped.pairs))
 
@@ -228,19 +221,6 @@ def _refuse_filled(out: Path) -> None:
         )
 
 
-def _made(folder: Path) -> Path:
-    folder.mkdir(parents=True)
-    return folder
-
-
-def _by_camera(photographs: Sequence[CapturedPhotograph], *, one: bool) -> list[list[str]]:
-    """Names of the pictures of each camera, see ``CapturedPhotograph.camera``."""
-    groups: dict[str, list[str]] = {}
-    for item in photographs:
-        groups.setdefault("" if one else item.camera, []).append(item.name)
-    return list(groups.values())
-
-
 def _report(
     source: Path,
     photographs: Sequence[CapturedPhotograph],
@@ -253,49 +233,27 @@ def _report(
     model = mapped.model
     there = {picture_of(image.name) for image in model.images.values() if image.has_pose}
     registered = [item.name for item in photographs if item.name in there]
-    partners: dict[str, int] = {}
-    for pair in mapped.pairs:
-        for name in pair:
-            partners[name] = partners.get(name, 0) + 1
+    partners = Counter(name for pair in mapped.pairs for name in pair)
     left_out = {}
-    for item in photographs:
-        apart = [len(names) for names in mapped.others if item.name in names]
-        if item.name in there:
-            continue
-        if apart:
-            left_out[item.name] = (
-                f"in a further model of {apart[0]} pictures, which does not connect"
-            )
-        elif item.name in partners:
-            reason = f"overlaps with {partners[item.name]} pictures, and no camera fits them"
-            left_out[item.name] = reason
-        else:
-            left_out[item.name] = "overlaps with no other picture"
-    met = list(findings)
-    if left_out:
-        met.append(
-            Finding(
-                "warning",
-                f"{len(left_out)} of {len(photographs)} pictures have no camera "
-                f"({named(list(left_out))}); take more pictures between these and the others",
-            )
-        )
-    if mapped.others:
-        sizes = ", ".join(str(len(names)) for names in mapped.others)
-        text = f"further models of {sizes} pictures do not connect to the largest: not kept"
-        met.append(Finding("warning", text))
-    if mapped.flat:
-        text = (
-            "each pair of pictures is explained by a plane: focal length and depth hang by little; "
-            "look at the picture of the cameras, and take more pictures from the side"
-        )
-        met.append(Finding("warning", text))
-    if mapped.explained < DOUBTFUL:
-        text = (
-            f"{mapped.explained:.0%} of the matches became points: the cameras are doubtful; look "
-            "at the picture of the cameras, and take more pictures from places in between"
-        )
-        met.append(Finding("warning", text))
+    for name in (item.name for item in photographs if item.name not in there):
+        apart = [len(names) for names in mapped.others if name in names]
+        left_out[name] = (
+            f"in a further model of {apart[0]} pictures, which does not connect" if apart
+            else f"overlaps with {partners[name]} pictures, and no camera fits them"
+            if name in partners else "overlaps with no other picture"
+        )  # fmt: skip
+    sizes = ", ".join(str(len(names)) for names in mapped.others)
+    look = "look at the picture of the cameras, and take more pictures from"
+    met = (
+        (left_out, f"{len(left_out)} of {len(photographs)} pictures have no camera "
+         f"({named(list(left_out))}); take more pictures between these and the others"),
+        (sizes, f"further models of {sizes} pictures do not connect to the largest: not kept"),
+        (mapped.flat, "each pair of pictures is explained by a plane: focal length and depth hang "
+         f"by little; {look} the side"),
+        (mapped.explained < DOUBTFUL, f"{mapped.explained:.0%} of the matches became points: the "
+         f"cameras are doubtful; {look} places in between"),
+    )  # fmt: skip
+    warnings = [Finding("warning", text) for there, text in met if there]
     return CaptureReport(
         source=str(source.resolve()),
         pictures=len(photographs),
@@ -322,5 +280,5 @@ def _report(
         metric=placement.metric,
         placed_by=placement.by,
         origin=placement.origin,
-        findings=tuple(met),
+        findings=(*findings, *warnings),
     )

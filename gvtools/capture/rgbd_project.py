@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from gvtools.cameras import Cameras
-from gvtools.capture.bag import take_apart
+from gvtools.capture.matching import Say
 from gvtools.capture.project import REPORT, replaced_folder
 from gvtools.errors import ProjectError
 from gvtools.files import link_or_copy, write_json
@@ -48,8 +48,6 @@ DRAWN = 12
 # Loops that still miss by this (median) tell of wrong intrinsics, or of too fast a motion.
 DOUBTFUL_MM = 30.0
 
-Say = Callable[[str], object]
-
 
 @dataclass(frozen=True, kw_only=True)
 class RgbdCaptureReport:
@@ -77,10 +75,6 @@ class RgbdCaptureReport:
     placed_by: str = "first frame"
     findings: tuple[Finding, ...] = ()  # what was met
 
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-ready."""
-        return asdict(self)
-
 
 def capture_rgbd(
     source: Path,
@@ -103,7 +97,7 @@ def capture_rgbd(
         if source.is_file():
             folder = work / "recording"
             say(f"taking {source} apart")
-            unit = take_apart(source, folder)
+            unit = unpack_bag(source, folder)
             options = (options or RgbdOptions()).replaced(depth_unit=unit)
         recording, scene, resolved = _read(folder, options)
         say(f"comparing {len(scene)} frames")
@@ -117,10 +111,40 @@ def capture_rgbd(
         names = _names(recording)
         report = _report(scene, found, names, source=source, sources=recording)
         _write(work, recording, resolved, found=found, names=names)
-        write_json(work / REPORT, report.to_dict())
+        write_json(work / REPORT, asdict(report))
         shutil.rmtree(work / "recording", ignore_errors=True)
         draw(work, report)
     return report
+
+
+def unpack_bag(bag: Path, folder: Path) -> float:
+    """Write a RealSense recording in Redwood's layout to a new folder; metres a unit of depth.
+
+    The recording has one colour and one depth stream of the same rate; depth is registered to
+    colour.
+    """
+    import open3d as o3d
+
+    if not hasattr(o3d.t.io, "RSBagReader"):
+        raise ProjectError(
+            f"{bag}: this machine's Open3D has no reader of RealSense recordings (its packages for "
+            "x86-64 have one); convert it to folders color and depth there"
+        )
+    units = 0.0
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        try:
+            reader = o3d.t.io.RGBDVideoReader.create(str(bag))
+            if reader.is_opened():
+                units = float(reader.metadata.depth_scale)
+                reader.save_frames(str(folder))
+        except RuntimeError:
+            units = 0.0
+    if not (folder / "color").is_dir() or not units > 0:
+        raise ProjectError(
+            f"{bag}: Open3D cannot read it; expected a recording by librealsense with a colour "
+            "(RGB8) and a depth stream (Z16) of the same rate"
+        )
+    return 1 / units
 
 
 def _read(source: Path, options: RgbdOptions | None) -> tuple[Recording, Scene, RgbdOptions]:
@@ -165,12 +189,11 @@ def _readable(frame: PosedFrame) -> bool:
 
 def _names(recording: Recording) -> list[str]:
     """Names of the project's pictures: 7-Scenes' own stay, others are numbered in order."""
-    names = []
-    for number, frame in enumerate(recording.frames):
-        kept = ".color." in frame.image.name
-        suffix = frame.image.suffix.lower()
-        names.append(frame.image.name if kept else f"frame-{number:06d}.color{suffix}")
-    return names
+    images = [frame.image for frame in recording.frames]
+    return [
+        image.name if ".color." in image.name else f"frame-{i:06d}.color{image.suffix.lower()}"
+        for i, image in enumerate(images)
+    ]
 
 
 def _write(
@@ -258,13 +281,9 @@ def _report(
 
 
 def points_from_above(scene: Scene, keyframes: Sequence[str]) -> tuple[Cameras, Float64]:
-    """Cameras and a sparse cloud of a captured project, turned so that z is up, for its picture.
+    """Cameras and (N, 3) points of a captured project, turned so that z is up, for its picture.
 
-    Args:
-        keyframes: names of views that give points; of many, DRAWN are taken.
-
-    Returns:
-        The cameras, and (N, 3) points, metres; up is against the mean of the cameras' y axes.
+    Keyframes give points, of many DRAWN; up is against the mean of the cameras' y axes.
     """
     cameras = scene.cameras
     down = cameras.world_from_cam[:, :3, 1].mean(axis=0)
@@ -301,26 +320,14 @@ def _summary(rows: Float64) -> dict[str, float] | None:
 
 
 def _findings(found: RecordingPoses, left_out: dict[str, str], *, count: int) -> list[Finding]:
-    findings = []
-    if left_out:
-        findings.append(
-            Finding(
-                "warning",
-                f"{len(left_out)} of {count} frames could not be connected "
-                f"({named(list(left_out))}): left out; record with slower motion, and nothing "
-                "nearer than the depth camera's range",
-            )
-        )
-    if not found.loops:
-        text = (
-            "no loop closes: drift cannot be told; let the camera return to where it has been, and "
-            "record more frames a second"
-        )
-        findings.append(Finding("warning", text))
-    elif np.median(found.residuals[:, 0]) > DOUBTFUL_MM:
-        text = (
-            f"loops miss by {np.median(found.residuals[:, 0]):.0f} mm (median) after optimisation: "
-            "the poses are doubtful; look at the intrinsics, and record with slower motion"
-        )
-        findings.append(Finding("warning", text))
-    return findings
+    miss = float(np.median(found.residuals[:, 0])) if found.loops else 0.0
+    met = (
+        (left_out, f"{len(left_out)} of {count} frames could not be connected "
+         f"({named(list(left_out))}): left out; record with slower motion, and nothing nearer than "
+         "the depth camera's range"),
+        (not found.loops, "no loop closes: drift cannot be told; let the camera return to where it "
+         "has been, and record more frames a second"),
+        (miss > DOUBTFUL_MM, f"loops miss by {miss:.0f} mm (median) after optimisation: the poses "
+         "are doubtful; look at the intrinsics, and record with slower motion"),
+    )  # fmt: skip
+    return [Finding("warning", text) for there, text in met if there]

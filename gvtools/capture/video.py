@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.capture.photographs import sharpness
+from gvtools.capture.photographs import JPEG_QUALITY, sharpness
 from gvtools.errors import OptionError, ProjectError
+from gvtools.scenes.scene import Finding
 from gvtools.untrusted import regular
 
 # Frames are compared at this width. [pixels]
@@ -23,7 +24,6 @@ STEP = 0.07
 MOST = 300
 # A whole video with less motion than this share of the width shows the scene from one place.
 STANDS_STILL = 0.05
-JPEG_QUALITY = 97
 # Containers' counts of frames are not exact; this share may lack without a word.
 LOST = 0.05
 # Corners (Shi-Tomasi) that are tracked from frame to frame, at most.
@@ -40,6 +40,18 @@ class Picked:
     # How many frames the file announces beyond those that can be read; 0 where they are fewer
     # than LOST of all.
     lost: int = 0
+
+    def findings(self, name: str) -> list[Finding]:
+        """For the report of the capture of a video of that name."""
+        text = (
+            f"{len(self.frames)} of {self.total} frames taken, over a motion of "
+            f"{self.motion:.1f} widths of the picture"
+        )
+        lost = (
+            f"{name}: about {self.lost} frames at its end cannot be read; copy the video again if "
+            "it was cut off"
+        )
+        return [Finding("info", text), *([Finding("warning", lost)] if self.lost else ())]
 
 
 def pick_frames(

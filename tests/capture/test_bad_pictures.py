@@ -15,10 +15,9 @@ from command_line import refused
 from PIL import Image, ImageFilter
 from scipy.spatial.transform import Rotation
 
-from gvtools.capture.mapping import _explained_by, find_cameras
-from gvtools.capture.masks import complete_masks
-from gvtools.capture.matching import only_turned
-from gvtools.capture.photographs import copy_upright, find_photographs
+from gvtools.capture.mapping import _explained, find_cameras
+from gvtools.capture.matching import MappingTask, only_turned
+from gvtools.capture.photographs import complete_masks, copy_upright, find_photographs
 from gvtools.capture.project import capture_photographs
 from gvtools.errors import ProjectError
 from gvtools.procedural.room_sample import write_room
@@ -106,10 +105,8 @@ def test_a_camera_that_only_turned_is_told(texture: Image.Image, tmp_path: Path)
         Image.fromarray(seen).save(images / f"{index}.png")
     (tmp_path / "work").mkdir()
     with pytest.raises(ProjectError, match=r"away: .*the camera only turned.* while walking"):
-        find_cameras(
-            images, [[f"{index}.png" for index in range(4)]],
-            work=tmp_path / "work", source=Path("away"),
-        )  # fmt: skip
+        names = [f"{index}.png" for index in range(4)]
+        find_cameras(MappingTask(images, [names], tmp_path / "work", source=Path("away")))
 
 
 def walls(texture: Image.Image, folder: Path, poses: list[tuple[float, float]]) -> None:
@@ -167,8 +164,8 @@ def test_matches_of_another_place_are_no_fault_of_the_model() -> None:
 
     models = [model(["c", "d"], 10), model(["a", "b", "e"], 90)]
     pairs = {("a", "b"): 100, ("c", "d"): 50, ("b", "d"): 20}
-    assert _explained_by(models, pairs) == pytest.approx(90 / 120)
-    assert _explained_by(models[1:], pairs) == pytest.approx(90 / 170)
+    assert _explained(models, pairs) == pytest.approx(90 / 120)
+    assert _explained(models[1:], pairs) == pytest.approx(90 / 170)
 
 
 def test_pictures_of_phones_that_are_not_read_are_named(

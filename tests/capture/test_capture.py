@@ -13,7 +13,7 @@ from command_line import refused
 from PIL import Image
 
 from gvtools.capture.mapping import find_cameras
-from gvtools.capture.matching import sift_descriptors, similar_pairs
+from gvtools.capture.matching import MappingTask, sift_descriptors, similar_pairs
 from gvtools.capture.photographs import copy_upright, find_photographs
 from gvtools.capture.placement import place
 from gvtools.capture.project import capture_photographs
@@ -178,7 +178,7 @@ def test_wrong_inputs_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[
 def test_pairs_are_found_by_what_pictures_look_like(room: Path, tmp_path: Path) -> None:
     names = sorted(path.name for path in (room / "images").iterdir())
     with pytest.raises(ProjectError):
-        find_cameras(room / "images", [names[:1]], work=tmp_path)
+        find_cameras(MappingTask(room / "images", [names[:1]], tmp_path))
     database = tmp_path / "features.db"
     pycolmap.extract_features(database, room / "images")
     pairs = similar_pairs(sift_descriptors(database), nearest=3)

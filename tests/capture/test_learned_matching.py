@@ -14,6 +14,7 @@ from random_features import write_disk
 
 from gvtools.capture import matching
 from gvtools.capture.mapping import find_cameras
+from gvtools.capture.matching import MappingTask
 from gvtools.errors import CheckpointError, OptionError
 from gvtools.features import Features, LightGlueMatcher, SiftMatcher
 from gvtools.procedural.room_sample import write_room
@@ -118,7 +119,7 @@ def error_of(model: pycolmap.Reconstruction, room: Path, *, least: int) -> float
 def test_what_a_matcher_finds_becomes_a_model(room: Path, tmp_path: Path) -> None:
     """SIFT by the way that learned features take: the same cameras as by COLMAP's own."""
     names = sorted(path.name for path in (room / "images").iterdir())[:7]
-    mapped = find_cameras(room / "images", [names], work=tmp_path, learned=SiftMatcher())
+    mapped = find_cameras(MappingTask(room / "images", [names], tmp_path, learned=SiftMatcher()))
     assert mapped.matching == "all pairs"
     assert error_of(mapped.model, room, least=6) < 0.03
 
@@ -130,7 +131,7 @@ def test_a_model_comes_of_random_networks(
     """What DISK with random weights finds in neighbours is alike enough for a rough model."""
     names = sorted(path.name for path in (room / "images").iterdir())[:4]
     matcher = LightGlueMatcher("disk", weights=weights, max_features=1024)
-    mapped = find_cameras(room / "images", [names], work=tmp_path, learned=matcher)
+    mapped = find_cameras(MappingTask(room / "images", [names], tmp_path, learned=matcher))
     assert error_of(mapped.model, room, least=4) < 0.2
 
 
@@ -142,5 +143,5 @@ def test_a_model_comes_of_published_networks(extractor: str, room: Path, tmp_pat
     except CheckpointError as absent:
         pytest.skip(str(absent))
     names = sorted(path.name for path in (room / "images").iterdir())[:7]
-    mapped = find_cameras(room / "images", [names], work=tmp_path, learned=matcher)
+    mapped = find_cameras(MappingTask(room / "images", [names], tmp_path, learned=matcher))
     assert error_of(mapped.model, room, least=6) < 0.05
