@@ -155,11 +155,7 @@ ESTIMATE, ESTIMATE_TOLERANCE = 0.3, 0.03
 
 
 def add_depth(
-    image: NDArray[np.float32],
-    view: ReducedView,
-    gradient: NDArray[np.float32],
-    *,
-    weight: float,
+    image: NDArray[np.float32], view: ReducedView, gradient: NDArray[np.float32], *, weight: float
 ) -> None:
     """Add the gradient of |D - A d| / d over the pixels with depth d to (5, H, W).
 

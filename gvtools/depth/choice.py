@@ -42,12 +42,9 @@ def choose_source(
 
     "auto" takes recorded depth where there is some and computes the rest: by Depth Anything 3 where
     its weights are given, by COLMAP's PatchMatch where pycolmap has CUDA, otherwise by plane-sweep
-    stereo. Nothing but ``views`` is looked at.
-
-    Args:
-        choice: one of CHOICES; ``sensor`` wants RGB-D, ``colmap`` COLMAP's stereo maps, on disk or
-            computed now, ``plane-sweep`` photographs alone, ``da3`` a foundation model's weights.
-        foundation: options of Depth Anything 3; ``da3`` needs its ``weights``.
+    stereo. Of CHOICES, ``sensor`` wants RGB-D, ``colmap`` COLMAP's stereo maps, on disk or computed
+    now, ``plane-sweep`` photographs alone, ``da3`` a foundation model's weights. Nothing but
+    ``views`` is looked at.
     """
     chosen = _chosen(
         scene, views, choice, stereo=stereo, foundation=foundation or FoundationOptions()
@@ -58,9 +55,8 @@ def choose_source(
 def rough_source(scene: Scene, source: DepthSource) -> DepthSource:
     """A cheap source of depth for what needs no more than typical distances.
 
-    Args:
-        source: the run's. Where it takes its time, a plane sweep of small pictures with the poses
-            as they are is given instead.
+    Where the run's own takes its time, it is a plane sweep of small pictures with the poses as they
+    are.
     """
     if isinstance(source, MixedDepth):
         return rough_source(scene, source.computed)

@@ -33,15 +33,7 @@ def has_patch_match() -> bool:
 
 
 class ColmapPatchMatch:
-    """Depth of the given views, computed together when the first is asked for.
-
-    Args:
-        scene: with sparse points, from which COLMAP takes depth ranges and sources.
-
-    Attributes:
-        name: "colmap-patch-match".
-        views: names of the given views.
-    """
+    """Depth of some views of a scene with points, computed together when the first is asked for."""
 
     name = "colmap-patch-match"
 

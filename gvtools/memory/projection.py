@@ -202,10 +202,7 @@ class Projection:
         return True
 
     def _cull_boxes(
-        self,
-        boxes: NDArray[np.float32],
-        rows: NDArray[np.int64],
-        rect: NDArray[np.int32],
+        self, boxes: NDArray[np.float32], rows: NDArray[np.int64], rect: NDArray[np.int32]
     ) -> NDArray[np.float32]:
         """Rectangles of ``rows`` of boxes go to ``rect``; returns their depth ranges."""
         height, width = self.target.shape

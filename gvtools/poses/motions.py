@@ -20,12 +20,7 @@ def centers_of(poses: Float64) -> Float64:
 
 
 def nearest(
-    poses: Float64,
-    row: int,
-    *,
-    count: int,
-    shift: float,
-    by_angle: bool = False,
+    poses: Float64, row: int, *, count: int, shift: float, by_angle: bool = False
 ) -> NDArray[np.int64]:
     """Rows of the ``count`` poses that stand and look most like another one, the best first.
 

@@ -209,13 +209,7 @@ def compare(frames: RgbdFrames, source: int, target: int, *, start: Float64) -> 
 
 
 def _odometry(
-    first: SmallFrame,
-    second: SmallFrame,
-    K: Float64,
-    *,
-    start: Float64,
-    method: Any,
-    reach: float,
+    first: SmallFrame, second: SmallFrame, K: Float64, *, start: Float64, method: Any, reach: float
 ) -> Float64 | None:
     """(4, 4) ``second_from_first``, metres; None if odometry fails."""
     import open3d as o3d

@@ -17,9 +17,15 @@ from zipfile import BadZipFile
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.depth.fitted_depth import FittedDepth
-from gvtools.depth.scale import disagrees, scale_to_points
-from gvtools.depth.source import DepthMap, DepthSource, RecordedDepth, is_recorded
+from gvtools.depth.shown import FittedDepth
+from gvtools.depth.source import (
+    DepthMap,
+    DepthSource,
+    RecordedDepth,
+    disagrees,
+    is_recorded,
+    scale_to_points,
+)
 from gvtools.errors import DegenerateError, ProjectError
 from gvtools.files import replaced_when_written
 from gvtools.runs.layout import context_depth, target_stems

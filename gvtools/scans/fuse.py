@@ -60,9 +60,7 @@ def fuse_scan(
     return total
 
 
-def point_spacing(
-    positions: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def point_spacing(positions: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """The spacing of points on a surface, from the density around each.
 
     Args:

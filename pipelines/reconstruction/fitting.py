@@ -37,7 +37,7 @@ from gvtools.appearance.population import from_depth, from_points, pixels_with_d
 from gvtools.appearance.splat.gsplat_splatter import GsplatSplat, splatter_on
 from gvtools.appearance.splat.project_kernels import LOG_SCALE
 from gvtools.depth.choice import is_estimated
-from gvtools.depth.fitted_depth import FittedDepth
+from gvtools.depth.shown import FittedDepth
 from gvtools.depth.source import DepthMap, MixedDepth, RecordedDepth, is_recorded
 from gvtools.errors import DegenerateError, GvError, MemoryFileError, OptionError, ShapeError
 from gvtools.memory.projection import project

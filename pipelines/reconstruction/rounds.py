@@ -24,9 +24,8 @@ from gvtools.completers.base import (
     ScaleAlignment,
     run_completer,
 )
-from gvtools.depth.from_memory import MEMORY, depth_from_memory
-from gvtools.depth.scale import disagrees, scale_to_points
-from gvtools.depth.source import DepthMap
+from gvtools.depth.shown import MEMORY, depth_from_memory
+from gvtools.depth.source import DepthMap, disagrees, scale_to_points
 from gvtools.errors import ProjectError
 from gvtools.guidance import Guidance, concatenate
 from gvtools.kernels import parallel_kernels_may_overlap

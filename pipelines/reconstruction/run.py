@@ -67,12 +67,12 @@ def compile_kernels(
         config: of the run; its completer and the back end of projection tell which kernels.
     """
     from gvtools.completers.base import completer_type
-    from gvtools.depth import view_check
+    from gvtools.depth import source as depth_source
     from gvtools.kernels import compile_side_by_side
     from gvtools.memory import compile_kernels as memory
 
     completer = completer_type(config.completer)
-    sets = [memory.KERNELS, view_check.KERNELS, *completer.kernels, *more]
+    sets = [memory.KERNELS, depth_source.KERNELS, *completer.kernels, *more]
     if completer.costly and config.effort.inpaint_below > 0:
         sets += completer_type("inpaint").kernels
     if config.refine.wanted:

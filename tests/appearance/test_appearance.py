@@ -13,7 +13,7 @@ from gvtools.appearance.appearance import Appearance, Blend, blended, recolor
 from gvtools.appearance.gaussians import Gaussians
 from gvtools.appearance.splat.project_kernels import LOGIT
 from gvtools.cameras import Cameras
-from gvtools.depth.fitted_depth import LEAST_CONFIDENCE, OPAQUE, FittedDepth
+from gvtools.depth.shown import LEAST_CONFIDENCE, OPAQUE, FittedDepth
 from gvtools.guidance import Guidance
 from gvtools.memory.store.local_frame import LocalFrame
 from gvtools.scenes.scene import Frame

@@ -14,8 +14,14 @@ from gvtools.depth import choice, colmap_patch_match
 from gvtools.depth.choice import choose_source, rough_source
 from gvtools.depth.colmap_patch_match import ColmapPatchMatch
 from gvtools.depth.options import StereoOptions
-from gvtools.depth.scale import disagrees, scale_to_points
-from gvtools.depth.source import DepthMap, MixedDepth, RecordedDepth, is_recorded
+from gvtools.depth.source import (
+    DepthMap,
+    MixedDepth,
+    RecordedDepth,
+    disagrees,
+    is_recorded,
+    scale_to_points,
+)
 from gvtools.depth.stereo.plane_sweep import PlaneSweepStereo
 from gvtools.errors import CheckpointError, DegenerateError, OptionError, ProjectError
 from gvtools.scenes.colmap import read_colmap

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gvtools.cameras import Cameras
-from gvtools.depth.from_memory import depth_from_memory
+from gvtools.depth.shown import depth_from_memory
 from gvtools.memory.spatial_memory import SpatialMemory
 
 SIZE = (60, 80)

@@ -6,9 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gvtools.cameras import Cameras
-from gvtools.evaluation.depth_reprojection import (
-    depth_reprojection,
-)
+from gvtools.evaluation.depth_reprojection import depth_reprojection
 from gvtools.evaluation.feature_consistency import feature_consistency
 from gvtools.evaluation.posed_picture import PosedPicture
 

@@ -7,11 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gvtools.completers.geoverse.objective import (
-    gradient_weights,
-    high_gradient_loss,
-    rgb_loss,
-)
+from gvtools.completers.geoverse.objective import gradient_weights, high_gradient_loss, rgb_loss
 
 pytestmark = [pytest.mark.usefixtures("one_thread"), pytest.mark.filterwarnings("error")]
 

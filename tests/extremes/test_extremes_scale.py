@@ -7,12 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from extreme_scenes import (
-    IMAGES,
-    share_that_differs,
-    square_before_wall,
-    target,
-)
+from extreme_scenes import IMAGES, share_that_differs, square_before_wall, target
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from memory_scenes import camera, plane_view, points

@@ -140,8 +140,7 @@ def test_weights_count_by_their_ratios_alone(weight):
 @settings(max_examples=40, deadline=None)
 @given(
     st.one_of(
-        st.sampled_from([0.0, 1e-16, 1e-8, np.pi - 1e-8, np.pi - 1e-15, np.pi]),
-        st.floats(0, np.pi),
+        st.sampled_from([0.0, 1e-16, 1e-8, np.pi - 1e-8, np.pi - 1e-15, np.pi]), st.floats(0, np.pi)
     ),
     st.integers(0, 100),
     st.sampled_from([SPACE, PLANE]),
@@ -187,8 +186,7 @@ def test_confidences_count_by_their_ratios_alone(weight):
 
 @pytest.mark.parametrize("least", [0, 1, 200])
 @pytest.mark.parametrize(
-    ("depth", "valid"),
-    [(DEPTH, ~ALL), (DEPTH * np.nan, ALL), (-DEPTH, ALL), (DEPTH[:0], ALL[:0])],
+    ("depth", "valid"), [(DEPTH, ~ALL), (DEPTH * np.nan, ALL), (-DEPTH, ALL), (DEPTH[:0], ALL[:0])]
 )
 def test_no_common_pixel_has_no_scale(depth, valid, least):
     reference = np.abs(np.nan_to_num(depth)) + 1

@@ -71,8 +71,7 @@ def test_a_turn_on_the_spot_counts_though_centres_differ_by_rounding(noise, offs
 @settings(max_examples=40, deadline=None)
 @given(
     st.one_of(
-        st.sampled_from([0.0, 1e-16, 1e-8, np.pi - 1e-8, np.pi - 1e-15, np.pi]),
-        st.floats(0, np.pi),
+        st.sampled_from([0.0, 1e-16, 1e-8, np.pi - 1e-8, np.pi - 1e-15, np.pi]), st.floats(0, np.pi)
     ),
     st.integers(0, 50),
 )

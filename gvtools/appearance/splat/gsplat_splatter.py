@@ -14,14 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gvtools.appearance.splat.project_kernels import (
-    BLUR,
-    LOG_SCALE,
-    LOGIT,
-    QUATERNION,
-    SH,
-    VALUES,
-)
+from gvtools.appearance.splat.project_kernels import BLUR, LOG_SCALE, LOGIT, QUATERNION, SH, VALUES
 from gvtools.appearance.splat.splat import EXACT, Lens, Splat
 from gvtools.optional import installed
 

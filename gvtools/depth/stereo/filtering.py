@@ -48,15 +48,9 @@ LEAST, MOST = 0.02, 0.99
 
 
 def without_speckles(depth: Float32, step: float, smallest: int) -> Float32:
-    """Depth without patches smaller than ``smallest`` pixels.
+    """Depth (H, W) without patches smaller than ``smallest`` pixels.
 
-    Args:
-        depth: (H, W) float32, 0 = unknown.
-        step: relative difference up to which neighbours (above, below, beside) belong together.
-        smallest: pixels.
-
-    Returns:
-        (H, W) float32.
+    Neighbours (above, below, beside) belong together up to ``step``, a relative difference.
     """
     cell = np.arange(depth.size).reshape(depth.shape)
     first, second = [], []
@@ -74,16 +68,9 @@ def without_speckles(depth: Float32, step: float, smallest: int) -> Float32:
 
 @compiled(parallel=True)
 def weighted_median(depth: Float32, guide: Float32, weight: Float32, radius: int) -> Float32:
-    """The weighted median of known depths round each known pixel.
+    """The weighted median of known depths round each known pixel, of every other pixel of a square.
 
-    Args:
-        depth: (H, W) float32, 0 = unknown; stays unknown.
-        guide: (H, W) float32 luminance; neighbours of another luminance count less.
-        weight: (H, W) float32, how much each pixel's depth is trusted.
-        radius: pixels; every other pixel of the square is looked at.
-
-    Returns:
-        (H, W) float32.
+    Neighbours of another luminance (``guide``) count less.
     """
     height, width = depth.shape
     result = np.zeros_like(depth)
@@ -125,19 +112,10 @@ def weighted_median(depth: Float32, guide: Float32, weight: Float32, radius: int
 def enlarged(
     depth: Float32, guide: Float32, fine_guide: Float32, trust: Float32
 ) -> tuple[Float32, Float32]:
-    """A depth map at the size of a larger picture, its edges where the picture's are.
+    """A depth map (h, w) and its trust at the size of a larger picture, with the picture's edges.
 
     Among the four depths round a pixel, those that lie near the most alike one are averaged, by
-    nearness and likeness; a pixel whose nearest depth is unknown stays unknown.
-
-    Args:
-        depth: (h, w) float32, 0 = unknown.
-        guide: (h, w) float32 luminance of the small picture.
-        fine_guide: (H, W) float32 luminance of the large one.
-        trust: (h, w) float32, interpolated along.
-
-    Returns:
-        (H, W) float32 depth and (H, W) float32 trust.
+    nearness and likeness of luminance; a pixel whose nearest depth is unknown stays unknown.
     """
     height, width = fine_guide.shape
     h, w = depth.shape
@@ -177,13 +155,7 @@ def enlarged(
 def trimmed(depth: Float32, rgb: Bytes, radius: int) -> Float32:
     """Depth without the pixels whose look-alikes nearby are mostly unknown, again and again.
 
-    Args:
-        depth: (H, W) float32, 0 = unknown.
-        rgb: (H, W, 3) uint8.
-        radius: pixels round each pixel that vote, a little more than half the matched window.
-
-    Returns:
-        (H, W) float32.
+    ``radius`` is that of the pixels that vote, a little more than half the matched window.
     """
     import cv2
 
@@ -227,15 +199,7 @@ def regrown(
 ) -> Float32:
     """Depth continued into its candidates, pixel by pixel, where colour and depth run on.
 
-    Args:
-        depth: (H, W) float32, 0 = unknown.
-        candidates: (H, W) float32, depth that an unknown pixel would get; 0 = none.
-        rgb: (H, W, 3) uint8.
-        tolerance: relative difference in depth up to which two neighbours belong together.
-        steps: how far it grows, pixels (up, down and sideways).
-
-    Returns:
-        (H, W) float32.
+    Two neighbours belong together up to ``tolerance``, relative; it grows ``steps`` pixels far.
     """
     height, width = depth.shape
     grown = depth.copy()
@@ -290,16 +254,11 @@ def agreement(
     *,
     tolerance: float,
 ) -> Agreement:
-    """Compare a view's depth with the depth maps of other views.
+    """Compare a view's inverse depth (H, W), 0 where unknown, with that of other views of any size.
 
     Each pixel is carried into the other view, that view's depth is read there, and carried back
-    along the pixel's own ray: it confirms when both depths differ by no more than the tolerance.
-
-    Args:
-        inverse_depth: (H, W), 0 where unknown.
-        reference: the view's camera for these pixels, a batch of one.
-        others: for each other view its (H', W') inverse depth, 0 where unknown, and its camera.
-        tolerance: relative.
+    along the pixel's own ray: it confirms when both depths differ by no more than ``tolerance``,
+    relative.
     """
     height, width = inverse_depth.shape
     v, u = pixel_centers(height, width, inverse_depth.device)
@@ -339,13 +298,7 @@ def agreement(
 def confidence_of(cost: torch.Tensor, views: torch.Tensor, spread: torch.Tensor) -> torch.Tensor:
     """Predicted probability that the depth's relative error is below RIGHT.
 
-    Args:
-        cost: (H, W) photometric cost in [0, 1].
-        views: (H, W) how many other views confirm.
-        spread: (H, W) mean relative difference to these.
-
-    Returns:
-        (H, W) float32.
+    By photometric cost, how many other views confirm, and the mean relative difference to these.
     """
     number = views.to(cost.dtype)
     features = torch.stack([cost, number.clamp(max=4), (number >= 2).to(cost.dtype), 100 * spread])

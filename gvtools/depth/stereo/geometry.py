@@ -54,14 +54,9 @@ class Warps:
     offset: Float64  # (S, 3) float64, K_s t, pixels x scene units
 
     def project(self, xy: Float64, inverse_depth: Float64) -> tuple[Float64, Float64]:
-        """Where reference pixels lie in the sources.
+        """Where reference pixels (N, 2) at inverse depths (N,) lie in the sources.
 
-        Args:
-            xy: (N, 2) pixels.
-            inverse_depth: (N,), 1 / scene units.
-
-        Returns:
-            (S, N, 2) pixels, and (S, N) the source's depth over the reference's (<= 0: behind).
+        (S, N, 2) pixels, and (S, N) the source's depth over the reference's (<= 0: behind).
         """
         xy = np.asarray(xy, np.float64)
         homogeneous = np.concatenate([xy, np.ones_like(xy[:, :1])], axis=1)
@@ -94,14 +89,8 @@ def disparity_rate(
 ) -> NDArray[np.float64]:
     """How far a pixel moves in each source from ``far`` to ``near``, over the inverse depths' gap.
 
-    Args:
-        reference: a batch of one.
-        near: depth, scene units.
-        far: depth, scene units, may be infinite.
-
-    Returns:
-        (S,) float64, pixels x scene units: the median over the pixels that both depths keep in
-        the source; 0 where there are too few.
+    (S,) pixels x scene units: the median over the pixels that both depths keep in the source; 0
+    where there are too few. ``far`` may be infinite.
     """
     warps = relative_warps(reference, sources)
     xy = pixel_grid(reference, 12)
@@ -188,12 +177,7 @@ def estimate_range(scene: Scene, name: str) -> DepthRange:
 
 
 def range_of_depths(depths: Float64, *, origin: str, margin: float = MARGIN) -> DepthRange:
-    """The range that known depths of a view span.
-
-    Args:
-        depths: (N,) scene units, outliers among them.
-        margin: factor by which the range reaches beyond the percentiles.
-    """
+    """The range that known depths (N,) of a view span, outliers among them, times a margin."""
     low, lower, upper, high = np.percentile(depths, [LOW, 25, 75, HIGH])
     return DepthRange(float(low / margin), float(high * margin), float(lower), float(upper), origin)
 
@@ -241,15 +225,12 @@ def _baseline_depth(scene: Scene, name: str) -> float:
 def choose_sources(
     scene: Scene, name: str, candidates: tuple[str, ...], *, count: int, depths: DepthRange
 ) -> tuple[str, ...]:
-    """Names of the best source views for a reference view, best first.
+    """Names of the best source views among candidates for a reference view, best first.
 
     Each candidate is rated by the points of the reference that it sees too, each weighted by its
     parallax: sparse points with their tracks when the reference has enough of them, else points
     spread over its frustum inside the depth range. Candidates close to a chosen one count less, and
     those at the reference's own place are none.
-
-    Args:
-        candidates: views that may be looked at; the reference itself is left out.
     """
     others = tuple(candidate for candidate in candidates if candidate != name)
     if not others:
@@ -324,12 +305,9 @@ class Hypotheses:
 def plane_hypotheses(
     reference: Cameras, sources: Cameras, depths: DepthRange, *, planes: int | None
 ) -> Hypotheses:
-    """As many planes as the baseline resolves on this level.
+    """As many planes as the baseline resolves on this level, or ``planes``.
 
-    Args:
-        reference: the level's camera, a batch of one.
-        planes: how many; None for one per pixel of disparity in the source that moves most,
-            between 8 and 256.
+    That is one per pixel of disparity in the source that moves most, between 8 and 256.
     """
     low, high = 1 / depths.far, 1 / depths.near
     if planes is None:
@@ -340,13 +318,9 @@ def plane_hypotheses(
 
 
 def best_plane(volume: torch.Tensor, hypotheses: Hypotheses) -> tuple[torch.Tensor, torch.Tensor]:
-    """The cheapest plane of each pixel, refined between the planes by a parabola.
+    """The cheapest plane of each pixel by costs (H, W, D), refined between planes by a parabola.
 
-    Args:
-        volume: (H, W, D) float32 costs.
-
-    Returns:
-        (H, W) float32 inverse depth, and (H, W) int64 which plane was cheapest.
+    (H, W) inverse depth, and (H, W) which plane was cheapest.
     """
     count = volume.shape[-1]
     index = volume.argmin(dim=-1)

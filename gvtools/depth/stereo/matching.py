@@ -64,41 +64,24 @@ class Matcher(ABC):
 
     @abstractmethod
     def sweep(self, level: Level, inverse_depths: torch.Tensor) -> torch.Tensor:
-        """Photometric cost of planes parallel to the reference's image.
+        """(H, W, D) photometric cost of planes at depths (D,) parallel to the reference's image.
 
         The cost is 1 - ZNCC over a square window, mean of the best sources. Both variances are
         raised by the noise's, so that windows without texture match nothing.
-
-        Args:
-            inverse_depths: (D,) float32.
-
-        Returns:
-            (H, W, D) float32 in [0, 1].
         """
 
     @abstractmethod
     def aggregate(self, volume: torch.Tensor, guide: torch.Tensor) -> torch.Tensor:
-        """Semi-global aggregation along eight paths.
+        """(H, W, D) costs after semi-global aggregation, the mean of eight paths.
 
-        Args:
-            volume: (H, W, D) float32 costs.
-            guide: (H, W) float32 luminance; across its edges a jump is cheaper.
-
-        Returns:
-            (H, W, D) float32, mean of the paths' costs.
+        Across the edges of ``guide`` (H, W), luminance, a jump is cheaper.
         """
 
     @abstractmethod
     def score(self, level: Level, planes: torch.Tensor) -> torch.Tensor:
-        """Photometric cost of one slanted plane for each pixel.
+        """(H, W) photometric cost of one slanted plane a pixel, over the window's weighted taps.
 
-        Args:
-            level: the pictures; the window's pixels are ``level.taps``, weighted.
-            planes: (3, H, W) float32: inverse depth at the pixel, and its change per pixel in x
-                and y.
-
-        Returns:
-            (H, W) float32 in [0, 1].
+        ``planes`` (3, H, W): inverse depth at the pixel, and its change per pixel in x and y.
         """
 
 
@@ -119,13 +102,7 @@ def working_size(width: int, height: int, max_side: int) -> tuple[int, int]:
 def build_pyramid(
     rgb: NDArray[np.uint8], camera: Cameras, *, max_side: int, levels: int
 ) -> Pyramid:
-    """The levels of one picture, each half the size of the one before.
-
-    Args:
-        rgb: (H, W, 3).
-        camera: a batch of one.
-        levels: see StereoOptions; fewer where the picture would fall below 16 pixels.
-    """
+    """The levels of one picture, each half the size of the one before, at least 16 pixels."""
     colors = torch.from_numpy(rgb).permute(2, 0, 1).float() / 255
     luminance = rgb_to_grayscale(colors)[0]  # (H, W), BT.601
     width, height = working_size(rgb.shape[1], rgb.shape[0], max_side)
@@ -184,21 +161,9 @@ def window_weights(image: torch.Tensor, taps: torch.Tensor) -> torch.Tensor:
 
 
 def level_of(
-    reference: Pyramid,
-    sources: Sequence[Pyramid],
-    index: int,
-    *,
-    window: int,
-    device: torch.device,
+    reference: Pyramid, sources: Sequence[Pyramid], index: int, *, window: int, device: torch.device
 ) -> Level:
-    """One level of a reference view and its sources, ready to be matched.
-
-    Args:
-        sources: at least one.
-        index: 0 is the finest.
-        window: side of the compared window, pixels.
-        device: where it is matched.
-    """
+    """Level ``index``, 0 the finest, of a reference view and its sources, ready to be matched."""
     chosen = [min(index, len(source.images) - 1) for source in sources]
     images = [source.images[i] for source, i in zip(sources, chosen, strict=True)]
     cameras = concatenate([source.cameras[i] for source, i in zip(sources, chosen, strict=True)])
@@ -222,13 +187,7 @@ def level_of(
 
 
 def textured(image: torch.Tensor, *, window: int, noise: float) -> torch.Tensor:
-    """(H, W) bool, where a window's detail stands out from the picture's noise.
-
-    Args:
-        image: (H, W) float32 luminance in [0, 1].
-        window: its side, pixels, odd.
-        noise: standard deviation of the noise to expect, see StereoOptions.
-    """
+    """(H, W) where a window's detail stands out from the picture's noise, found or expected."""
     detail = detail_of(image, window)
     return detail > max(EXPECTED * noise, CLEAR * noise_of(image, detail))
 
@@ -255,12 +214,7 @@ def detail_of(image: torch.Tensor, window: int) -> torch.Tensor:
 
 
 def noise_of(image: torch.Tensor, detail: torch.Tensor) -> float:
-    """The detail of a picture's blankest windows; 0 where all of it is clipped.
-
-    Args:
-        image: (H, W) float32 luminance in [0, 1].
-        detail: (H, W) float32, see ``detail_of``.
-    """
+    """The detail (H, W) of a picture's blankest windows; 0 where all of it is clipped."""
     exposed = (image > CLIPPED) & (image < 1 - CLIPPED)
     if not exposed.any():
         return 0.0

@@ -134,16 +134,9 @@ def pixel_centers(
 def bilinear(
     image: torch.Tensor, size: Sequence[int], x: torch.Tensor, y: torch.Tensor
 ) -> torch.Tensor:
-    """The values of a picture at some places, held at its border.
+    """The values of a picture, the first ``size`` pixels of an image, at places x and y (H, W).
 
-    Args:
-        image: (H', W'), of which the first ``size`` (width, height) pixels are the picture.
-        size: pixels.
-        x: (H, W) pixel coordinates; the first pixel's centre is 0.5, unlike kornia's 0.
-        y: (H, W).
-
-    Returns:
-        (H, W).
+    The first pixel's centre is 0.5, unlike kornia's 0; values are held at the border.
     """
     picture = image[None, None, : size[1], : size[0]]
     places = ((x - 0.5)[None], (y - 0.5)[None])
@@ -175,15 +168,11 @@ class ResidualFlow:
 def residual_flow(
     level: Level, inverse_depth: torch.Tensor, *, noise: float, iterations: int = 3
 ) -> ResidualFlow:
-    """Lucas and Kanade's motion between the reference and each warped source.
+    """Lucas and Kanade's motion between the reference and each source, warped by inverse depth.
 
     Both windows are freed of their mean, so a difference in exposure does no harm. A pixel's motion
     counts by how alike the windows are once moved, and not at all where the picture does not vary
     in both directions, where the window leaves the source, or where the motion is long.
-
-    Args:
-        inverse_depth: (H, W).
-        noise: standard deviation of the pictures' noise.
     """
     height, width = level.reference.shape
     v, u = pixel_centers(height, width, level.reference.device)

@@ -49,16 +49,11 @@ EXACT_ENOUGH = 0.25
 class PlaneSweepStereo:
     """Depth from photographs with known poses; see gvtools.depth.source.DepthSource.
 
-    Only the views named at construction are ever looked at as sources. Each view's own estimate is
-    computed once, when it or a view that it confirms is asked for, and kept (about 5 MB at
-    640x480); asking for the depth of all views therefore takes time linear in their number. Poses
-    are adjusted, where they are, at the first question; depth is that of the adjusted camera, and
-    a view outside ``views`` keeps the pose that it has.
-
-    Attributes:
-        name: "plane-sweep".
-        options: see StereoOptions.
-        views: names of the views usable as sources.
+    Only ``views`` are ever looked at as sources. Each view's own estimate is computed once, when it
+    or a view that it confirms is asked for, and kept (about 5 MB at 640x480); asking for the depth
+    of all views therefore takes time linear in their number. Poses are adjusted, where they are, at
+    the first question; depth is that of the adjusted camera, and a view outside ``views`` keeps the
+    pose that it has.
     """
 
     name = "plane-sweep"
@@ -66,11 +61,7 @@ class PlaneSweepStereo:
     def __init__(
         self, scene: Scene, *, options: StereoOptions | None = None, views: tuple[str, ...]
     ) -> None:
-        """Prepare; nothing is computed yet.
-
-        Args:
-            views: names of the views usable as sources; no other picture is read.
-        """
+        """Prepare; nothing is computed yet."""
         self.options = options or StereoOptions()
         self.views = tuple(dict.fromkeys(views))
         if len(self.views) < 2:

@@ -36,16 +36,7 @@ MATCHED, BETTER, BETTER_SHARE = 0.3, 0.02, 0.05
 
 
 def upsampled(planes: torch.Tensor, height: int, width: int) -> torch.Tensor:
-    """The planes of a coarser level, continued to the pixels of a finer one.
-
-    Args:
-        planes: (3, h, w) inverse depth and its change per pixel in x and y.
-        height: of the finer level.
-        width: of the finer level.
-
-    Returns:
-        (3, height, width).
-    """
+    """The planes (3, h, w) of a coarser level, see Matcher.score, at the pixels of a finer one."""
     device = planes.device
     down, across = planes.shape[1] / height, planes.shape[2] / width
     y = (torch.arange(height, device=device) + 0.5) * down
@@ -62,14 +53,8 @@ def fitted(
 ) -> torch.Tensor:
     """The plane that fits the inverse depths round each pixel best, by weighted least squares.
 
-    Args:
-        inverse_depth: (H, W).
-        weight: (H, W), 0 to leave a pixel out.
-        radius: half side of the square that is fitted.
-
-    Returns:
-        (3, H, W): see Matcher.score. Without enough weight in reach, the plane is parallel to the
-        image.
+    (3, H, W), see Matcher.score. Without enough weight in reach, the plane is parallel to the
+    image.
     """
     size = 2 * radius + 1
     offset = torch.arange(-radius, radius + 1, device=weight.device, dtype=weight.dtype)
@@ -110,18 +95,12 @@ def refined(
     bounds: tuple[float, float],
     iterations: int,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Propagate, adjust and refine planes on one level.
+    """Propagate, adjust and refine planes (3, H, W) on one level; gives them and their costs.
 
     All pixels take the same kind of proposal at once: a neighbour's plane, a shifted plane, the
     plane fitted to the surroundings. What lowers the photometric cost is kept. Proposals follow
-    each other, so planes travel several pixels per round. Nothing is drawn at random.
-
-    Args:
-        planes: (3, H, W) to begin with.
-        step: inverse depth that moves one pixel in the source that moves most.
-
-    Returns:
-        (3, H, W) planes and (H, W) their costs.
+    each other, so planes travel several pixels per round. Nothing is drawn at random. ``step``:
+    inverse depth that moves one pixel in the source that moves most.
     """
     planes = planes.clone()
     planes[0].clamp_(*bounds)
@@ -255,11 +234,7 @@ def fine_depth(
 
 
 def enough_disparity(reference: Cameras, sources: Cameras, depths: DepthRange) -> NDArray[np.bool_]:
-    """(S,) whether each source sees the nearest depth move at all.
-
-    Args:
-        reference: the finest level's camera, a batch of one.
-    """
+    """(S,) whether each source sees the nearest depth move at all, on the finest level."""
     rate = disparity_rate(reference, sources, depths.near, far=np.inf)
     return rate / depths.near >= LEAST_DISPARITY
 
@@ -270,11 +245,7 @@ def only_turned(
     """Whether a turn of the camera explains the pictures as well as any depth does.
 
     Infinite depth moves pixels by the turn alone. Where cameras moved next to nothing, it matches
-    every pixel at least as well as the depth that was found.
-
-    Args:
-        cost: (H, W) float32 photometric cost of the depth that was found.
-        textured: (H, W) bool.
+    every pixel at least as well as the depth that was found, of ``cost`` (H, W).
     """
     turned = matcher.sweep(level, torch.zeros(1, device=cost.device))[..., 0]
     matched = textured & (torch.minimum(cost, turned) < MATCHED)

@@ -413,12 +413,7 @@ class TileSet:
 
 
 def part_levels(
-    cells: NDArray[np.int64],
-    weight: NDArray[np.float64],
-    level: int,
-    *,
-    least: int,
-    largest: float,
+    cells: NDArray[np.int64], weight: NDArray[np.float64], level: int, *, least: int, largest: float
 ) -> tuple[NDArray[np.int64], list[Node]]:
     """Levels of the parts of a cube that is divided until each part is small enough.
 

@@ -1,4 +1,4 @@
-"""Depth of photographs as fitted Gaussians show it."""
+"""Depth of a photograph as the memory's projection, or fitted Gaussians, show it."""
 
 from __future__ import annotations
 
@@ -10,11 +10,61 @@ import torch
 from numpy.typing import NDArray
 
 from gvtools.appearance.appearance import Appearance
+from gvtools.cameras import Cameras
 from gvtools.depth.source import DepthMap
 from gvtools.depth.stereo.filtering import agreement
+from gvtools.memory.spatial_memory import SpatialMemory
+from gvtools.memory.splat.api import SplatOptions
 from gvtools.scenes.images import resize_nearest
 from gvtools.scenes.scene import Frame, Scene, View
 from gvtools.view_selection import nearest_views
+
+# Colours that differ by less, in the mean over a window, may be of one surface: pictures have
+# noise, edges are half a pixel off, and surfaces shine. In a picture darker than BRIGHT it is less.
+SAME_COLOR, BRIGHT, WINDOW = 0.2, 0.5, 5
+# A photograph this many times brighter or darker than memory tells too little.
+MOST_GAIN = 4.0
+# What such depth names as its source.
+MEMORY = "memory"
+
+
+def depth_from_memory(
+    memory: SpatialMemory,
+    camera: Cameras,
+    rgb: NDArray[np.uint8],
+    *,
+    least: float,
+    options: SplatOptions | None = None,
+) -> DepthMap | None:
+    """The memory's projected depth of a photograph, if the projection matches enough of it.
+
+    A pixel matches where the memory's observed content shows the photograph's colour, but for a
+    gain per channel that all pixels share; the darker the photograph, the less may be off. None
+    where fewer pixels than the share ``least`` match.
+    """
+    if not len(memory):
+        return None
+    known = memory.project(camera, options=options)
+    valid = known.valid[0] & ~known.generated[0]
+    if valid.mean() < least or not valid.any():
+        return None
+    seen = (rgb / np.float32(255)).astype(np.float32)
+    shown = known.rgb[0]
+    level = np.median(seen[valid], axis=0)
+    gain = level / np.maximum(np.median(shown[valid], axis=0), 1 / 255)
+    if gain.max() > MOST_GAIN or gain.min() < 1 / MOST_GAIN:
+        return None
+    tolerance = SAME_COLOR * min(1.0, float(level.mean()) / BRIGHT)
+    off = np.abs(shown * gain.astype(np.float32) - seen).mean(-1) * valid
+    size = (WINDOW, WINDOW)
+    mean = cv2.blur(off, size) / np.maximum(cv2.blur(valid.astype(np.float32), size), 1e-6)
+    matching = valid & (mean < tolerance)
+    if matching.mean() < least:
+        return None
+    depth = np.where(matching, known.depth[0], np.float32(0))
+    confidence = np.where(matching, np.minimum(known.confidence[0], 1), np.float32(1))
+    return DepthMap(depth, confidence.astype(np.float32), MEMORY)
+
 
 # A pixel has depth where the Gaussians stop this share of the light.
 OPAQUE = 0.8
@@ -50,12 +100,9 @@ class SweptDepth(Protocol):
 class FittedDepth:
     """Depth of views by Gaussians that were fitted to them.
 
-    Confidence is by how many depth maps agree that were found without the Gaussians: the view's
-    own and those of views near it. The mean of all that agree is taken. Without such maps it falls
+    Confidence is by how many depth maps agree that were found without the Gaussians: the view's own
+    and those of views near it. The mean of all that agree is taken. Without such maps it falls
     where the Gaussians do not look like the photograph.
-
-    Args:
-        swept: depth that was found without them; None for none.
     """
 
     name = "fitted"

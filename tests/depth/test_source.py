@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from gvtools.cameras import Cameras
-from gvtools.depth.source import RecordedDepth
-from gvtools.depth.view_check import LEAST, contradicted
+from gvtools.depth.source import LEAST, RecordedDepth, contradicted
 from gvtools.scenes.scene import Frame, Scene, View
 
 HEIGHT, WIDTH, FAR = 40, 60, 3.0
