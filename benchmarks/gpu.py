@@ -22,7 +22,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -35,6 +35,8 @@ import gvtools
 ROOT = Path(__file__).parents[1]
 Figures = dict[str, str]
 LONGEST_ERROR = 160
+# Models of pictures of this side train one sample at a time, and recompute layers. [px]
+LARGE = 256
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,7 @@ class Sizes:
         config: of the generative core, random weights.
         tests: arguments that select the tests.
         repeat: timed turns.
+        compile: measure passes of compiled blocks, too.
         points: voxels of the memory that is projected.
         picture: (W, H) of projections and of pictures of Gaussians, px.
         gaussians: how many.
@@ -57,6 +60,7 @@ class Sizes:
     config: str = "tiny"
     tests: tuple[str, ...] = ("tests", "-m", "gpu")
     repeat: int = 7
+    compile: bool = True
     points: int = 1_000_000
     picture: tuple[int, int] = (640, 480)
     gaussians: int = 100_000
@@ -68,6 +72,7 @@ class Sizes:
 
 SMALL: dict[str, Any] = {
     "repeat": 1,
+    "compile": False,
     "points": 20_000,
     "picture": (48, 36),
     "gaussians": 300,
@@ -113,17 +118,24 @@ def complete(sizes: Sizes) -> Figures:
     from pipelines.bench.options import CompleteOptions
 
     found: Figures = {}
-    for precision in ("bfloat16", "float32"):
+    ways = {"bfloat16": False, "float32": False}
+    if sizes.compile:
+        ways["bfloat16, compiled"] = True
+    for way, compiled in ways.items():
         options = CompleteOptions(
-            config=sizes.config, size=sizes.core, device="cuda", precision=precision,
-            repeat=sizes.repeat,
+            config=sizes.config, size=sizes.core, device="cuda", precision=way.split(",")[0],
+            repeat=sizes.repeat, compile=compiled,
         )  # fmt: skip
         figures = complete_figures(options)
-        whole = figures["results"][-1]
-        found[f"a pass of {sizes.config}, {precision}"] = (
+        *stages, whole = figures["results"]
+        found[f"a pass of {sizes.config}, {way}"] = (
             f"{whole['ours_s'] * 1e3:.1f} ms, {whole['tflop_per_s']:.3g} TFLOP/s, first "
             f"{figures['first_pass_s']:.2f} s, peak {figures['peak_bytes'] / 2**20:,.0f} MiB"
         )
+        found[f"its parts, {way}"] = ", ".join(
+            f"{row['name']} {row['ours_s'] * 1e3:.0f} ms" for row in stages if not row["within"]
+        )
+        torch.cuda.empty_cache()
     return found
 
 
@@ -220,6 +232,7 @@ def plane_sweep(sizes: Sizes) -> Figures:
 def training_step(sizes: Sizes) -> Figures:
     """A step of stage ``denoiser`` on random views, in bfloat16: loss, gradients, AdamW."""
     from gvtools.completers.geoverse.config import named
+    from gvtools.networks.compute import set_recompute
     from gvtools.training.options import DenoiserStageOptions
     from gvtools.training.samples import Draws, TrainingBatch
     from gvtools.training.stages import DenoiserStage
@@ -227,19 +240,21 @@ def training_step(sizes: Sizes) -> Figures:
 
     config = named(sizes.config)
     if config.video is not None:
-        raise RuntimeError(f"{config.name} needs its video prior's weights in training; use tiny")
+        config = replace(config, name=f"{config.name} without video", video=None, injection="none")
     size = sizes.core or (config.image_size, config.image_size)
     views = random_views(size, context=2, targets=2)
-    rows = torch.zeros(sizes.samples, dtype=torch.long)
+    samples = sizes.samples if config.image_size < LARGE else 1
+    rows = torch.zeros(samples, dtype=torch.long)
     batch = TrainingBatch(views, views.images, views.depth + 1.5 * ~views.valid).samples(rows)
     batch = batch.to("cuda")
     stage = DenoiserStage(random_model(config, "cuda"), DenoiserStageOptions()).to("cuda")
+    set_recompute(stage, config.image_size >= LARGE)
     learning = [p for p in stage.parameters() if p.requires_grad]
     optimizer = torch.optim.AdamW(learning, lr=1e-5)
     losses: list[float] = []
 
     def step() -> None:
-        draws = Draws(0, stage.name, len(losses), tuple(range(sizes.samples)))
+        draws = Draws(0, stage.name, len(losses), tuple(range(samples)))
         with torch.autocast("cuda", dtype=torch.bfloat16):
             loss, _ = stage(batch, draws)
         loss.backward()
@@ -252,7 +267,7 @@ def training_step(sizes: Sizes) -> Figures:
     if not np.isfinite(losses).all():
         raise RuntimeError(f"the losses are {losses}; expected finite numbers")
     peak = torch.cuda.max_memory_allocated() / 2**20
-    what = f"{config.name}, {sizes.samples} x 4 views of {size[0]}x{size[1]}, bfloat16"
+    what = f"{config.name}, {samples} x 4 views of {size[0]}x{size[1]}, bfloat16"
     return {what: f"{seconds * 1e3:.0f} ms, peak {peak:,.0f} MiB"}
 
 

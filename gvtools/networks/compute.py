@@ -12,7 +12,7 @@ float32. On a CPU it takes bfloat16 where the processor multiplies it faster, wh
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import cache
 from typing import Any
@@ -96,6 +96,37 @@ def hold_in(dtype: torch.dtype, *modules: nn.Module | None) -> None:
                 for name, weight in list(layer.named_parameters(recurse=False)):
                     held = weight.detach().to(dtype)
                     setattr(layer, name, nn.Parameter(held, requires_grad=False))
+
+
+def on_device(
+    tensor: Tensor, device: torch.device | str | None, *, dtype: torch.dtype | None = None
+) -> Tensor:
+    """A CPU tensor on a device; to a CUDA card through pinned memory, so that nobody waits."""
+    if device is None or torch.device(device).type != "cuda":
+        return tensor.to(device=device, dtype=dtype)
+    return tensor.to(dtype=dtype).pin_memory().to(device, non_blocking=True)
+
+
+def constant(values: Sequence[float], like: Tensor) -> Tensor:
+    """(N,) of the type of ``like``, where it lies."""
+    return on_device(torch.tensor(values, dtype=like.dtype), like.device)
+
+
+class RememberedTable:
+    """A table that is made of a learned one, made again when that or the key changes."""
+
+    def __init__(self) -> None:
+        self._made: tuple[Any, ...] | None = None
+
+    def __call__(self, key: Any, learned: Tensor, make: Callable[[], Tensor]) -> Tensor:
+        """What ``make`` gives of ``learned`` for this key; not remembered while it is trained."""
+        if learned.requires_grad and torch.is_grad_enabled():
+            return make()
+        version = (key, learned.device, learned.dtype, learned._version)
+        if self._made is None or self._made[0] is not learned or self._made[1] != version:
+            self._made = (learned, version, make())
+        table: Tensor = self._made[2]
+        return table
 
 
 @cache

@@ -209,9 +209,7 @@ def complete_figures(options: CompleteOptions) -> dict[str, Any]:
     )
     counts = timed.flops()
     if options.compile:
-        for part in (model.level1, model.cascade, model.control, model.rgb_head):
-            if part is not None:
-                part.compile()
+        model.compile_blocks()
     forget_peak(options.place)
     first_pass = timed.run()
     return {

@@ -108,7 +108,13 @@ def test_pictures_and_gradients_are_those_of_the_cpu():
     pytest.importorskip("gsplat", reason="gsplat is not installed")
     values, weight = gaussians(), np.random.default_rng(0).normal(size=(5, *SIZE[::-1]))
     pictures = [kind(values, lens()) for kind in (Splat, GsplatSplat)]
-    np.testing.assert_allclose(pictures[1].image, pictures[0].image, atol=0.02)
+    # Its CUDA kernels leave out what adds less than 1 / 255 of opacity: more in units of depth.
+    farthest = values[:, 2].max()
+    for channel, (theirs, ours) in enumerate(
+        zip(pictures[1].image, pictures[0].image, strict=True)
+    ):
+        bound = 0.02 * (farthest if channel == 3 else 1)
+        np.testing.assert_allclose(theirs, ours, atol=bound)
     dense = []
     for picture in pictures:
         rows, d_camera = picture.backward(weight.astype(np.float32))

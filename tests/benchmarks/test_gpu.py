@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from dataclasses import replace
 
 import pytest
 import torch
@@ -68,8 +67,3 @@ def test_every_part_runs_on_a_posed_device(monkeypatch, tmp_path, capsys):
     for name in parts:
         assert f"| {name} |" in text
     assert "failed" not in text
-
-
-def test_training_with_a_video_prior_is_refused():
-    with pytest.raises(RuntimeError, match="base needs its video prior"):
-        gpu.training_step(replace(gpu.Sizes(), config="base"))

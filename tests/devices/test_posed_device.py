@@ -13,6 +13,7 @@ from posed_cuda import posed_cuda
 from torch import nn
 
 from gvtools.completers.geoverse.completer import GeoVerseCompleter
+from pipelines.bench.random_model import random_views
 
 SAME = "Expected all tensors to be on the same device"
 
@@ -163,3 +164,18 @@ def test_a_batch_that_was_left_on_the_cpu_is_found(posed):
 def test_auto_is_the_posed_device(posed, tmp_path):
     completer = GeoVerseCompleter(weights=str(micro.weights_folder(tmp_path / "weights")))
     assert next(completer.model.parameters()).is_cuda
+
+
+WAITS = ("nonzero", "unique", "_local_scalar_dense", "equal")
+
+
+def test_a_pass_waits_for_the_device_only_to_learn_which_views_have_hints(posed, tmp_path):
+    completer = GeoVerseCompleter(
+        weights=str(micro.weights_folder(tmp_path)), device="cuda", precision="float32"
+    )
+    batch = random_views((24, 32), context=2, targets=2).to("cuda")
+    model = completer.model
+    posed.clear()
+    model.generate(batch)
+    waits = {name: n for name, n in posed.items() if any(word in name for word in WAITS)}
+    assert 0 < sum(waits.values()) <= 3, waits

@@ -117,7 +117,8 @@ def plucker_map(
     pixel = torch.stack(
         (x.expand(height, width), y[:, None].expand(height, width), x.new_ones(height, width))
     )
-    through = _product(world_from_cam[..., :3, :3], torch.linalg.inv(K))
+    # What ``inv`` does, without asking the device whether it could.
+    through = _product(world_from_cam[..., :3, :3], torch.linalg.inv_ex(K).inverse)
     direction = _product(through, pixel.flatten(1))
     # Never 0: z is 1 before the rotation. Torch's own norm is slow over a dimension in the middle.
     direction = (direction / direction.square().sum(dim=2, keepdim=True).sqrt()).unflatten(-1, size)
@@ -180,7 +181,6 @@ class Projective:
         )
         self._cos = torch.stack((self.cos, self.cos), dim=-2).flatten(-3)
         self._sin = torch.stack((self.sin, -self.sin), dim=-2).flatten(-3)
-        self._swap = _swap(head_dim // 8, self.matrix.new_empty(0))
 
     def query(self, q: Tensor) -> Tensor:
         """(B, heads, V*h*w, head_dim) queries, encoded."""
@@ -204,8 +204,9 @@ class Projective:
         with torch.autocast(x.device.type, enabled=False):
             projected, turned = x.unflatten(2, (self.views, tokens)).to(dtype).chunk(2, dim=-1)
             projected = projected @ blocks.to(dtype)[:, None]
-            turned = turned.contiguous()
-            other = turned @ self._swap.to(dtype)
+            # The other of each rotary pair.
+            x1, x2, y1, y2 = turned.chunk(4, dim=-1)
+            other = torch.cat((x2, x1, y2, y1), dim=-1)
             turned = torch.addcmul(turned * self._cos, other, self._sin, value=turn)
         return torch.cat((projected.to(x.dtype), turned.to(x.dtype)), -1).flatten(2, 3)
 
@@ -259,9 +260,3 @@ def _blocks(right: Tensor, size: int) -> Tensor:
     eye = torch.eye(size // GROUP, dtype=right.dtype, device=right.device)
     blocks = eye[:, None, :, None] * right[..., None, :, None, :]
     return blocks.flatten(-4, -3).flatten(-2, -1)
-
-
-def _swap(frequencies: int, like: Tensor) -> Tensor:
-    """The permutation of half a head that exchanges the two of each rotary pair."""
-    eye = torch.eye(4 * frequencies, dtype=like.dtype, device=like.device)
-    return eye.unflatten(1, (2, 2, frequencies)).flip(2).flatten(1)

@@ -16,6 +16,7 @@ import hashlib
 import json
 import math
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import TypeVar
@@ -24,6 +25,7 @@ import torch
 from torch import Tensor
 
 from gvtools.errors import OptionError
+from gvtools.networks.compute import on_device
 from gvtools.networks.config_json import check_range
 
 Time = TypeVar("Time", float, Tensor)
@@ -33,6 +35,8 @@ Velocity = Callable[[Tensor, Tensor], Tensor]
 GLD_END = 0.001
 # A shift beyond it, or below its inverse, puts all times within rounding of an end.
 MOST_SHIFT = 1e6
+# That draw noise.
+MOST_THREADS = 8
 
 
 def shift_time(t: Time, shift: float) -> Time:
@@ -180,8 +184,7 @@ def integrate(
     wide = torch.promote_types(state.dtype, torch.float32)
     grid = torch.as_tensor(times, dtype=torch.float64, device="cpu")
     grid = grid.reshape(len(grid), -1).expand(-1, len(state))
-    strides = grid.diff(dim=0).to(wide).to(state.device)
-    at = grid.to(wide).to(state.device)
+    strides, at = (on_device(x.to(wide), state.device) for x in (grid.diff(dim=0), grid))
     current = state.to(wide)
     for step in range(len(strides)):
         u = velocity(current.to(state.dtype), at[step])
@@ -220,14 +223,20 @@ def seeded_noise(
     dtype: torch.dtype = torch.float32,
 ) -> Tensor:
     """Standard normal noise, drawn view by view in float32 on the CPU."""
-    views = [
-        torch.randn(tuple(shape[2:]), generator=torch.Generator().manual_seed(value))
-        for row in seeds
-        for value in row
-    ]
-    if not views:
-        return torch.empty(tuple(shape), device=device, dtype=dtype)
-    return torch.stack(views).reshape(tuple(shape)).to(device=device, dtype=dtype)
+    return on_device(drawn_noise(shape, seeds), device, dtype=dtype)
+
+
+def drawn_noise(shape: Sequence[int], seeds: Sequence[Sequence[int]]) -> Tensor:
+    """``seeded_noise`` on the CPU; each view is drawn on a thread of its own."""
+
+    def drawn(seed: int) -> Tensor:
+        return torch.randn(tuple(shape[2:]), generator=torch.Generator().manual_seed(seed))
+
+    values = [value for row in seeds for value in row]
+    if not values:
+        return torch.empty(tuple(shape))
+    with ThreadPoolExecutor(min(len(values), MOST_THREADS)) as threads:
+        return torch.stack(list(threads.map(drawn, values))).reshape(tuple(shape))
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,6 +11,7 @@ Data flow of one pass (tensor shapes in the README.md beside this file; equation
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from typing import cast
@@ -33,9 +34,9 @@ from gvtools.completers.geoverse.denoiser import Conditions, Denoiser, Positions
 from gvtools.completers.geoverse.flow import (
     Velocity,
     check_bounds,
+    drawn_noise,
     over_state,
     sample,
-    seeded_noise,
     velocity_from_clean,
     view_seed,
 )
@@ -44,7 +45,7 @@ from gvtools.completers.geoverse.rgb_head import RGBHead
 from gvtools.completers.geoverse.video_injection import ControlBranch, SharedAttention, video_keys
 from gvtools.completers.geoverse.video_prior import VideoFeatures, VideoPrior
 from gvtools.errors import CheckpointError, GvError, ShapeError
-from gvtools.networks.compute import hold_in
+from gvtools.networks.compute import hold_in, on_device
 from gvtools.networks.depth_anything.geometry_head import ViewGeometry
 from gvtools.networks.depth_anything.network import DepthAnything3
 from gvtools.networks.tensors import first_line
@@ -167,6 +168,16 @@ class GeoVerse(nn.Module):
         self.geometry.hold_in(dtype)
         hold_in(dtype, self.rgb_head, self.level1, self.cascade, self.control, self.shared)
 
+    def compile_blocks(self) -> None:
+        """Compile the repeated blocks on first use: one of a kind stands for all of them."""
+        parts = [self.level1, self.cascade, self.control, self.rgb_head]
+        parts += [] if self.video is None else [self.video.networks.transformer]
+        for part in parts:
+            for blocks in () if part is None else part.children():
+                if isinstance(blocks, nn.ModuleList):
+                    for block in blocks:
+                        block.compile(dynamic=False)
+
     @property
     def level_statistics(self) -> Sequence[LatentStatistics]:
         """Statistics of level 0 and of level 1."""
@@ -207,22 +218,37 @@ class GeoVerse(nn.Module):
         def seeds(draw: str) -> list[list[int]]:
             return [[view_seed(seed, draw, name) for name in row] for row in rows]
 
-        def noise(level: str) -> Tensor:
-            return seeded_noise(like.shape, seeds(level), device=like.device)
+        encoder = self.config.geometry.encoder
+        grid = self.geometry.encoder.grid(*batch.size)
+        shape = (*batch.images.shape[:2], encoder.channels, *grid)
+        denoises = bounds is None or len(bounds) > 0
+        # Drawn on the CPU, while the device prepares.
+        with ThreadPoolExecutor(1) as aside:
+            draws = {
+                level: aside.submit(drawn_noise, shape, seeds(level))
+                for level in (("level1", "level0") if denoises else ("level0",))
+            }
 
-        prepared = self.prepare(batch, seed=seeds("video"), video=video)
-        level1 = like = prepared.hints.unmasked
-        if bounds is None or len(bounds):
-            level1 = self.sample1(
+            def noise(level: str) -> Tensor:
+                return on_device(draws[level].result(), batch.images.device)
+
+            prepared = self.prepare(batch, seed=seeds("video"), video=video)
+            level1 = prepared.hints.unmasked
+            if denoises:
+                level1 = self.sample1(
+                    prepared,
+                    noise("level1"),
+                    bounds=bounds,
+                    cfg_scale=cfg_scale,
+                    temperature=temperature,
+                )
+            level0 = self.sample0(
                 prepared,
-                noise("level1"),
-                bounds=bounds,
-                cfg_scale=cfg_scale,
-                temperature=temperature,
+                level1,
+                noise("level0"),
+                bounds=cascade_bounds,
+                cfg_scale=cascade_cfg_scale,
             )
-        level0 = self.sample0(
-            prepared, level1, noise("level0"), bounds=cascade_bounds, cfg_scale=cascade_cfg_scale
-        )
         hint = None
         with self.clock(DECODE):
             decoded = self.decode(prepared, level0, level1, targets_alone=targets_alone)
@@ -244,7 +270,7 @@ class GeoVerse(nn.Module):
             source = batch
             batch = fill_holes(batch, config.hints)
             camera = camera_condition(
-                torch.linalg.inv(batch.cam_from_world),
+                torch.linalg.inv_ex(batch.cam_from_world).inverse,
                 batch.K,
                 batch.size,
                 context=batch.context,

@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from gvtools.networks.compute import Recomputing, attend
+from gvtools.networks.compute import Recomputing, RememberedTable, attend, constant
 from gvtools.networks.depth_anything.encoder import IMAGENET_MEAN, IMAGENET_STD
 
 SINE_BASE = 10000.0
@@ -44,6 +44,7 @@ class RGBHead(Recomputing):
         self.config = config
         width = config.width
         self.register_buffer("decoder_pos_embed", sine_table(width, config.base_grid)[None])
+        self._resized = RememberedTable()
         self.trainable_cls_token = nn.Parameter(torch.zeros(1, 1, width))
         self.decoder_embed = nn.Linear(config.in_channels, width)
         self.decoder_layers = nn.ModuleList(_Layer(config) for _ in range(config.depth))
@@ -74,7 +75,7 @@ class RGBHead(Recomputing):
         patch = self.config.patch
         pixels = logits.unflatten(2, (patch, patch, 3)).unflatten(1, grid)
         pixels = pixels.permute(0, 5, 1, 3, 2, 4).flatten(4, 5).flatten(2, 3)
-        mean, std = (pixels.new_tensor(c).view(3, 1, 1) for c in (IMAGENET_MEAN, IMAGENET_STD))
+        mean, std = (constant(c, pixels).view(3, 1, 1) for c in (IMAGENET_MEAN, IMAGENET_STD))
         return pixels * std + mean
 
     def positions(self, grid: tuple[int, int]) -> Tensor:
@@ -82,10 +83,14 @@ class RGBHead(Recomputing):
         table = self.decoder_pos_embed
         if tuple(grid) == tuple(self.config.base_grid):
             return table
-        plane = table[:, 1:].mT.unflatten(2, self.config.base_grid)
-        dtype = torch.promote_types(plane.dtype, torch.float32)
-        plane = F.interpolate(plane.to(dtype), size=grid, mode="bicubic", align_corners=False)
-        return torch.cat((table[:, :1], plane.flatten(2).mT.to(table.dtype)), dim=1)
+
+        def resized() -> Tensor:
+            plane = table[:, 1:].mT.unflatten(2, self.config.base_grid)
+            dtype = torch.promote_types(plane.dtype, torch.float32)
+            plane = F.interpolate(plane.to(dtype), size=grid, mode="bicubic", align_corners=False)
+            return torch.cat((table[:, :1], plane.flatten(2).mT.to(table.dtype)), dim=1)
+
+        return self._resized(tuple(grid), table, resized)
 
     def _views(self, features: Tensor, position: Tensor) -> Tensor:
         x = self.decoder_embed(features)

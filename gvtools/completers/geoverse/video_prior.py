@@ -80,7 +80,11 @@ def packed_mask(generate: Tensor, layout: ViewLayout, *, stride: int = 8) -> Ten
     of several views is to be generated where any of them is: resampling the mask in time, as VACE
     does for true video, would give a latent the mask of a view that it does not hold.
     """
-    latents = [generate[:, list(views), 0].amax(dim=1) for views in layout.views_of_latent]
+    shown = generate[:, :, 0].unbind(1)
+    latents = [
+        torch.stack([shown[v] for v in views], dim=1).amax(dim=1)
+        for views in layout.views_of_latent
+    ]
     packed = [F.pixel_unshuffle(mask[:, None], stride) for mask in latents]
     return torch.stack(packed, dim=2)
 
@@ -278,9 +282,12 @@ class VideoPrior:
                     timestep=self.config.timestep,
                     blocks=self.config.taps,
                 )
-            where = torch.tensor(layout.latent_of_view, device=device)
-            tensors = (x.index_select(1, where).movedim(-1, 2).contiguous() for x in outputs)
-            return VideoFeatures(tuple(tensors), layout.latent_of_view)
+            where = layout.latent_of_view
+            tensors = (
+                torch.stack([x[:, latent] for latent in where], dim=1).movedim(-1, 2).contiguous()
+                for x in outputs
+            )
+            return VideoFeatures(tuple(tensors), where)
 
     def _proxy(
         self, images: Tensor, valid: Tensor, context: int, *, seeds: list[list[int]]
@@ -294,7 +301,9 @@ class VideoPrior:
 
     def _encoded(self, images: Tensor, layout: ViewLayout) -> Tensor:
         """Normalised latents (B, 16, F, h, w) of views (B, V, 3, H, W)."""
-        clips = torch.stack([images[:, list(clip)] for clip in layout.clips], dim=1)
+        clips = torch.stack(
+            [torch.stack([images[:, view] for view in clip], dim=1) for clip in layout.clips], dim=1
+        )
         latents = self.networks.encode(clips.flatten(0, 1).transpose(1, 2))
         return latents.unflatten(0, clips.shape[:2]).transpose(1, 2).flatten(2, 3)
 

@@ -15,13 +15,16 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from gvtools.errors import CheckpointError
+from gvtools.networks.compute import constant, on_device
 from gvtools.networks.tensors import Shapes, TensorFiles, check_fit, shapes
 from gvtools.untrusted import read_json
 
@@ -116,13 +119,34 @@ class WanNetworks:
 
         Clips are (N, 3, 4k + 1, H, W) in [-1, 1].
         """
-        latents = self.vae.encode(clips.to(self.vae.dtype)).latent_dist.mode().float()
+        clips = clips.to(self.vae.dtype)
+        if clips.shape[2] == 1 and self.vae.config.get("patch_size") is None:
+            latents = self._still(clips).float()
+        else:
+            latents = self.vae.encode(clips).latent_dist.mode().float()
         mean, deviation = (
-            latents.new_tensor(self.vae.config[name]).view(-1, 1, 1, 1)
+            constant(self.vae.config[name], latents).view(-1, 1, 1, 1)
             for name in ("latents_mean", "latents_std")
         )
         normalised: Tensor = (latents - mean) / deviation
         return normalised
+
+    def _still(self, clips: Tensor) -> Tensor:
+        """The mode for clips of one frame: of every kernel in time, the last tap alone sees it."""
+        encoder, last = self.vae.encoder, self.vae.quant_conv
+        flat = [part for part in encoder.modules() if isinstance(part, nn.Conv3d)] + [last]
+        # On a CPU one at a time, as ``enable_slicing`` has it.
+        parts = clips.split(1)
+        if clips.device.type == "cuda":
+            parts = (clips.contiguous(memory_format=torch.channels_last_3d),)
+        try:
+            for convolution in flat:
+                convolution.forward = partial(_last_tap, convolution)
+            moments = torch.cat([last(encoder(part)) for part in parts])
+        finally:
+            for convolution in flat:
+                del convolution.forward
+        return moments.chunk(2, dim=1)[0]
 
     def block_outputs(
         self, x: Tensor, condition: Tensor, *, timestep: float, blocks: Sequence[int]
@@ -141,7 +165,7 @@ class WanNetworks:
                 taken[block] = entering[0].to(self.dtype)
 
             hooks.append(after[block].register_forward_pre_hook(keep))
-        prompt = self.prompt.to(x.device, self.dtype).expand(len(x), -1, -1)
+        prompt = on_device(self.prompt, x.device, dtype=self.dtype).expand(len(x), -1, -1)
         try:
             self.transformer(
                 hidden_states=x.to(self.dtype),
@@ -155,6 +179,18 @@ class WanNetworks:
                 hook.remove()
         frames, rows, columns = (n // p for n, p in zip(x.shape[2:], PATCH, strict=True))
         return [taken[block].unflatten(1, (frames, rows, columns)) for block in blocks]
+
+
+def _last_tap(convolution: Any, x: Tensor, cache_x: Tensor | None = None) -> Tensor:
+    """A causal convolution of diffusers' VAE on (N, C, 1, H, W), as a convolution of pictures."""
+    weight = convolution.weight[:, :, -1]
+    if x.device.type == "cuda":
+        weight = weight.contiguous(memory_format=torch.channels_last)
+    padding = getattr(convolution, "_padding", (0,) * 6)
+    y = F.conv2d(
+        x[:, :, 0], weight, convolution.bias, convolution.stride[1:], (padding[2], padding[0])
+    )
+    return y[:, :, None]
 
 
 def expected_tensors(config: Mapping[str, Any], *, component: str = "transformer") -> Shapes:

@@ -20,7 +20,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from gvtools.errors import ShapeError
-from gvtools.networks.compute import Recomputing, attend
+from gvtools.networks.compute import Recomputing, RememberedTable, attend, constant
 
 
 @dataclass(frozen=True)
@@ -258,6 +258,7 @@ class DepthAnythingBackbone(Recomputing):
         self.cls_token = nn.Parameter(torch.zeros(1, 1, width))
         self.camera_token = nn.Parameter(torch.randn(1, 2, width) * 0.02)
         self.pos_embed = nn.Parameter(torch.zeros(1, 1 + config.base_grid**2, width))
+        self._resized = RememberedTable()
         self.patch_embed = PatchEmbed(3, width, config.patch)
         self.blocks = nn.ModuleList(
             TransformerBlock(
@@ -390,6 +391,10 @@ class DepthAnythingBackbone(Recomputing):
         base = self.config.base_grid
         if grid == (base, base):
             return self.pos_embed
+        return self._resized(grid, self.pos_embed, lambda: self._interpolated(grid))
+
+    def _interpolated(self, grid: tuple[int, int]) -> Tensor:
+        base = self.config.base_grid
         token, patches = self.pos_embed.float().split((1, base * base), dim=1)
         table = patches.transpose(1, 2).unflatten(2, (base, base))
         factor = [(side + 0.1) / base for side in grid]
@@ -423,6 +428,5 @@ def patch_rays(
 
 def normalise_imagenet(images: Tensor) -> Tensor:
     """(..., 3, H, W) in [0, 1] to ImageNet's mean 0 and deviation 1."""
-    mean = images.new_tensor(IMAGENET_MEAN)[:, None, None]
-    std = images.new_tensor(IMAGENET_STD)[:, None, None]
+    mean, std = (constant(c, images)[:, None, None] for c in (IMAGENET_MEAN, IMAGENET_STD))
     return (images - mean) / std

@@ -349,6 +349,21 @@ def test_half_precision_gives_nearly_the_same(weights):
     np.testing.assert_allclose(half.depth, full.depth, rtol=0.05)
 
 
+@pytest.mark.slow
+@pytest.mark.skipif(not shutil.which("g++"), reason="needs a C++ compiler")
+def test_compiled_blocks_give_the_same(weights):
+    context, known = micro.context_views(2), micro.guidance(2)
+    plain, compiled = (complete(weights, context, known, compile=c) for c in (False, True))
+    np.testing.assert_allclose(compiled.rgb, plain.rgb, atol=1e-4)
+    np.testing.assert_allclose(compiled.depth, plain.depth, rtol=1e-3)
+
+
+def test_compiling_without_a_compiler_is_refused(monkeypatch):
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(OptionError, match=r"completer\.compile"):
+        create("geoverse", compile=True)
+
+
 @pytest.mark.parametrize(
     ("folder", "said"), [(None, "completer.weights=DIR"), ("absent", "gvtools weights list")]
 )

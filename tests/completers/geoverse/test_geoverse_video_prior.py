@@ -421,3 +421,14 @@ def test_weights_leave_where_a_pass_would_lack_room(
     (tmp_path / "vae" / "x.safetensors").write_bytes(bytes(1000))
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda place: (free, 1e12))
     assert _leaves(tmp_path, device, offload) is leaves
+
+
+def test_pictures_are_encoded_as_clips_of_one_frame(network: Any) -> None:
+    networks = tiny.prior(network).networks
+    clips = torch.rand(2, 3, 1, 32, 48, generator=torch.Generator().manual_seed(3)) * 2 - 1
+    stored = networks.vae.encode(clips).latent_dist.mode()
+    mean, deviation = (
+        torch.tensor(networks.vae.config[name])[:, None, None, None]
+        for name in ("latents_mean", "latents_std")
+    )
+    torch.testing.assert_close(networks.encode(clips), (stored - mean) / deviation)
