@@ -59,6 +59,11 @@ class Figure(SpecRecord):
     not_stated: Texts  # what it leaves open
     unit: str = ""  # of the values; empty for none, or for one that is not stated
 
+    @property
+    def column(self) -> Column:
+        """The figure's column in tables."""
+        return Column(self.label, unit=self.unit, better=self.better, digits=self.digits)
+
 
 class PublishedRow(SpecRecord):
     """What a source reports of one system."""
@@ -318,7 +323,7 @@ def comparison_table(rows: Sequence[SideBySideRow], benchmark: Benchmark) -> Tab
     """The rows as a table; why values have no rank stands in its notes."""
     figures = benchmark.figures.values()
     columns = [Column("System"), Column("Origin")]
-    columns += [Column(f.label, unit=f.unit, better=f.better, digits=f.digits) for f in figures]
+    columns += [figure.column for figure in figures]
     cells: list[tuple[Value, ...]] = [
         (
             row.system,

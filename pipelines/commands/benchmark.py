@@ -49,9 +49,10 @@ class BenchmarkArguments(LpipsArguments):
 def run(args: BenchmarkArguments, console: Console) -> None:
     """Measure what is not measured yet, and write the tables."""
     from gvtools.evaluation.published import load_benchmark
+    from gvtools.evaluation.tables import markdown
     from gvtools.runs.folder import folder_lock
     from pipelines.scoring.benchmark import measure_apart, measure_cells
-    from pipelines.scoring.benchmark_results import PAGE, print_tables, write_results
+    from pipelines.scoring.benchmark_results import PAGE, write_results
 
     benchmark = load_benchmark(args.name)
     cells = planned_cells(args, benchmark, console)
@@ -64,7 +65,8 @@ def run(args: BenchmarkArguments, console: Console) -> None:
     with folder_lock(out):
         measure_cells(cells, console=console, measure=measure_apart, after=write)
         tables = write_results(benchmark, cells, out, title=title)
-    print_tables(tables, console)
+    for table in tables.values():
+        console.line(markdown(table))
     console.line(f"results in {out}: {PAGE}, results.json, and tables as .csv, .md and .tex")
     _check_some_measured(cells, args.root)
 

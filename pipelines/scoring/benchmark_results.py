@@ -13,14 +13,12 @@ from gvtools.evaluation.published import (
     Benchmark,
     MeasuredRow,
     Setting,
-    SideBySideRow,
-    comparison_notes,
+    comparison_table,
     side_by_side,
 )
 from gvtools.evaluation.statistics import Interval, mean_interval
-from gvtools.evaluation.tables import Column, Ranked, Table, Value, markdown
+from gvtools.evaluation.tables import Column, Table, Value
 from gvtools.files import write_json, write_text
-from pipelines.console import Console
 from pipelines.scoring.benchmark import BenchmarkCell, read_cell
 from pipelines.scoring.sweep import FAILED
 from pipelines.scoring.tables import write_tables
@@ -131,42 +129,37 @@ def _setting(
 def comparison(benchmark: Benchmark, results: Sequence[MethodResult]) -> Table:
     """A table of published and measured rows, with ranks where they are comparable."""
     rows = side_by_side([result.row for result in results], benchmark)
+    table = comparison_table(rows, benchmark)
     by_name = {result.row.system: result for result in results}
-    first, *others = benchmark.figures.values()
-    columns = [Column("System"), Column("Origin"), _column(first)]
-    columns += [Column(f"{first.label} {end}", digits=first.digits) for end in ("low", "high")]
-    columns += [_column(figure) for figure in others]
-    columns += [*COSTS, Column("Scenes")]
-    body = [_cells(row, benchmark, by_name.get(row.system)) for row in rows]
+    first = next(iter(benchmark.figures.values()))
+    ends = [Column(f"{first.label} {end}", digits=first.digits) for end in ("low", "high")]
+    body: list[tuple[Value, ...]] = []
+    for row, cells in zip(rows, table.rows, strict=True):
+        result = by_name.get(row.system) if row.origin == MEASURED else None
+        interval = result.intervals[first.name] if result else None
+        own = interval.low if interval else None, interval.high if interval else None
+        costs = _costs(result.row.figures, result.seconds, result.peak_bytes) if result else ()
+        scenes = len(result.scenes) if result else None
+        body.append((*cells[:3], *own, *cells[3:], *(costs or [None] * len(COSTS)), scenes))
     notes = [
         f"{first.label} low and high: 95 % bootstrap interval of the mean over scenes. Observed: "
         "PSNR of the pixels that stand on observations. A run: mean wall-clock seconds. Peak: the "
         "most main memory of any run.",
         *(f"{result.row.system}, {scene}: failed: {reason}" for result in results
           for scene, reason in result.failures.items()),
-        *comparison_notes(rows, benchmark),
+        *table.notes,
     ]  # fmt: skip
+    columns = (*table.columns[:3], *ends, *table.columns[3:], *COSTS, Column("Scenes"))
     caption = f"{benchmark.name}, {benchmark.context} context views"
-    return Table(tuple(columns), tuple(body), caption, tuple(notes))
+    return Table(columns, tuple(body), caption, tuple(notes))
 
 
-def _column(figure: Any) -> Column:
-    return Column(figure.label, unit=figure.unit, better=figure.better, digits=figure.digits)
-
-
-def _cells(
-    row: SideBySideRow, benchmark: Benchmark, result: MethodResult | None
+def _costs(
+    figures: Mapping[str, Any], seconds: float | None, peak_bytes: int | None
 ) -> tuple[Value, ...]:
-    ranked = [Ranked(row.figures[name], row.ranks[name]) for name in benchmark.figures]
-    if row.origin != MEASURED or result is None:
-        return (row.system, row.origin, ranked[0], None, None, *ranked[1:], *[None] * 5)
-    interval = result.intervals[next(iter(benchmark.figures))]
-    peak = None if result.peak_bytes is None else result.peak_bytes / MIB
-    return (
-        row.system, row.origin, ranked[0], interval.low, interval.high, *ranked[1:],
-        result.row.figures["psnr_observed"], result.row.figures["coverage"], result.seconds, peak,
-        len(result.scenes),
-    )  # fmt: skip
+    """The values of COSTS."""
+    peak = None if peak_bytes is None else peak_bytes / MIB
+    return figures.get("psnr_observed"), figures.get("coverage"), seconds, peak
 
 
 def interval_table(benchmark: Benchmark, by_views: Mapping[int, Sequence[MethodResult]]) -> Table:
@@ -185,23 +178,19 @@ def interval_table(benchmark: Benchmark, by_views: Mapping[int, Sequence[MethodR
 
 def scene_table(benchmark: Benchmark, by_views: Mapping[int, Sequence[MethodResult]]) -> Table:
     """One row for each cell that was tried: its figures, or why it failed."""
-    figures = list(benchmark.figures.values())
     columns = [Column("scene"), Column("views"), Column("method")]
-    columns += [_column(figure) for figure in figures]
+    columns += [figure.column for figure in benchmark.figures.values()]
     columns += [*COSTS, Column("targets"), Column("note")]
     rows: list[tuple[Value, ...]] = []
     for views, results in by_views.items():
         for result in results:
             for scene, one in result.scenes.items():
-                peak = one.get("peak_bytes")
-                values = [one["figures"].get(f.name) for f in figures]
-                rows.append((
-                    scene, views, result.row.system, *values, one["figures"].get("psnr_observed"),
-                    one["figures"].get("coverage"), one.get("seconds"),
-                    None if peak is None else peak / MIB, len(one["views"]), "",
-                ))  # fmt: skip
+                values = [one["figures"].get(name) for name in benchmark.figures]
+                costs = _costs(one["figures"], one.get("seconds"), one.get("peak_bytes"))
+                head = scene, views, result.row.system
+                rows.append((*head, *values, *costs, len(one["views"]), ""))
             for scene, reason in result.failures.items():
-                gaps = [None] * (len(figures) + 5)
+                gaps = [None] * (len(benchmark.figures) + len(COSTS) + 1)
                 rows.append((scene, views, result.row.system, *gaps, f"failed: {reason}"))
     rows.sort(key=lambda row: (str(row[0]), row[1]))
     return Table(tuple(columns), tuple(rows), f"{benchmark.name}: scenes")
@@ -247,12 +236,6 @@ def _plain(by_views: Mapping[int, Sequence[MethodResult]]) -> dict[str, Any]:
         }
         for views, results in by_views.items()
     }
-
-
-def print_tables(tables: Mapping[int, Table], console: Console) -> None:
-    """Print the comparison tables in Markdown."""
-    for table in tables.values():
-        console.line(markdown(table))
 
 
 def _page(

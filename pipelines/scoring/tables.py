@@ -14,7 +14,7 @@ from gvtools.evaluation.statistics import mean_interval
 from gvtools.evaluation.tables import Column, Ranked, Table, Value, markdown, render
 from gvtools.files import write_text
 from pipelines.report import nested
-from pipelines.scoring.measurement import JUDGED
+from pipelines.scoring.measurement import JUDGED, NEVER_OBSERVED
 
 if TYPE_CHECKING:
     from pipelines.console import Console
@@ -279,22 +279,19 @@ def side_by_side(figures: Figures) -> Table:
 def _ranks(
     methods: Sequence[Figures], path: Sequence[str], *, better: str, total: int
 ) -> list[int | None]:
-    """Ranks of the methods that have a picture of every view; of the others None."""
+    """Ranks of the methods that have a picture of every view, if there are two; of others None."""
     values = [nested(m, *path) if m["views"] == total else None for m in methods]
     known = sorted((v for v in values if v is not None), reverse=better == "higher")
-    if len(known) < 2:
-        return [None] * len(values)
-    return [None if value is None else known.index(value) + 1 for value in values]
+    ranked = len(known) > 1
+    return [known.index(v) + 1 if ranked and v is not None else None for v in values]
 
 
 def _control(method: Figures, path: Sequence[str]) -> float | None:
-    if path[0] == "consistency":
-        path = ("consistency", "true_pictures", *path[2:])
-    elif path[0] == "poses":
-        path = ("poses", "true_pictures", *path[1:])
-    else:
+    """The figure of the true pictures."""
+    if path[0] == "images":
         return None
-    value: float | None = nested(method, *path)
+    at = path[1:] if path[0] == "poses" else path[2:]
+    value: float | None = nested(method, path[0], "true_pictures", *at)
     return value
 
 
@@ -381,18 +378,11 @@ def print_judgement(tables: Mapping[str, Table], console: Console) -> None:
         console.table([column.heading for column in apart.columns], shown)
 
 
-# Of each figure, whether more is better.
-PAIRED = {
-    "psnr": True,
-    "ssim": True,
-    "lpips": False,
-    "psnr_valid": True,
-    "ssim_valid": True,
-    "lpips_valid": False,
-    "psnr_never_observed": True,
-    "ssim_never_observed": True,
-    "lpips_never_observed": False,
-}
+PAIRED = [
+    f"{figure}{region}"
+    for region in ("", "_valid", f"_{NEVER_OBSERVED}")
+    for figure in ("psnr", "ssim", "lpips")
+]
 
 
 def differences(methods: Sequence[Figures], seed: int) -> list[dict[str, Any]]:
@@ -402,7 +392,7 @@ def differences(methods: Sequence[Figures], seed: int) -> list[dict[str, Any]]:
     """
     out = []
     for first, second in combinations(methods, 2):
-        for figure, more in PAIRED.items():
+        for figure in PAIRED:
             others = {(v["name"], v["round"]): v[figure] for v in second["images"]["views"]}
             pairs = [
                 (view[figure], others.get((view["name"], view["round"])))
@@ -413,14 +403,14 @@ def differences(methods: Sequence[Figures], seed: int) -> list[dict[str, Any]]:
             apart = [a - b for a, b in known if not (a == b == float("inf"))]
             if not apart:
                 continue
-            better = [value > 0 if more else value < 0 for value in apart]
+            sign = 1 if BETTER[figure.split("_")[0]] == "higher" else -1
             out.append(
                 {
                     "first": first["name"],
                     "second": second["name"],
                     "figure": figure,
                     **asdict(mean_interval(apart, seed=seed)),
-                    "first_better": sum(better) / len(better),
+                    "first_better": sum(sign * value > 0 for value in apart) / len(apart),
                 }
             )
     return out

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,7 +24,7 @@ SHARES = ("covisible_share", "occluded_share", "contradicting_share", "unknown_s
 
 
 @pytest.fixture(scope="module")
-def pair() -> tuple[PosedPicture, PosedPicture]:
+def pair():
     """Two views whose parallax hides and uncovers parts of the wall."""
     return (
         picture(camera((-0.3, 0.05, 0), turn=(1, -4, 2)), "left"),
@@ -41,20 +40,20 @@ def _flat(depth: float, *, x: float = 0.0, measured: float | None = None) -> Pos
     return PosedPicture("flat", at, rgb, np.full(size, measured or depth, np.float32))
 
 
-def test_exact_depth_of_a_plane_leaves_no_error() -> None:
+def test_exact_depth_of_a_plane_leaves_no_error():
     first = picture(camera((-0.3, 0, 0)), "left", square=False)
     second = picture(camera((0.4, 0.1, 0.3), turn=(3, 8, -5)), "right", square=False)
     result = depth_reprojection(first, second)
     assert result.ok and (result.first, result.second) == ("left", "right")
     assert result.known == first.rgb[..., 0].size and 0 < result.inside < result.known
     assert result.covisible == result.inside
-    assert result.mean_pixels is not None and result.mean_pixels < 1e-3
-    assert result.mean_relative_depth is not None and result.mean_relative_depth < 1e-5
+    assert result.mean_pixels < 1e-3
+    assert result.mean_relative_depth < 1e-5
     assert [getattr(result, name) for name in SHARES] == [1, 0, 0, 0]
 
 
 @pytest.mark.parametrize("scale", [0.97, 1.03])
-def test_a_wrong_depth_scale_gives_its_closed_form(scale: float) -> None:
+def test_a_wrong_depth_scale_gives_its_closed_form(scale):
     distance, baseline = 2.5, 0.4
     first = _flat(distance)
     second = _flat(distance, x=baseline, measured=scale * distance)
@@ -68,7 +67,7 @@ def test_a_wrong_depth_scale_gives_its_closed_form(scale: float) -> None:
     assert result.median_relative_depth == pytest.approx(abs(1 / scale - 1), rel=1e-5)
 
 
-def test_a_scale_beyond_the_occlusion_limit_shows_in_the_shares() -> None:
+def test_a_scale_beyond_the_occlusion_limit_shows_in_the_shares():
     near = depth_reprojection(_flat(2.0), _flat(2.0, x=0.1, measured=1.8))
     far = depth_reprojection(_flat(2.0), _flat(2.0, x=0.1, measured=2.2))
     assert near.occluded_share == 1 and far.contradicting_share == 1
@@ -76,12 +75,9 @@ def test_a_scale_beyond_the_occlusion_limit_shows_in_the_shares() -> None:
     assert near.status == "empty: flat and flat see no common surface"
 
 
-def test_pixels_are_classified_as_the_scenes_geometry_says(
-    pair: tuple[PosedPicture, PosedPicture],
-) -> None:
+def test_pixels_are_classified_as_the_scenes_geometry_says(pair):
     first, second = pair
     found = correspond(first, second)
-    assert first.depth is not None
     rotation, eye = first.camera.cam_from_world[0, :3, :3], first.camera.centers[0]
     rays = first.camera.rays()[found.rows, found.columns] @ rotation
     points = eye + first.depth[found.rows, found.columns, None] * rays
@@ -104,7 +100,7 @@ def test_pixels_are_classified_as_the_scenes_geometry_says(
     assert (found.seen[plain] == Seen.COVISIBLE).all()
 
 
-def test_depth_is_never_a_blend_of_two_surfaces(pair: tuple[PosedPicture, PosedPicture]) -> None:
+def test_depth_is_never_a_blend_of_two_surfaces(pair):
     first, second = pair
     found = correspond(first, second)
     there = found.depth > 0
@@ -116,9 +112,8 @@ def test_depth_is_never_a_blend_of_two_surfaces(pair: tuple[PosedPicture, PosedP
     assert np.minimum(off_wall, off_square).max() < 0.01
 
 
-def test_what_floats_in_front_contradicts(pair: tuple[PosedPicture, PosedPicture]) -> None:
+def test_what_floats_in_front_contradicts(pair):
     first, second = pair
-    assert first.depth is not None
     depth = first.depth.copy()
     depth[50:70, 130:150] *= 0.5
     clean, dirty = (correspond(replace(first, depth=d), second) for d in (first.depth, depth))
@@ -130,12 +125,9 @@ def test_what_floats_in_front_contradicts(pair: tuple[PosedPicture, PosedPicture
     assert (dirty.seen == clean.seen)[~patch[dirty.rows, dirty.columns]].all()
 
 
-def test_a_wrong_place_a_shift_and_noise_raise_the_error(
-    pair: tuple[PosedPicture, PosedPicture],
-) -> None:
+def test_a_wrong_place_a_shift_and_noise_raise_the_error(pair):
     first, second = pair
     clean = depth_reprojection(first, second)
-    assert second.depth is not None
     rng = np.random.default_rng(3)
     noise = second.depth * (1 + rng.normal(0, 0.01, second.depth.shape)).astype(np.float32)
     for worse in (
@@ -148,7 +140,7 @@ def test_a_wrong_place_a_shift_and_noise_raise_the_error(
         assert all(getattr(result, name) > 1.5 * getattr(clean, name) for name in FIGURES)
 
 
-def test_the_worlds_frame_does_not_matter(pair: tuple[PosedPicture, PosedPicture]) -> None:
+def test_the_worlds_frame_does_not_matter(pair):
     elsewhere = moved(pair[0], turn=(20, 130, 50)).camera.cam_from_world[0]
     elsewhere[:3, 3] = (3e4, -2e4, 5e4)
     carried = [
@@ -160,9 +152,8 @@ def test_the_worlds_frame_does_not_matter(pair: tuple[PosedPicture, PosedPicture
         assert getattr(there, name) == pytest.approx(getattr(here, name), abs=1e-6)
 
 
-def test_masked_and_missing_depth_is_not_known(pair: tuple[PosedPicture, PosedPicture]) -> None:
+def test_masked_and_missing_depth_is_not_known(pair):
     first, second = pair
-    assert first.depth is not None and second.depth is not None
     mask = np.zeros(first.depth.shape, bool)
     mask[10:30, 40:90] = True
     assert depth_reprojection(replace(first, mask=mask), second).known == 20 * 50
@@ -180,7 +171,7 @@ def test_masked_and_missing_depth_is_not_known(pair: tuple[PosedPicture, PosedPi
     )
 
 
-def test_surfaces_behind_the_first_camera_are_not_covisible() -> None:
+def test_surfaces_behind_the_first_camera_are_not_covisible():
     # The first camera stands close to its wall and the second 30 units behind it: within 5 % of
     # second's depth lies what is behind the first camera.
     first, second = _flat(1.0), _flat(31.0, measured=29.6)
@@ -189,9 +180,7 @@ def test_surfaces_behind_the_first_camera_are_not_covisible() -> None:
     assert result.occluded_share == 1 and result.mean_pixels is None
 
 
-def test_views_without_common_surface_give_no_figure(
-    pair: tuple[PosedPicture, PosedPicture],
-) -> None:
+def test_views_without_common_surface_give_no_figure(pair):
     first, second = pair
     away = moved(second, turn=(0, 180, 0))
     blind = replace(second, depth=None)
@@ -207,9 +196,7 @@ def test_views_without_common_surface_give_no_figure(
     assert depth_reprojection(first, blind).unknown_share == 1
 
 
-def test_many_views_weigh_by_pixels_and_name_the_pairs_without_overlap(
-    pair: tuple[PosedPicture, PosedPicture],
-) -> None:
+def test_many_views_weigh_by_pixels_and_name_the_pairs_without_overlap(pair):
     away = replace(moved(pair[1], turn=(0, 180, 0)), name="away")
     off = replace(moved(pair[1], turn=(0, 2, 0), shift=(0.1, 0, 0)), name="off")
     path = [pair[0], off, pair[1], away]
@@ -236,7 +223,7 @@ def test_many_views_weigh_by_pixels_and_name_the_pairs_without_overlap(
     assert all(type(getattr(views, name)) is float for name in (*FIGURES, *SHARES))
 
 
-def test_too_few_views_give_a_status(pair: tuple[PosedPicture, PosedPicture]) -> None:
+def test_too_few_views_give_a_status(pair):
     for views in ([], [pair[0]]):
         result = depth_reprojection_of_views(views)
         assert result.status == f"empty: {len(views)} view(s); at least 2 are needed"
@@ -247,7 +234,7 @@ def test_too_few_views_give_a_status(pair: tuple[PosedPicture, PosedPicture]) ->
 
 
 @pytest.mark.data
-def test_a_real_recording_agrees_until_a_pose_is_wrong(shared: Path) -> None:
+def test_a_real_recording_agrees_until_a_pose_is_wrong(shared):
     scene = open_project(shared / "data" / "sevenscenes_reg")
     first, second = (
         PosedPicture(view.name, view.camera, frame.rgb, frame.depth, frame.mask)
@@ -256,7 +243,7 @@ def test_a_real_recording_agrees_until_a_pose_is_wrong(shared: Path) -> None:
     )
     good = depth_reprojection(first, second)
     bad = depth_reprojection(first, moved(second, turn=(0, 2, 0)))
-    assert good.median_relative_depth is not None and good.median_relative_depth < 0.01
+    assert good.median_relative_depth < 0.01
     assert (good.covisible_share or 0) > 0.85
     assert (bad.median_relative_depth or 0) > 3 * good.median_relative_depth
     assert (bad.contradicting_share or 0) > 10 * (good.contradicting_share or 1)

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from gvtools.errors import OptionError, ProjectError
-from gvtools.evaluation.picture_sets import MethodPicture, match_pictures, open_pictures
+from gvtools.evaluation.picture_sets import match_pictures, open_pictures
 
 NAMES = ("cam/2.jpg", "cam/10.jpg", "cam/30.jpg")
 
@@ -30,17 +30,12 @@ def png(rgb) -> bytes:
     return out.getvalue()
 
 
-def truth_of(one: MethodPicture) -> np.ndarray:
-    """What the tool kept as the truth."""
-    assert one.load_truth is not None
+def truth_of(one):
     return one.load_truth()
 
 
-def depth_of(one: MethodPicture) -> np.ndarray:
-    """The depth beside the picture."""
-    depth = one.load().depth
-    assert depth is not None
-    return depth
+def depth_of(one):
+    return one.load().depth
 
 
 def loaded(found):
@@ -167,7 +162,7 @@ def test_nerfbaselines(tmp_path, form):
     assert found.notes == (taken if form == "training" else ())
 
 
-def test_what_holds_no_pictures_is_refused(tmp_path):
+def test_what_holds_no_pictures_is_refused(tmp_path, monkeypatch):
     with pytest.raises(ProjectError, match="no such folder"):
         open_pictures(tmp_path / "absent")
     with pytest.raises(ProjectError, match="no pictures"):
@@ -178,8 +173,8 @@ def test_what_holds_no_pictures_is_refused(tmp_path):
     (tmp_path / "predictions.tar.gz").write_bytes(b"x")
     with pytest.raises(ProjectError, match="no readable archive"):
         open_pictures(tmp_path / "predictions.tar.gz")
-    bomb = {"color/a.png": bytes(200 << 20)}
-    write_archive(tmp_path / "large.tar.gz", bomb)
+    monkeypatch.setattr("gvtools.evaluation.picture_sets.UNPACKED_BYTES", 1 << 20)
+    write_archive(tmp_path / "large.tar.gz", {"color/a.png": bytes(2 << 20)})
     with pytest.raises(ProjectError, match="more than such a file can hold"):
         open_pictures(tmp_path / "large.tar.gz")
     write_archive(tmp_path / "empty.tar.gz", {"info.json": b"{}"})
@@ -187,15 +182,16 @@ def test_what_holds_no_pictures_is_refused(tmp_path):
         open_pictures(tmp_path / "empty.tar.gz")
 
 
-def test_a_canvas_that_is_no_pair_is_refused(tmp_path):
-    save(tmp_path / "val_step0_0000.png", picture(0)[:, :15])
-    with pytest.raises(ProjectError, match="15 pixels wide"):
-        open_pictures(tmp_path).pictures[0].load()
-
-
-def test_a_damaged_picture_is_named(tmp_path):
-    (tmp_path / "1.png").write_bytes(png(picture(0))[:60])
-    with pytest.raises(ProjectError, match=r"1\.png"):
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("val_step0_0000.png", png(picture(0)[:, :15]), "15 pixels wide"),
+        ("1.png", png(picture(0))[:60], r"1\.png"),
+    ],
+)
+def test_a_canvas_that_is_no_pair_and_a_damaged_picture_are_named(tmp_path, name, content, message):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(ProjectError, match=message):
         open_pictures(tmp_path).pictures[0].load()
 
 
@@ -226,14 +222,20 @@ def test_names_match_without_endings_and_what_all_have_around_them(pictures, vie
     assert found == list(reversed(made))
 
 
-def test_numbers_are_whole_names_not_parts_of_longer_ones():
-    rule, found = partners(["render_11.png", "render_1.png"], ["1.jpg", "11.jpg"])
-    assert (rule, found) == ("name", ["render_1.png", "render_11.png"])
-
-
-def test_folders_of_the_pictures_do_not_count_where_names_are_enough():
-    rule, found = partners(["test/a/1.png", "test/b/2.png"], ["1.jpg", "2.jpg"])
-    assert (rule, found) == ("name", ["test/a/1.png", "test/b/2.png"])
+@pytest.mark.parametrize(
+    ("pictures", "views", "alphabetical", "expected"),
+    [
+        # Numbers are whole names, not parts of longer ones.
+        (["r_11.png", "r_1.png"], ["1.jpg", "11.jpg"], False, ("name", ["r_1.png", "r_11.png"])),
+        # Folders of the pictures do not count where names are enough.
+        (["a/1.png", "b/2.png"], ["1.jpg", "2.jpg"], False, ("name", ["a/1.png", "b/2.png"])),
+        # The order is the natural one of both sides, or the alphabetical one of the views.
+        (["p10.png", "p9.png"], ["v2.jpg", "v10.jpg"], False, ("order", ["p9.png", "p10.png"])),
+        (["0.png", "1.png"], ["v2.jpg", "v10.jpg"], True, ("order", ["1.png", "0.png"])),
+    ],
+)
+def test_partners(pictures, views, alphabetical, expected):
+    assert partners(pictures, views, alphabetical=alphabetical) == expected
 
 
 def test_missing_and_left_over_pictures_are_told():
@@ -241,16 +243,6 @@ def test_missing_and_left_over_pictures_are_told():
     assert found.picture_of == (0, None, None)
     assert found.missing == ("b.jpg", "c.jpg")
     assert found.left_over == ("x.png",)
-
-
-def test_order_is_the_natural_one_of_both_sides():
-    rule, found = partners(["p10.png", "p9.png"], ["view2.jpg", "view10.jpg"])
-    assert (rule, found) == ("order", ["p9.png", "p10.png"])
-
-
-def test_order_may_be_the_alphabetical_one_of_the_views():
-    rule, found = partners(["0.png", "1.png"], ["view2.jpg", "view10.jpg"], alphabetical=True)
-    assert (rule, found) == ("order", ["1.png", "0.png"])
 
 
 def test_pictures_that_count_views_are_never_matched_by_name():

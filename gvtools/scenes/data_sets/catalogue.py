@@ -115,9 +115,8 @@ class DataSetSpec(SpecRecord):
     camera: CameraConvention  # conventions of the cameras
     depth: DepthEncoding | None = None  # of stored depth; None where the data set has none
     licence: Licence  # terms and address
-    splits: dict[str, str] = Field(
-        default_factory=dict
-    )  # official splits: name, and which file or rule defines it
+    # Official splits: name, and which file or rule defines it.
+    splits: dict[str, str] = Field(default_factory=dict)
     # Of training; None for data sets that serve as benchmarks alone.
     geometry: GeometrySource | None = None
     sources: Texts  # where each of these facts was read
