@@ -42,13 +42,7 @@ def test_there_are_eight_short_scripts() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
-def test_an_example_runs(
-    script: Path,
-    room: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_an_example_runs(script, room, tmp_path, monkeypatch, capsys):
     arguments = [] if script.stem.startswith("05") else [str(room), str(tmp_path)]
     monkeypatch.setenv("MPLBACKEND", "Agg")
     monkeypatch.setattr(sys, "argv", [str(script), *arguments])

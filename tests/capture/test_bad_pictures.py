@@ -168,9 +168,7 @@ def test_matches_of_another_place_are_no_fault_of_the_model() -> None:
     assert _explained(models[1:], pairs) == pytest.approx(90 / 170)
 
 
-def test_pictures_of_phones_that_are_not_read_are_named(
-    texture: Image.Image, tmp_path: Path
-) -> None:
+def test_pictures_of_phones_that_are_not_read_are_named(texture, tmp_path):
     (tmp_path / "IMG_1.HEIC").write_bytes(b"ftypheic")
     with pytest.raises(ProjectError, match=r"1 pictures are HEIC.*IMG_1\.HEIC.* to JPEG"):
         find_photographs(tmp_path)

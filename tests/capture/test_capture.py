@@ -143,9 +143,7 @@ def test_a_picture_of_elsewhere_is_left_out_and_named(room: Path, tmp_path: Path
     assert any("noise.png" in finding.message for finding in report.findings)
 
 
-def test_pictures_that_share_nothing_give_one_line_and_no_folder(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_pictures_that_share_nothing_give_one_line_and_no_folder(tmp_path, capsys):
     folder = tmp_path / "photos"
     folder.mkdir()
     rng = np.random.default_rng(1)

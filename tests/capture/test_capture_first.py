@@ -59,9 +59,7 @@ def on_terminal(monkeypatch: pytest.MonkeyPatch, answer: str) -> list[str]:
     return questions
 
 
-def test_without_a_terminal_one_line_gives_the_command(
-    room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_a_terminal_one_line_gives_the_command(room, tmp_path, capsys):
     photos = tmp_path / "my photos"
     shutil.copytree(room / "images", photos)
     out = tmp_path / "runs" / "x"
@@ -111,14 +109,7 @@ def test_capture_comes_unasked_and_once(room: Path, captures: list[Asked], tmp_p
 
 
 @pytest.mark.parametrize(("answer", "calls"), [("y", 1), ("Yes ", 1), ("", 0), ("n", 0)])
-def test_a_user_at_a_terminal_is_asked(
-    answer: str,
-    calls: int,
-    room: Path,
-    captures: list[Asked],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_user_at_a_terminal_is_asked(answer, calls, room, captures, tmp_path, monkeypatch):
     questions = on_terminal(monkeypatch, answer)
     args = arguments("reconstruct", room / "images", "--out", tmp_path / "run")
     if calls:

@@ -34,9 +34,7 @@ def walked() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 @pytest.fixture(scope="session")
-def recording(
-    walked: tuple[np.ndarray, np.ndarray, np.ndarray], tmp_path_factory: pytest.TempPathFactory
-) -> Path:
+def recording(walked, tmp_path_factory):
     return write_sevenscenes(tmp_path_factory.mktemp("recording") / "room", *walked[1:])
 
 
@@ -93,9 +91,7 @@ def test_a_tum_recording_keeps_its_depth_unit_and_its_order(walked, tmp_path) ->
     assert report.sources["frame-000001.color.png"] == "rgb/1000.033333.png"
 
 
-def test_a_depth_camera_of_its_own_and_given_intrinsics_go_into_the_project(
-    walked, tmp_path
-) -> None:
+def test_a_depth_camera_of_its_own_and_given_intrinsics_go_into_the_project(walked, tmp_path):
     source = write_redwood(tmp_path / "recording", walked[1][:3], walked[2][:3])
     np.savetxt(tmp_path / "moved.txt", np.eye(4))
     K = f"{FOCAL},{FOCAL},{WIDTH / 2 - 0.5},{HEIGHT / 2 - 0.5}"

@@ -26,9 +26,7 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return write_disk(tmp_path_factory.mktemp("weights"))
 
 
-def test_published_forms_are_read_and_others_refused(
-    weights: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_published_forms_are_read_and_others_refused(weights, tmp_path, capsys):
     matcher = LightGlueMatcher("disk", weights=weights, max_features=64)
     stored = torch.load(weights[0], weights_only=True)["extractor"]
     for name, tensor in matcher._extractor.state_dict().items():
@@ -125,9 +123,7 @@ def test_what_a_matcher_finds_becomes_a_model(room: Path, tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
-def test_a_model_comes_of_random_networks(
-    weights: tuple[Path, Path], room: Path, tmp_path: Path
-) -> None:
+def test_a_model_comes_of_random_networks(weights, room, tmp_path):
     """What DISK with random weights finds in neighbours is alike enough for a rough model."""
     names = sorted(path.name for path in (room / "images").iterdir())[:4]
     matcher = LightGlueMatcher("disk", weights=weights, max_features=1024)

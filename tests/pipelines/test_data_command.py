@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from command_line import refused
-from data_sets.miniature import Miniature, miniatures
+from data_sets.miniature import miniatures
 from tiny_scan import FOCAL, WIDTH, render, world_from_cam, write_scan
 
 from gvtools.scenes.data_sets.catalogue import DataSetSpec, load_spec, read_scene, spec_names
@@ -40,9 +40,7 @@ def report(path: Path) -> dict[str, Any]:
     return dict(json.loads(path.read_text(encoding="utf-8")))
 
 
-def test_the_list_has_a_row_for_each_data_set(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_the_list_has_a_row_for_each_data_set(capsys, tmp_path):
     assert data("list") == 0
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 1 + len(spec_names()) + 1
@@ -69,9 +67,7 @@ def test_all_that_is_known_of_one_data_set_is_printed(capsys: pytest.CaptureFixt
     assert "did you mean 'virtualkitti'" in refused(capsys, "data", "list", "virtual kity")
 
 
-def test_each_scene_of_a_download_has_its_line(
-    root: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_each_scene_of_a_download_has_its_line(root, capsys, tmp_path):
     (root / SECOND / "frame-000003.depth.png").unlink()
     assert data("check", "7-Scenes", root, "--json", tmp_path / "check.json") == 0
     out = capsys.readouterr().out
@@ -88,9 +84,7 @@ def test_each_scene_of_a_download_has_its_line(
 
 
 @pytest.mark.parametrize("miniature", miniatures(), ids=lambda miniature: miniature.title)
-def test_every_layout_can_be_checked_and_summed_up(
-    miniature: Miniature, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_every_layout_can_be_checked_and_summed_up(miniature, tmp_path, capsys):
     name = next(x for x in spec_names() if load_spec(x).layout == miniature.layout)
     with miniature.within():
         expected = miniature.write(tmp_path / "root")
@@ -111,9 +105,7 @@ def test_every_layout_can_be_checked_and_summed_up(
         )
 
 
-def test_damaged_scenes_are_reported_after_the_others(
-    root: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_damaged_scenes_are_reported_after_the_others(root, capsys, tmp_path):
     (root / FIRST / "frame-000000.color.png").write_bytes(b"no picture")
     for path in (root / SECOND).glob("*.color.png"):
         path.unlink()
@@ -132,9 +124,7 @@ def test_damaged_scenes_are_reported_after_the_others(
 
 
 @pytest.mark.parametrize("action", ["check", "stats"])
-def test_bad_input_is_one_line(
-    action: str, root: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_bad_input_is_one_line(action, root, capsys, tmp_path):
     out = tmp_path / "out.json"
     cases = {
         ("7-Scene", root): "data set '7-Scene' is unknown; did you mean '7scenes'",
@@ -151,9 +141,7 @@ def test_bad_input_is_one_line(
     assert f"first {FIRST}: " in refused(capsys, "data", action, "7-Scenes", root)
 
 
-def test_figures_are_those_of_the_files(
-    root: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_figures_are_those_of_the_files(root, capsys, tmp_path):
     assert data("stats", "7-Scenes", root, "--scene", FIRST, "--json", tmp_path / "s.json") == 0
     figures = report(tmp_path / "s.json")
     assert figures["unit"] == "m"

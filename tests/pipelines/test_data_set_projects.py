@@ -88,12 +88,7 @@ def test_commands_take_it(root: Path, tmp_path: Path, capsys: pytest.CaptureFixt
 
 
 @pytest.mark.slow
-def test_a_run_is_resumed_and_evaluated(
-    root: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_run_is_resumed_and_evaluated(root, tmp_path, monkeypatch, capsys):
     out = tmp_path / "run"
     options = ["--context", "every:2", "--targets", "every:2+1", "--views-per-round", "2"]
     options += ["--voxel", "0.05", "--refine", "0", "--out", str(out), "--quiet"]

@@ -39,9 +39,7 @@ def frames_of(path: Path) -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize("suffix", ["mp4", "gif", "webp"])
-def test_a_path_becomes_a_film_of_the_memorys_pictures(
-    run: Path, tmp_path: Path, suffix: str
-) -> None:
+def test_a_path_becomes_a_film_of_the_memorys_pictures(run, tmp_path, suffix):
     out = tmp_path / f"film.{suffix}"
     assert main(["film", str(run), "--path", "interpolate:5", "--out", str(out)]) == 0
     frames = frames_of(out)

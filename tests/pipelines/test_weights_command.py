@@ -79,9 +79,7 @@ def test_published_files_have_their_published_numbers(capsys: pytest.CaptureFixt
     assert "  video/" in lines
 
 
-def test_depth_alone_and_gld_are_listed_with_their_steps(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_depth_alone_and_gld_are_listed_with_their_steps(capsys):
     assert weights("list", "depth") == 0
     text = capsys.readouterr().out
     # The official network of DA3-LARGE has 643 tensors of these many numbers.
@@ -133,9 +131,7 @@ def test_a_folder_that_fits(capsys: pytest.CaptureFixture[str], own: Path, tmp_p
     assert part["missing"] == part["unexpected"] == part["shape_mismatch"] == []
 
 
-def test_what_does_not_fit_is_said_for_each_part(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_what_does_not_fit_is_said_for_each_part(capsys, tmp_path):
     bare = replace(PLAIN, level1=replace(PLAIN.level1, depth_condition=False))
     folder = published.write_published(micro.model(bare), tmp_path / "published")
     assert weights("check", folder) == 0
@@ -166,9 +162,7 @@ def test_what_does_not_fit_is_said_for_each_part(
     assert text.endswith("ok: false\n")
 
 
-def test_the_configuration_may_be_another_than_the_folders(
-    capsys: pytest.CaptureFixture[str], own: Path, micro_file: Path
-) -> None:
+def test_the_configuration_may_be_another_than_the_folders(capsys, own, micro_file):
     assert weights("check", own, "--config", micro_file, "--quiet") == 0
     assert weights("check", own, "--config", own, "--quiet") == 0
     line = refused(capsys, "check", own, "--config", "tiny", "--quiet")
@@ -189,9 +183,7 @@ def test_a_folder_that_is_none(capsys: pytest.CaptureFixture[str], tmp_path: Pat
 # create
 
 
-def test_a_created_model_is_untrained_and_its_seeds_own(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, micro_file: Path
-) -> None:
+def test_a_created_model_is_untrained_and_its_seeds_own(capsys, tmp_path, micro_file):
     state = torch.get_rng_state()
     for folder, seed in (("a", 0), ("b", 0), ("c", 1)):
         assert weights("create", micro_file, tmp_path / folder, "--seed", seed) == 0
@@ -208,9 +200,7 @@ def test_a_created_model_is_untrained_and_its_seeds_own(
     assert torch.isfinite(a.generate(micro.batch()).decoded.rgb).all()
 
 
-def test_nothing_is_overwritten(
-    capsys: pytest.CaptureFixture[str], own: Path, micro_file: Path, tmp_path: Path
-) -> None:
+def test_nothing_is_overwritten(capsys, own, micro_file, tmp_path):
     before = {path: path.read_bytes() for path in own.iterdir()}
     assert "nothing is overwritten" in refused(capsys, "create", micro_file, own)
     assert {path: path.read_bytes() for path in own.iterdir()} == before
@@ -221,9 +211,7 @@ def test_nothing_is_overwritten(
     assert not (tmp_path / "huge").exists()
 
 
-def test_a_created_model_says_that_it_lacks_the_video_prior(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_a_created_model_says_that_it_lacks_the_video_prior(capsys, tmp_path):
     path = tmp_path / "control.json"
     path.write_text(json.dumps(to_json(micro.config(injection="control"))))
     assert weights("create", path, tmp_path / "model") == 0
@@ -234,9 +222,7 @@ def test_a_created_model_says_that_it_lacks_the_video_prior(
 # the video prior
 
 
-def test_the_video_prior_is_cut_and_completed(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_the_video_prior_is_cut_and_completed(capsys, tmp_path):
     pytest.importorskip("diffusers", reason="the extra wan is not installed")
     import tiny_wan
 
@@ -270,9 +256,7 @@ def test_the_video_prior_is_cut_and_completed(
 
 
 @pytest.mark.parametrize("action", ACTIONS)
-def test_every_help_of_an_action_starts_with_two_examples(
-    action: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_every_help_of_an_action_starts_with_two_examples(action, capsys):
     with pytest.raises(SystemExit) as stop:
         weights(action, "--help")
     assert stop.value.code == 0

@@ -137,9 +137,7 @@ def test_exposure_varies_by_a_few_percent(scene: Scene, twin: Scene) -> None:
     assert np.abs(np.array(ratio) - 1).max() < 0.1
 
 
-def test_targets_are_the_truth_at_the_true_poses(
-    scene: Scene, twin: Scene, sample: RoomSample
-) -> None:
+def test_targets_are_the_truth_at_the_true_poses(scene, twin, sample):
     assert scene.names == sample.context + sample.targets
     np.testing.assert_allclose(scene.cameras.K, twin.cameras.K, rtol=1e-8)
     poses, true = scene.cameras.cam_from_world, twin.cameras.cam_from_world

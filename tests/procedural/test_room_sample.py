@@ -125,9 +125,7 @@ def test_model_reads_back_through_pycolmap(sample: RoomSample) -> None:
             assert image.size == (SIZE["width"], SIZE["height"])
 
 
-def test_reader_finds_depth_everywhere_and_nothing_to_complain(
-    scene: Scene, frames: list[Frame], sample: RoomSample
-) -> None:
+def test_reader_finds_depth_everywhere_and_nothing_to_complain(scene, frames, sample):
     assert scene.names == tuple(sorted((*sample.context, *sample.targets)))
     assert [f.message for f in scene.findings if f.level != "info"] == []
     for frame in frames:
@@ -135,9 +133,7 @@ def test_reader_finds_depth_everywhere_and_nothing_to_complain(
         assert (frame.depth > 0.1).all() and (frame.depth < 9).all()
 
 
-def test_targets_lead_away_from_what_the_context_sees(
-    scene: Scene, frames: list[Frame], sample: RoomSample
-) -> None:
+def test_targets_lead_away_from_what_the_context_sees(scene, frames, sample):
     index = {name: i for i, name in enumerate(scene.names)}
     seen = []
     for target in sample.targets:

@@ -7,11 +7,10 @@ import shutil
 
 import pytest
 from hostile import samples
-from hostile.samples import indexed_tensors, run, shards
+from hostile.samples import indexed_tensors, shards
 
-from gvtools.errors import CheckpointError, GvError, ProjectError
+from gvtools.errors import CheckpointError, ProjectError
 from gvtools.networks.tensors import TensorFiles
-from gvtools.runs.run import load_run
 from gvtools.scenes.project import open_project
 from gvtools.scenes.shards import open_shards
 
@@ -118,15 +117,3 @@ def test_an_index_of_shards(tmp_path):
     collection = open_shards(tmp_path / "shards")
     with pytest.raises(ProjectError, match=OUT):
         collection.read(collection.names[0])
-
-
-def test_stems_of_a_run(tmp_path, secret):
-    run(tmp_path)
-    (tmp_path / "run" / "round_001" / "generated_x").mkdir()
-    file = tmp_path / "run" / "round_001" / "report.json"
-    report = json.loads(file.read_text())
-    report["views"][0]["stem"] = "x/../../../outside/secret"
-    file.write_text(json.dumps(report))
-    target = load_run(tmp_path / "run").views[0]
-    with pytest.raises(GvError, match="outside"):
-        target.read()

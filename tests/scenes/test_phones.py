@@ -73,9 +73,7 @@ def test_an_export_is_recognised_and_read_back(export: str, tmp_path: Path) -> N
         ("all data", "frame_*.jpg"),
     ],
 )
-def test_frames_whose_picture_is_absent_or_damaged_are_left_out(
-    export: str, pattern: str, tmp_path: Path
-) -> None:
+def test_frames_whose_picture_is_absent_or_damaged_are_left_out(export, pattern, tmp_path):
     _, write, place = EXPORTS[export]
     write(tmp_path / place)
     pictures = sorted((tmp_path / place).glob(pattern))
@@ -114,9 +112,7 @@ def test_the_sky_is_told_where_a_phone_was_turned() -> None:
 # --- Stray Scanner ----------------------------------------------------------------------------
 
 
-def test_stray_players_shift_the_video_by_the_frame_that_its_edit_list_hides(
-    tmp_path: Path,
-) -> None:
+def test_stray_players_shift_the_video_by_the_frame_that_its_edit_list_hides(tmp_path):
     rgb = stray_scanner(tmp_path).rgb
     video = tmp_path / "rgb.mp4"
     assert rgb is not None
@@ -273,9 +269,7 @@ def test_record3d_intrinsics_follow_pictures_of_another_size(tmp_path: Path) -> 
         ({"poses": "none"}, r"metadata: unreadable \(poses: "),
     ],
 )
-def test_record3d_metadata_that_is_of_no_use(
-    changed: dict[str, Any], message: str, tmp_path: Path
-) -> None:
+def test_record3d_metadata_that_is_of_no_use(changed, message, tmp_path):
     record3d(tmp_path / "scan.r3d")
     with pytest.raises(ProjectError, match=message):
         open_project(rewritten(tmp_path / "scan.r3d", **changed))

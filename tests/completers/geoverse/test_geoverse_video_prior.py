@@ -178,9 +178,7 @@ def test_masks_are_packed_as_in_the_pipeline_for_the_views_of_the_latent(name: s
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
-def test_only_valid_target_pixels_are_noised_and_invalid_ones_are_zero(
-    network: Any, name: str
-) -> None:
+def test_only_valid_target_pixels_are_noised_and_invalid_ones_are_zero(network, name):
     prior = tiny.prior(network, layout=name)
     spy = Spy(prior)
     images, valid = tiny.views(5, size=(48, 64))
@@ -362,9 +360,7 @@ def test_a_copied_model_shares_its_prior(network):
 pytest.importorskip("diffusers", reason="the extra wan is not installed")
 
 
-def test_lent_weights_come_home_without_being_copied_back(
-    network: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_lent_weights_come_home_without_being_copied_back(network, monkeypatch):
     prior = tiny.prior(network)
     views = (*tiny.views(3), 1)
     wanted = prior.features(*views)

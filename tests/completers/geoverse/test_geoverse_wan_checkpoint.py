@@ -100,9 +100,7 @@ def test_stored_names_are_found_by_diffusers_name(network: Any, wrapper: str) ->
     assert by_diffusers_name(names) == dict(zip(names, names, strict=True))
 
 
-def test_a_truncated_folder_gives_the_features_of_the_whole_network(
-    network: Any, truncated: Path
-) -> None:
+def test_a_truncated_folder_gives_the_features_of_the_whole_network(network, truncated):
     direct = features(tiny.prior(network))
     loaded = features(VideoPrior.from_pretrained(truncated, config=tiny.CONFIG))
     assert all(map(torch.equal, direct, loaded))
@@ -111,9 +109,7 @@ def test_a_truncated_folder_gives_the_features_of_the_whole_network(
 
 
 @pytest.mark.parametrize("kind", ["folder", "file", "wrapped", "bare"])
-def test_wans_own_files_give_the_same_tensors(
-    network: Any, truncated: Path, tmp_path: Path, kind: str
-) -> None:
+def test_wans_own_files_give_the_same_tensors(network, truncated, tmp_path, kind):
     wrapper = "model.diffusion_model." if kind == "wrapped" else ""
     folder = save_original(network, tmp_path / "wan" / "low_noise_model", wrapper=wrapper)
     tiny.vae().save_pretrained(tmp_path / "wan" / "vae")
@@ -157,9 +153,7 @@ def test_bfloat16_is_what_diffusers_makes_of_it(diffusers_source: Path, tmp_path
     assert found[0].dtype == torch.bfloat16
 
 
-def test_nothing_is_read_that_is_not_needed(
-    network: Any, source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_nothing_is_read_that_is_not_needed(network, source, tmp_path, monkeypatch):
     config = {**network.config, "num_layers": 4, "vace_layers": [0, 2]}
     needed = set(expected_tensors(config))
     shards = source / "transformer_2"
@@ -303,9 +297,7 @@ def test_impossible_numbers_of_blocks_are_refused(diffusers_source: Path, tmp_pa
             truncate(diffusers_source, tmp_path / "out", blocks=blocks)
 
 
-def test_a_full_disk_is_noticed_before_anything_is_written(
-    diffusers_source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_is_noticed_before_anything_is_written(diffusers_source, tmp_path, monkeypatch):
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=1_000_000))
     with pytest.raises(ProjectError, match=r"0\.1 GB are needed, 0\.0 GB are free"):
         truncate(diffusers_source, tmp_path / "deep" / "out", **KEPT)
@@ -365,9 +357,7 @@ def test_without_the_empty_prompt_it_says_how_to_make_it(truncated: Path, tmp_pa
         VideoPrior.from_pretrained(folder, config=tiny.CONFIG)
 
 
-def test_without_diffusers_the_extra_is_named(
-    truncated: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_diffusers_the_extra_is_named(truncated, monkeypatch):
     monkeypatch.setitem(sys.modules, "diffusers", None)
     with pytest.raises(CheckpointError, match=r"pip install 'gvtools\[wan\]'"):
         VideoPrior.from_pretrained(truncated, config=tiny.CONFIG)

@@ -21,7 +21,6 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from gvtools.completers.geoverse import GeoVerse, named
-from gvtools.completers.geoverse.config import GeoVerseConfig
 from gvtools.completers.geoverse.model import empty_model
 from gvtools.completers.geoverse.weights import (
     PARTS,
@@ -39,9 +38,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.mark.parametrize("config", [PLAIN, CONTROL, SHARED], ids=lambda c: c.injection)
-def test_published_files_and_ones_own_are_the_same_model(
-    source: Path, config: GeoVerseConfig, tmp_path: Path
-) -> None:
+def test_published_files_and_ones_own_are_the_same_model(source, config, tmp_path):
     model = load(source, config)
     assert not model.training
     for name, parameter in model.named_parameters():
@@ -58,9 +55,7 @@ def test_published_files_and_ones_own_are_the_same_model(
 
 
 @pytest.mark.parametrize("config", [PLAIN, CONTROL, SHARED], ids=lambda c: c.injection)
-def test_a_fresh_extension_changes_no_bit_and_is_the_same_each_time(
-    source: Path, config: GeoVerseConfig
-) -> None:
+def test_a_fresh_extension_changes_no_bit_and_is_the_same_each_time(source, config):
     bare, fresh = load(source), load(source, config)
     assert any(tensor.any() for tensor in output(bare)[:2])
     assert all(map(torch.equal, output(bare), output(fresh)))
@@ -72,9 +67,7 @@ def test_a_fresh_extension_changes_no_bit_and_is_the_same_each_time(
 @pytest.mark.parametrize(
     ("wrapper", "start"), [("ema", "module."), ("ema", ""), ("model", ""), (None, "module.")]
 )
-def test_the_wrappings_of_published_tensors(
-    folder: Path, source: Path, wrapper: str | None, start: str
-) -> None:
+def test_the_wrappings_of_published_tensors(folder, source, wrapper, start):
     for file in (LEVEL1, CASCADE, RGB_HEAD):
         inner = {start + n: t for n, t in torch.load(folder / file)["ema"].items()}
         content: dict[str, Any] = inner if wrapper is None else {wrapper: inner, "epoch": 7}
@@ -100,9 +93,7 @@ def test_a_shared_tensor_may_have_any_of_its_names(folder: Path, source: Path) -
     refused(folder, r"missing: head\.scratch\.output_conv2_aux\.0\.2\.bias and 3 more")
 
 
-def test_the_publishers_other_geometry_head_takes_the_place_of_the_first(
-    folder: Path, source: Path
-) -> None:
+def test_the_publishers_other_geometry_head_takes_the_place_of_the_first(folder, source):
     assert report(folder, "geometry_head").ok
     head = published.write_dpt_head(micro.model(BARE), folder)
     state, before = load(folder).state_dict(), load(source).state_dict()
@@ -302,9 +293,7 @@ def zip_of_text(file: Path) -> None:
     ],
     ids=["torn", "half", "start", "empty", "zip", "html", "lfs"],
 )
-def test_a_file_that_is_no_whole_tensor_file_is_refused(
-    folder: Path, file: Path, damage: Callable[[Path], Any], message: str
-) -> None:
+def test_a_file_that_is_no_whole_tensor_file_is_refused(folder, file, damage, message):
     damage(folder / file)
     assert file.name in refused(folder, message)
 
@@ -399,9 +388,7 @@ def test_what_could_not_be_loaded_is_not_saved(tmp_path: Path) -> None:
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
-def test_a_write_that_fails_leaves_the_earlier_model_whole(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_write_that_fails_leaves_the_earlier_model_whole(tmp_path, monkeypatch):
     model = micro.model(PLAIN)
     save_pretrained(model, tmp_path / "model")
     other = micro.model(replace(PLAIN, views=4), seed=1)
@@ -425,9 +412,7 @@ def test_a_write_that_fails_leaves_the_earlier_model_whole(
         save_pretrained(other, tmp_path / "file")
 
 
-def test_weights_are_never_beside_another_configuration(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_weights_are_never_beside_another_configuration(tmp_path, monkeypatch):
     """Killed between the two names, the folder holds no model, rather than a wrong one."""
     save_pretrained(micro.model(PLAIN), tmp_path)
     other = micro.model(replace(PLAIN, views=4), seed=1)

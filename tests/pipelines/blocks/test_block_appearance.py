@@ -159,9 +159,7 @@ def test_the_views_that_help_are_those_that_a_merge_fits_to(fitted: Path) -> Non
     assert 0 < len(found) < len(context)
 
 
-def test_pictures_across_faces_come_nearer_to_the_photographs(
-    fitted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_pictures_across_faces_come_nearer_to_the_photographs(fitted, tmp_path, monkeypatch):
     before = unfitted(fitted, tmp_path / "joined", monkeypatch)
     after = Fitted.load(fitted / "merged" / SAVED)
     assert error(fitted, after) < 0.95 * error(fitted, before)
@@ -192,9 +190,7 @@ def test_observed_content_is_still_the_unsplit_runs_to_the_bit(fitted: Path) -> 
         assert getattr(one.columns, name).tobytes() == getattr(two.columns, name).tobytes(), name
 
 
-def test_a_resumed_merge_has_the_same_bytes_and_fits_no_second_time(
-    fitted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_resumed_merge_has_the_same_bytes_and_fits_no_second_time(fitted, tmp_path, monkeypatch):
     runs, out = sorted((fitted / "runs").iterdir()), tmp_path / "merged"
 
     def stop(*args: object, **options: object) -> None:

@@ -205,9 +205,7 @@ def test_more_blocks_than_places_are_refused() -> None:
         cut_cells(np.zeros((5, 3)), 6)
 
 
-def test_what_cannot_be_merged_is_refused_in_one_line(
-    walk: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_cannot_be_merged_is_refused_in_one_line(walk, tmp_path, capsys):
     runs = sorted((walk / "runs").iterdir())
     out = tmp_path / "merged"
     assert "missing: " in refused(capsys, "merge", *runs[:2], "--out", out)

@@ -19,9 +19,7 @@ PARTIAL = [miniature for miniature in ALL if miniature.pictures]
 
 
 @pytest.fixture(scope="module", params=ALL, ids=lambda miniature: miniature.title)
-def written(
-    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[Miniature, Path, Expected]:
+def written(request, tmp_path_factory):
     """A miniature, where it lies, and what it holds; not to be changed."""
     root = tmp_path_factory.mktemp("miniature")
     return request.param, root, request.param.write(root)
@@ -38,9 +36,7 @@ def test_a_miniature_is_read_back(written: tuple[Miniature, Path, Expected]) -> 
 
 
 @pytest.mark.parametrize("miniature", PARTIAL, ids=lambda miniature: miniature.title)
-def test_what_a_partial_download_lacks_is_left_out_and_counted(
-    miniature: Miniature, tmp_path: Path
-) -> None:
+def test_what_a_partial_download_lacks_is_left_out_and_counted(miniature, tmp_path):
     expected = miniature.write(tmp_path)
     pictures = sorted(tmp_path.glob(miniature.pictures))
     pictures[1].unlink()

@@ -326,9 +326,7 @@ def test_arkitscenes_high_resolution_pair_has_its_own_intrinsics(tmp_path: Path)
     np.testing.assert_allclose(frame.depth, large.depth[2], rtol=1e-6, atol=0.0005)
 
 
-def test_arkitscenes_frames_between_poses_are_interpolated_and_others_left_out(
-    tmp_path: Path,
-) -> None:
+def test_arkitscenes_frames_between_poses_are_interpolated_and_others_left_out(tmp_path):
     expected = mini_captures.write_arkitscenes(tmp_path)
     folder = tmp_path / expected.scene
     for kind, suffix in (("lowres_wide", "png"), ("lowres_wide_intrinsics", "pincam")):
@@ -533,9 +531,7 @@ def test_aria_first_version_has_the_scalar_of_quaternions_first(tmp_path: Path) 
     assert "quaternions of version 1.0" in messages(scene)
 
 
-def test_aria_recordings_need_the_official_package(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_aria_recordings_need_the_official_package(tmp_path, monkeypatch):
     expected = mini_aria.write(tmp_path)
     monkeypatch.setitem(sys.modules, "projectaria_tools", None)
     with pytest.raises(OptionError, match=r"pip install 'gvtools\[aria\]'"):

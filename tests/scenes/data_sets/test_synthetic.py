@@ -306,9 +306,7 @@ def test_springs_sky_is_told_by_its_map_alone(written: Written) -> None:
     assert (depth[:2, :3] == 0).all()
 
 
-def test_hdf5_and_exr_name_the_extra_that_reads_them(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_hdf5_and_exr_name_the_extra_that_reads_them(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "h5py", None)
     monkeypatch.setitem(sys.modules, "OpenEXR", None)
     with pytest.raises(OptionError, match=r"gvtools\[data\]"):
