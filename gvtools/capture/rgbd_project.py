@@ -99,7 +99,7 @@ def capture_rgbd(
             say(f"taking {source} apart")
             unit = unpack_bag(source, folder)
             options = (options or RgbdOptions()).replaced(depth_unit=unit)
-        recording, scene, resolved = _read(folder, options)
+        recording, scene = _read(folder, options)
         say(f"comparing {len(scene)} frames")
         found = find_poses(RgbdFrames(scene), say=say)
         if len(found.poses) < 2:
@@ -110,7 +110,7 @@ def capture_rgbd(
             )
         names = _names(recording)
         report = _report(scene, found, names, source=source, sources=recording)
-        _write(work, recording, resolved, found=found, names=names)
+        _write(work, recording, found=found, names=names)
         write_json(work / REPORT, asdict(report))
         shutil.rmtree(work / "recording", ignore_errors=True)
         draw(work, report)
@@ -147,8 +147,8 @@ def unpack_bag(bag: Path, folder: Path) -> float:
     return 1 / units
 
 
-def _read(source: Path, options: RgbdOptions | None) -> tuple[Recording, Scene, RgbdOptions]:
-    """The recording in the order of its scene's views, the scene, and the options in force."""
+def _read(source: Path, options: RgbdOptions | None) -> tuple[Recording, Scene]:
+    """The recording in the order of its scene's views, and the scene."""
     resolved, met = resolve_options(source, options)
     recording = read_unposed(source, resolved)
     if recording is None:
@@ -170,9 +170,9 @@ def _read(source: Path, options: RgbdOptions | None) -> tuple[Recording, Scene, 
             raise ProjectError(f"{source}: {text}; expected at least two that overlap")
         recording = replace(recording, frames=kept)
     recording = replace(recording, findings=[*met, *recording.findings])
-    scene = rgbd_scene(recording, resolved)
+    scene = rgbd_scene(recording)
     frames = {frame.name: frame for frame in recording.frames}
-    return replace(recording, frames=[frames[name] for name in scene.names]), scene, resolved
+    return replace(recording, frames=[frames[name] for name in scene.names]), scene
 
 
 def _readable(frame: PosedFrame) -> bool:
@@ -197,12 +197,7 @@ def _names(recording: Recording) -> list[str]:
 
 
 def _write(
-    work: Path,
-    recording: Recording,
-    options: RgbdOptions,
-    *,
-    found: RecordingPoses,
-    names: Sequence[str],
+    work: Path, recording: Recording, *, found: RecordingPoses, names: Sequence[str]
 ) -> None:
     """The project's files but the report."""
     for number, pose in found.poses.items():
@@ -212,22 +207,10 @@ def _write(
         link_or_copy(frame.image, work / names[number])
         link_or_copy(frame.depth, work / f"{stem}.depth.png")
         _save(work / f"{stem}.pose.txt", pose)
-    color_K = recording.color_K if options.color_K is None else np.asarray(options.color_K)
-    _save(work / INTRINSICS, np.asarray(color_K)[:3, :3])
-    depth_K = recording.depth_K if options.depth_K is None else options.depth_K
-    moved = options.color_from_depth
-    if moved is None and recording.color_from_depth is not None:
-        moved = recording.color_from_depth.tolist()
-    distortion = options.distortion
-    if distortion is None and options.color_K is None and any(recording.distortion):
-        distortion = list(recording.distortion)
-    sidecar = {
-        "depth_unit": options.depth_unit or recording.depth_unit,
-        "depth_K": None if depth_K is None else np.asarray(depth_K).tolist(),
-        "color_from_depth": moved,
-        "distortion": distortion,
-        "depth_max": options.depth_max,
-    }
+    options = recording.options
+    _save(work / INTRINSICS, np.asarray(options.color_K)[:3, :3])
+    names_kept = ("depth_unit", "depth_K", "color_from_depth", "distortion", "depth_max")
+    sidecar = {name: getattr(options, name) for name in names_kept}
     write_json(
         work / SIDECAR, {name: value for name, value in sidecar.items() if value is not None}
     )

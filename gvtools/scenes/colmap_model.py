@@ -67,9 +67,7 @@ def has_model(folder: Path) -> bool:
 def find_model(root: Path, *, number: int | None = None) -> Path | None:
     """The model folder of a workspace, or ``root`` when it is one; None when there is none.
 
-    Args:
-        number: of the model, where the workspace holds several (``sparse/0``, ``sparse/1``, ...);
-            None takes the one with most images, the first of equals.
+    Of several (``sparse/0``, ``sparse/1``, ...) that with the ``number``, else with most images.
     """
     for place in PLACES:
         numbered = _numbered(root / place)
@@ -277,17 +275,14 @@ class ColmapModel:
 def load_model(folder: Path, *, faces: bool = False) -> ColmapModel:
     """The model in ``folder``, binary or text, classic or with rigs and frames.
 
-    Args:
-        faces: cameras that see too much for one pinhole camera become several views, see
-            ``faces``; without, each camera is one.
+    With ``faces``, cameras that see too much for one pinhole camera become several views.
     """
     files = model_files(folder)
     findings = []
     if files.others:
         listed = ", ".join(f"{name} ({count} images)" for name, count in files.others)
-        findings.append(
-            Finding("warning", f"model {folder.name} is read; further models are not: {listed}")
-        )
+        line = f"model {folder.name} is read; further models are not: {listed}"
+        findings.append(Finding("warning", line))
     reconstruction = _read(files)
     if reconstruction.num_reg_images() == 0:
         raise ProjectError(
@@ -296,11 +291,10 @@ def load_model(folder: Path, *, faces: bool = False) -> ColmapModel:
         )
     images, defects = _registered(files, reconstruction)
     findings += rotation_findings(defects)
-    absent = reconstruction.num_images() - len(images)
-    if absent:
-        findings.append(
-            Finding("warning", f"{absent} of {reconstruction.num_images()} images have no pose")
-        )
+    count = reconstruction.num_images()
+    if count > len(images):
+        line = f"{count - len(images)} of {count} images have no pose"
+        findings.append(Finding("warning", line))
     used = {image.camera_id for image in images}
     unused = sorted(set(reconstruction.cameras) - used)
     if unused:
@@ -308,12 +302,10 @@ def load_model(folder: Path, *, faces: bool = False) -> ColmapModel:
     views: dict[int, tuple[Undistortion, ...]] = {}
     for key in sorted(used):
         camera = reconstruction.cameras[key]
-        size = camera.width, camera.height
+        lens = camera.model_name, camera.params, (camera.width, camera.height)
         what = f"{folder}, camera {key}"
-        if faces:
-            views[key] = perspective_views(camera.model_name, camera.params, size, what=what)
-        else:
-            views[key] = (undistortion(camera.model_name, camera.params, size, what=what),)
+        one = () if faces else (undistortion(*lens, what=what),)
+        views[key] = one or perspective_views(*lens, what=what)
     return ColmapModel(files, images, views, reconstruction, tuple(findings))
 
 
@@ -362,16 +354,10 @@ def _registered(
 
 
 def _rotation(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The rotation of a quaternion, times its squared length.
+    """(3, 3) rotation of a quaternion x, y, z, w, times its squared length.
 
-    A quaternion that is not of unit length so gives a scaled rotation, which the check of poses
-    either mends exactly or refuses; formulas for unit quaternions would shear it instead.
-
-    Args:
-        quaternion: (4,) x, y, z, w.
-
-    Returns:
-        (3, 3) float64.
+    So one that is not of unit length gives a scaled rotation, which the check of poses either mends
+    exactly or refuses; formulas for unit quaternions would shear it instead.
     """
     from scipy.spatial.transform import Rotation
 
@@ -382,11 +368,7 @@ def _rotation(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def sparse_points(model: ColmapModel, scene: Scene) -> tuple[SparsePoints | None, list[Finding]]:
-    """The model's points with their tracks in the pixels of a scene's views.
-
-    Returns:
-        The points ordered by id (None when the model has none), and what was dropped.
-    """
+    """The model's points by id (None without any), tracks in the views' pixels, and findings."""
     points = model.reconstruction.points3D
     if not len(points):
         return None, [Finding("info", "the model has no sparse points")]
@@ -402,10 +384,8 @@ def sparse_points(model: ColmapModel, scene: Scene) -> tuple[SparsePoints | None
         findings.append(Finding("info", f"{lost} track elements belong to views that are not read"))
     sound = np.isfinite(xy).all(axis=1)
     if not sound.all():
-        bent = int((~sound).sum())
-        findings.append(
-            Finding("warning", f"{bent} detections lie where the lens has no inverse: dropped")
-        )
+        line = f"{int((~sound).sum())} detections lie where the lens has no inverse: dropped"
+        findings.append(Finding("warning", line))
     # By point, then by view: the model's own order depends on its tables.
     rows = np.lexsort((view, point))
     rows = rows[sound[rows]]
@@ -416,17 +396,10 @@ def sparse_points(model: ColmapModel, scene: Scene) -> tuple[SparsePoints | None
             f"{model.files.folder}: {int((~np.isfinite(positions)).any(axis=1).sum())} sparse "
             "points hold NaN or infinity; expected finite positions; export the model again"
         )
-    return (
-        SparsePoints(
-            positions,
-            np.array([item.color for item in ordered], np.uint8),
-            np.array([item.error for item in ordered], np.float32),
-            point[rows],
-            view[rows],
-            xy[rows],
-        ),
-        findings,
-    )
+    colors = np.array([item.color for item in ordered], np.uint8)
+    errors = np.array([item.error for item in ordered], np.float32)
+    tracks_of = SparsePoints(positions, colors, errors, point[rows], view[rows], xy[rows])
+    return tracks_of, findings
 
 
 def _observations(
@@ -494,11 +467,8 @@ def write_colmap(
     Args:
         folder: the model folder itself, usually ``workspace/sparse/0``; made when absent.
         cameras: V cameras; K without skew, each with a name of its own.
-        points: (N, 3), world frame, scene units.
-        colors: (N, 3); None is black.
-        point_index: (M,), for each track element its point.
-        view_index: (M,), and its view.
-        xy: (M, 2), and where it was seen, pixels with the first centre at (0.5, 0.5).
+        points: (N, 3), with (N, 3) ``colors``; None is black.
+        point_index: (M,), for each track element its point, with ``view_index`` and (M, 2) ``xy``.
     """
     if len(set(cameras.names)) != len(cameras):
         raise ShapeError("cameras: two views share a name; a model needs unique image names")

@@ -249,11 +249,7 @@ def perspective_views(
 
     Panoramas become six faces; pictures of fisheye models that are wider than WIDEST become those
     of the faces that they show, cut to the part that they show. All others stay one view.
-
-    Args:
-        params: its parameters, in COLMAP's order; pixels, first pixel centre (0.5, 0.5).
-        size: width and height of the recorded picture, pixels.
-        what: where the camera was read, for the message.
+    Parameters are COLMAP's; ``what`` says where the camera was read.
     """
     if model == PANORAMA:
         camera = camera_of(model, params, size, what=what)
@@ -274,8 +270,7 @@ def perspective_views(
 def panorama_faces(camera: pycolmap.Camera, *, degrees: float = 90.0) -> tuple[Face, ...]:
     """The six faces of an equirectangular camera, as fine in their middle as it is at its equator.
 
-    Args:
-        degrees: field of view of each face; more than 90 lets neighbours overlap.
+    More ``degrees`` of view than 90 let neighbours overlap.
     """
     across = math.tan(math.radians(degrees / 2))
     half = max(1, round(camera.width / (2 * math.pi) * across))
@@ -323,12 +318,10 @@ def _focal(camera: pycolmap.Camera) -> float:
 
 
 def field_of_view(camera: pycolmap.Camera) -> tuple[float, float]:
-    """How much a perspective or fisheye picture shows.
+    """The wider of a picture's two fields of view, degrees, and its greatest angle, radians.
 
-    Returns:
-        The wider of its horizontal and vertical field of view, degrees, and the greatest angle
-        from the optical axis at which its pixels count, radians: the picture's corners, or the
-        middles of its sides where the corners lie outside of the image circle.
+    That is from the optical axis to the last pixel that counts: of the corners, or of the middles
+    of the sides where the corners lie outside of the image circle.
     """
     theta = np.radians(np.arange(0.25, 180, 0.25))
     half: list[float] = []

@@ -106,16 +106,7 @@ def listed_file(folder: Path, name: str, *, where: str) -> Path:
 
 
 def associate(first: Float64, second: Float64, limit: float) -> dict[int, int]:
-    """Pairs of nearest time stamps, each stamp used once, the closest pairs first.
-
-    Args:
-        first: (A,) seconds.
-        second: (B,) seconds.
-        limit: the largest accepted difference, seconds.
-
-    Returns:
-        For indices of ``first``, the index of ``second``.
-    """
+    """Pairs of nearest time stamps in seconds, each used once: index of ``first`` to ``second``."""
     order = np.argsort(second, kind="stable")
     low = np.searchsorted(second[order], first - limit, side="left")
     high = np.searchsorted(second[order], first + limit, side="right")
@@ -143,15 +134,9 @@ def pose_at(
 ) -> Float64 | None:
     """(4, 4) cam_from_world at a time: a stored pose, or one interpolated between its neighbours.
 
-    The camera's centre is interpolated linearly, its rotation spherically (slerp). None outside of
-    the trajectory, and where the neighbours are too far apart in time.
-
-    Args:
-        time: of the frame; all times are in one unit.
-        times: (N,) of the poses, increasing; at least one.
-        poses: (N, 4, 4) cam_from_world, rigid.
-        same: a pose whose time differs by no more than this is taken as it is.
-        longest_gap: longest time between two poses that may be interpolated.
+    A pose within ``same`` of the time is taken as it is. Else the camera's centre is interpolated
+    linearly, its rotation spherically (slerp). None outside of the trajectory, and where the
+    neighbours are more than ``longest_gap`` apart. ``times`` (N,) increase.
     """
     from scipy.spatial.transform import Rotation, Slerp
 

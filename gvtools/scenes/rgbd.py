@@ -37,6 +37,7 @@ from gvtools.scenes.calibration import (
     intrinsics_beside,
     load_matrix,
     pinhole,
+    pinhole_lens,
     sensor_default,
 )
 from gvtools.scenes.images import read_depth
@@ -93,17 +94,19 @@ class RgbdOptions(Settings):
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """RGB-D frames, poses world_from_cam, with the calibration as published."""
+    """RGB-D frames, poses world_from_cam, and options: the user's over the layout's."""
 
     root: Path
-    color_K: Float64  # (3, 3)
-    distortion: tuple[float, ...] = ()  # k1, k2, p1, p2, k3 as OpenCV has them
-    depth_K: Float64 | None = None  # (3, 3); None where depth is of the colour camera
-    color_from_depth: Float64 | None = None  # (4, 4), metres; None: the same place
-    depth_unit: float = MILLIMETRES  # metres per stored unit
+    options: RgbdOptions  # ``color_K`` and ``depth_unit`` are known
     frames: Sequence[PosedFrame] = ()
     unposed: str = NO_POSE  # why frames without a pose are left out
     findings: Sequence[Finding] = ()
+
+
+def _under(options: RgbdOptions, **values: object) -> RgbdOptions:
+    """The options with what a layout says, where they say nothing."""
+    absent = {name: value for name, value in values.items() if getattr(options, name) is None}
+    return options.replaced(**absent)
 
 
 class RgbdFolder(ABC):
@@ -111,6 +114,8 @@ class RgbdFolder(ABC):
 
     name: str
     holds: tuple[str, str]  # with poses and without, for messages
+    unit = MILLIMETRES  # metres per stored unit of depth
+    above = False  # whether intrinsics may lie in the folder above
 
     @abstractmethod
     def matches(self, root: Path, *, posed: bool = True) -> bool:
@@ -120,53 +125,64 @@ class RgbdFolder(ABC):
     def frames(self, root: Path, options: RgbdOptions) -> list[PosedFrame]:
         """The pictures in order of time, with their depth maps, no poses yet."""
 
-    @abstractmethod
+    def frames_of_poses(self, root: Path) -> list[PosedFrame]:
+        """The frames that files of a pose each tell of, with a picture or without."""
+        return []
+
     def calibration(self, root: Path, options: RgbdOptions) -> Recording:
         """A recording that has no frames yet."""
+        options = _under(options, depth_unit=self.unit)
+        if options.color_K is not None:
+            return Recording(root, options)
+        found = intrinsics_beside(root, above=self.above)
+        if found is None:
+            return self.uncalibrated(root, options)
+        line = f"intrinsics: {found[1]}"
+        return Recording(root, _under(options, color_K=found[0]), findings=[Finding("info", line)])
 
-    @abstractmethod
-    def posed(self, recording: Recording, options: RgbdOptions, *, strict: bool) -> Recording:
+    def uncalibrated(self, root: Path, options: RgbdOptions) -> Recording:
+        """A recording where neither an option nor a file has intrinsics."""
+        K, finding = sensor_default()
+        return Recording(root, _under(options, color_K=K), findings=[finding])
+
+    def posed(self, recording: Recording, *, strict: bool) -> Recording:
         """The recording with its frames and their poses; only a strict one minds damaged ones."""
+        frames = self.frames(recording.root, recording.options)
+        known = {frame.where for frame in frames}
+        others = self.frames_of_poses(recording.root)
+        frames += [frame for frame in others if frame.where not in known]
+        return replace(recording, frames=[_with_pose(frame, strict=strict) for frame in frames])
 
     def record(self, root: Path, options: RgbdOptions, *, strict: bool = True) -> Recording:
         """The frames, poses and calibration of a folder."""
-        return self.posed(self.calibration(root, options), options, strict=strict)
+        return self.posed(self.calibration(root, options), strict=strict)
 
     def read(self, root: Path, *, options: RgbdOptions | None = None) -> Scene:
         """A folder with poses as a scene, metric, in the poses' own world frame."""
         resolved, findings = resolve_options(root, options)
         recording = self.record(root, resolved)
-        return rgbd_scene(replace(recording, findings=[*findings, *recording.findings]), resolved)
+        return rgbd_scene(replace(recording, findings=[*findings, *recording.findings]))
 
     def layout(self) -> Layout:
         """For folders with poses."""
         return Layout.of_folder(self.name, self.holds[0], matches=self.matches, read=self.read)
 
 
-def _with_pose(frame: PosedFrame, *shapes: tuple[int, int], strict: bool) -> PosedFrame:
+def _with_pose(frame: PosedFrame, *, strict: bool) -> PosedFrame:
     """The frame with the pose in its own file."""
     path = Path(frame.where)
     try:
-        return replace(frame, pose=load_matrix(path, *shapes)) if path.is_file() else frame
+        return replace(frame, pose=load_matrix(path, (4, 4), (3, 4))) if path.is_file() else frame
     except ProjectError:
         if strict:
             raise
         return frame
 
 
-def _published(root: Path, options: RgbdOptions, *, above: bool = False) -> Recording | None:
-    """Calibrated by an option, or else by a file beside the frames."""
-    if options.color_K is not None:
-        return Recording(root, np.asarray(options.color_K))
-    found = intrinsics_beside(root, above=above)
-    if found is None:
-        return None
-    return Recording(root, found[0], findings=[Finding("info", f"intrinsics: {found[1]}")])
-
-
 class _SevenScenes(RgbdFolder):
     name = "7-Scenes"
     holds = "*.color.*, *.depth.png, *.pose.txt", "*.color.*, *.depth.png"
+    above = True
 
     def matches(self, root: Path, *, posed: bool = True) -> bool:
         beside = "*.pose.txt" if posed else "*.depth.png"
@@ -174,36 +190,21 @@ class _SevenScenes(RgbdFolder):
 
     def frames(self, root: Path, options: RgbdOptions) -> list[PosedFrame]:
         suffixes = (".color.png", ".color.jpg", ".color.jpeg")
-        return [
-            self._frame(root, path.name[: path.name.rindex(".color.")], path.name)
-            for path in sorted(root.iterdir())
-            if path.name.endswith(suffixes)
-        ]
+        names = sorted(path.name for path in root.iterdir() if path.name.endswith(suffixes))
+        return [self._frame(root, name[: name.rindex(".color.")], name) for name in names]
+
+    def frames_of_poses(self, root: Path) -> list[PosedFrame]:
+        stems = (path.name.removesuffix(".pose.txt") for path in root.glob("*.pose.txt"))
+        return [self._frame(root, stem, f"{stem}.color.png") for stem in stems]
 
     def _frame(self, root: Path, stem: str, name: str) -> PosedFrame:
-        pose = str(root / f"{stem}.pose.txt")
-        depth = root / f"{stem}.depth.png"
+        pose, depth = str(root / f"{stem}.pose.txt"), root / f"{stem}.depth.png"
         return PosedFrame(name, root / name, None, None, depth, where=pose)
 
-    def calibration(self, root: Path, options: RgbdOptions) -> Recording:
-        found = _published(root, options, above=True)
-        if found is None:
-            raise ProjectError(
-                f"{root}: no {INTRINSICS} there or in the parent folder; expected three lines "
-                "'fx 0 cx', '0 fy cy', '0 0 1'; write it, or give color_K (--color-intrinsics)"
-            )
-        return found
-
-    def posed(self, recording: Recording, options: RgbdOptions, *, strict: bool) -> Recording:
-        root = recording.root
-        frames = self.frames(root, options)
-        known = {frame.where for frame in frames}
-        alone = (path.name for path in root.glob("*.pose.txt") if str(path) not in known)
-        stems = (name.removesuffix(".pose.txt") for name in alone)
-        frames += [self._frame(root, stem, f"{stem}.color.png") for stem in stems]
-        return replace(
-            recording,
-            frames=[_with_pose(frame, (4, 4), (3, 4), strict=strict) for frame in frames],
+    def uncalibrated(self, root: Path, options: RgbdOptions) -> Recording:
+        raise ProjectError(
+            f"{root}: no {INTRINSICS} there or in the parent folder; expected three lines "
+            "'fx 0 cx', '0 fy cy', '0 0 1'; write it, or give color_K (--color-intrinsics)"
         )
 
 
@@ -224,6 +225,7 @@ PUBLISHED = {
 class _Tum(RgbdFolder):
     name = "TUM"
     holds = "rgb.txt, depth.txt, groundtruth.txt", "rgb.txt, depth.txt"
+    unit = 1 / 5000
 
     def matches(self, root: Path, *, posed: bool = True) -> bool:
         return all((root / name).is_file() for name in self.holds[not posed].split(", "))
@@ -246,26 +248,23 @@ class _Tum(RgbdFolder):
             frames.append((time, PosedFrame(color.name, color, None, None, depth, where=where)))
         return sorted(frames, key=lambda item: (item[0], item[1].image))
 
-    def calibration(self, root: Path, options: RgbdOptions) -> Recording:
-        found = _published(root, options)
-        if found is None:
-            K, finding = sensor_default()
-            found = Recording(root, K, findings=[finding])
-            for name, (values, distortion) in PUBLISHED.items():
-                if name in root.resolve().name:
-                    source = Finding("info", f"intrinsics: published for {name}")
-                    found = Recording(root, pinhole(values), distortion, findings=[source])
-        return replace(found, depth_unit=1 / 5000)
+    def uncalibrated(self, root: Path, options: RgbdOptions) -> Recording:
+        for name, (values, distortion) in PUBLISHED.items():
+            if name in root.resolve().name:
+                lens = {"color_K": pinhole(values), "distortion": distortion or None}
+                published = _under(options, **lens)
+                line = f"intrinsics: published for {name}"
+                return Recording(root, published, findings=[Finding("info", line)])
+        return super().uncalibrated(root, options)
 
-    def posed(self, recording: Recording, options: RgbdOptions, *, strict: bool) -> Recording:
-        limit = options.max_time_difference
+    def posed(self, recording: Recording, *, strict: bool) -> Recording:
+        limit = recording.options.max_time_difference
         truth = read_poses(recording.root / "groundtruth.txt", layout="tum")
         assert truth.stamps is not None
         order = np.argsort(truth.stamps, kind="stable")
         at = partial(pose_at, times=truth.stamps[order], poses=truth.poses[order], same=limit)
-        frames = [
-            replace(frame, pose=at(time)) for time, frame in self._stamped(recording.root, options)
-        ]
+        stamped = self._stamped(recording.root, recording.options)
+        frames = [replace(frame, pose=at(time)) for time, frame in stamped]
         return replace(recording, frames=frames, unposed=f"{NO_POSE} within {limit:g} s")
 
 
@@ -294,47 +293,40 @@ class _ScanNet(RgbdFolder):
     def frames(self, root: Path, options: RgbdOptions) -> list[PosedFrame]:
         return [self._frame(root, path) for path in pictures_in(root / "color")]
 
+    def frames_of_poses(self, root: Path) -> list[PosedFrame]:
+        stems = (path.stem for path in (root / "pose").glob("*.txt"))
+        return [self._frame(root, root / "color" / f"{stem}.jpg") for stem in stems]
+
     def _frame(self, root: Path, color: Path) -> PosedFrame:
         depth, pose = root / "depth" / f"{color.stem}.png", root / "pose" / f"{color.stem}.txt"
         return PosedFrame(color.name, color, None, None, depth, where=str(pose))
 
     def calibration(self, root: Path, options: RgbdOptions) -> Recording:
-        folder = root / "intrinsic"
-        if options.color_K is not None:
-            K = np.asarray(options.color_K)
-        elif (folder / "intrinsic_color.txt").is_file():
-            K = load_matrix(folder / "intrinsic_color.txt", (4, 4), (3, 3))[:3, :3]
-        else:
+        folder, cameras = root / "intrinsic", ("color", "depth")
+        color_K, depth_K = (
+            load_matrix(path, (4, 4), (3, 3))[:3, :3] if path.is_file() else None
+            for path in (folder / f"intrinsic_{camera}.txt" for camera in cameras)
+        )
+        merged = _under(options, depth_unit=self.unit, color_K=color_K, depth_K=depth_K)
+        if merged.color_K is None:
             raise ProjectError(
                 f"{folder}: no intrinsic_color.txt; export it, or give color_K (--color-intrinsics)"
             )
-        if not (folder / "intrinsic_depth.txt").is_file():
-            return Recording(root, K)
-        depth_K = load_matrix(folder / "intrinsic_depth.txt", (4, 4), (3, 3))[:3, :3]
-        files = (folder / f"extrinsic_{camera}.txt" for camera in ("color", "depth"))
+        if depth_K is None:
+            return Recording(root, merged)
         # Camera from rig each; an export without such files has one place for both.
         color, depth = (
             rigid_transform(load_matrix(path, (4, 4)), what=str(path))[0]
             if path.is_file()
             else np.eye(4)
-            for path in files
+            for path in (folder / f"extrinsic_{camera}.txt" for camera in cameras)
         )
         moved, findings = color @ np.linalg.inv(depth), []
         if options.color_from_depth is None and not np.allclose(moved, np.eye(4)):
             # Exports with other than identity are rare, and tools read them both ways.
             message = "extrinsics are taken as camera-from-rig; if not, give color_from_depth"
             findings.append(Finding("warning", message))
-        return Recording(root, K, depth_K=depth_K, color_from_depth=moved, findings=findings)
-
-    def posed(self, recording: Recording, options: RgbdOptions, *, strict: bool) -> Recording:
-        root = recording.root
-        frames = self.frames(root, options)
-        known = {frame.image.stem for frame in frames}
-        alone = (path.stem for path in (root / "pose").glob("*.txt") if path.stem not in known)
-        frames += [self._frame(root, root / "color" / f"{stem}.jpg") for stem in alone]
-        return replace(
-            recording, frames=[_with_pose(frame, (4, 4), strict=strict) for frame in frames]
-        )
+        return Recording(root, _under(merged, color_from_depth=moved), findings=findings)
 
 
 class _Redwood(RgbdFolder):
@@ -355,21 +347,13 @@ class _Redwood(RgbdFolder):
         depth_of = pair_by_name(colors, pictures_in(root / "depth"))
         return [PosedFrame(path.name, path, None, None, depth_of.get(path)) for path in colors]
 
-    def calibration(self, root: Path, options: RgbdOptions) -> Recording:
-        found = _published(root, options)
-        if found is not None:
-            return found
-        K, finding = sensor_default()
-        return Recording(root, K, findings=[finding])
-
-    def posed(self, recording: Recording, options: RgbdOptions, *, strict: bool) -> Recording:
-        root = recording.root
-        findings = list(recording.findings)
+    def posed(self, recording: Recording, *, strict: bool) -> Recording:
+        root, findings = recording.root, list(recording.findings)
         logs = sorted(root.glob("*.log"), key=lambda path: (path.name != "trajectory.log", path))
         if len(logs) > 1:
             others = named([path.name for path in logs[1:]])
             findings.append(Finding("warning", f"poses are read from {logs[0].name}, not {others}"))
-        frames = self.frames(root, options)
+        frames = self.frames(root, recording.options)
         unpaired = len(pictures_in(root / "depth")) - sum(item.depth is not None for item in frames)
         if unpaired:
             findings.append(Finding("warning", f"{unpaired} depth maps belong to no picture"))
@@ -380,9 +364,8 @@ class _Redwood(RgbdFolder):
                 f"{logs[0]}: {len(numbers)} poses numbered {named(numbers)} for {len(frames)} "
                 "pictures; expected one pose a picture, or numbers of pictures counted from 0"
             )
-        for row, number, pose in zip(
-            numbers if fits else range(len(frames)), numbers, poses, strict=True
-        ):
+        rows = numbers if fits else range(len(frames))
+        for row, number, pose in zip(rows, numbers, poses, strict=True):
             frames[row] = replace(frames[row], pose=pose, where=f"{logs[0]}, pose {number}")
         return replace(recording, frames=frames, findings=findings)
 
@@ -428,7 +411,8 @@ def read_unposed(root: Path, options: RgbdOptions) -> Recording | None:
     folder = _unposed(root)
     if folder is None:
         return None
-    recording, found = folder.calibration(root, options), folder.frames(root, options)
+    recording = folder.calibration(root, options)
+    found = folder.frames(root, recording.options)
     frames = [
         replace(frame, pose=np.eye(4), where=str(frame.image))
         for frame in found
@@ -453,27 +437,24 @@ def resolve_options(root: Path, options: RgbdOptions | None) -> tuple[RgbdOption
     return merged, [Finding("info", f"options read from {SIDECAR}: {names}")]
 
 
-def rgbd_scene(
-    recording: Recording, options: RgbdOptions, *, kind: str = "rgbd", strict: bool = True
-) -> Scene:
+def rgbd_scene(recording: Recording, *, kind: str = "rgbd", strict: bool = True) -> Scene:
     """The scene of a recording, in metres, in the poses' own world frame."""
-    root, frames = recording.root, recording.frames
-    color_K = recording.color_K if options.color_K is None else options.color_K
-    K = corner_origin(color_K, what=f"{root}, colour intrinsics")
-    registration = _registration(recording, options)
-    unit = recording.depth_unit if options.depth_unit is None else float(options.depth_unit)
+    root, frames, options = recording.root, recording.frames, recording.options
+    K = corner_origin(np.array(options.color_K), what=f"{root}, colour intrinsics")
+    registration = _registration(root, options)
     size = first_size(frame.image for frame in frames)
     if size is None and frames and strict:
         what = "unreadable" if frames[0].image.exists() else "no such picture"
         raise ProjectError(f"{frames[0].image}: {what}, like all {len(frames)} pictures beside it")
-    lens = _lens(K, recording, options, size=size or (2, 2))
+    lens = _lens(K, recording, size=size or (2, 2))
+    unit = options.depth_unit or MILLIMETRES
     reader = partial(read_depth, unit=unit, maximum=options.depth_max)
-    frames = [
-        replace(frame, lens=lens, read_depth=reader, registration=registration) for frame in frames
-    ]
     scene = posed_scene(
         root,
-        frames,
+        [
+            replace(frame, lens=lens, read_depth=reader, registration=registration)
+            for frame in frames
+        ],
         poses="world_from_cam",
         metric=True,
         kind=kind,
@@ -482,7 +463,11 @@ def rgbd_scene(
         unposed=recording.unposed,
         advice="give its pictures and poses",
     )
-    findings = [*scene.findings, *_principal_point_findings(K, lens.size)]
+    findings, shares = [*scene.findings], K[:2, 2] / lens.size
+    if np.abs(shares - 0.5).max() >= 0.25:
+        line = f"the principal point ({K[0, 2]:.1f}, {K[1, 2]:.1f}) is far from the middle of "
+        line += f"{lens.size[0]}x{lens.size[1]} pixels: are the intrinsics of another size?"
+        findings.append(Finding("warning", line))
     if not any(view.has_depth for view in scene):
         findings.append(Finding("warning", f"none of {len(scene)} frames has a depth map"))
     else:
@@ -495,53 +480,29 @@ def rgbd_scene(
     return replace(scene, findings=tuple(findings))
 
 
-def _registration(recording: Recording, options: RgbdOptions) -> Registration | None:
-    depth_K = recording.depth_K if options.depth_K is None else options.depth_K
-    moved = (
-        recording.color_from_depth if options.color_from_depth is None else options.color_from_depth
-    )
-    if depth_K is None and moved is None:
+def _registration(root: Path, options: RgbdOptions) -> Registration | None:
+    if options.depth_K is None and options.color_from_depth is None:
         return None
-    if depth_K is None:
+    if options.depth_K is None:
         raise OptionError(
-            f"{recording.root}: color_from_depth is given without depth_K; expected both; give the "
-            "depth camera's intrinsics"
+            f"{root}: color_from_depth is given without depth_K; expected both; give the depth "
+            "camera's intrinsics"
         )
     transform = np.eye(4)
-    if moved is not None:
-        transform, _ = rigid_transform(moved, what=f"{recording.root}, color_from_depth")
-    return Registration(
-        corner_origin(depth_K, what=f"{recording.root}, depth intrinsics"), transform
-    )
+    if options.color_from_depth is not None:
+        transform, _ = rigid_transform(options.color_from_depth, what=f"{root}, color_from_depth")
+    return Registration(corner_origin(options.depth_K, what=f"{root}, depth intrinsics"), transform)
 
 
-def _lens(
-    K: Float64, recording: Recording, options: RgbdOptions, *, size: tuple[int, int]
-) -> LensParameters:
-    shared = (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
-    if options.distortion is not None:
-        distortion: Sequence[float] = options.distortion
-        if len(distortion) != 5 or not np.isfinite(distortion).all():
-            raise OptionError(
-                f"{recording.root}, colour camera: distortion {distortion}; expected five numbers "
-                "k1, k2, p1, p2, k3"
-            )
-    else:
-        # What a layout publishes belongs to the intrinsics that it publishes.
-        distortion = recording.distortion if options.color_K is None else ()
-    if any(distortion):
-        return LensParameters("FULL_OPENCV", (*shared, *distortion, 0.0, 0.0, 0.0), size)
-    return LensParameters("PINHOLE", shared, size)
-
-
-def _principal_point_findings(K: Float64, size: tuple[int, int]) -> list[Finding]:
-    x, y = K[0, 2] / size[0], K[1, 2] / size[1]
-    if 0.25 < x < 0.75 and 0.25 < y < 0.75:
-        return []
-    return [
-        Finding(
-            "warning",
-            f"the principal point ({K[0, 2]:.1f}, {K[1, 2]:.1f}) is far from the middle of "
-            f"{size[0]}x{size[1]} pixels: are the intrinsics of another size?",
+def _lens(K: Float64, recording: Recording, *, size: tuple[int, int]) -> LensParameters:
+    lens, distortion = pinhole_lens(K, size), recording.options.distortion
+    if distortion is None:
+        return lens
+    if len(distortion) != 5 or not np.isfinite(distortion).all():
+        raise OptionError(
+            f"{recording.root}, colour camera: distortion {distortion}; expected five numbers k1, "
+            "k2, p1, p2, k3"
         )
-    ]
+    if not any(distortion):
+        return lens
+    return LensParameters("FULL_OPENCV", (*lens.values, *distortion, 0.0, 0.0, 0.0), size)

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gvtools.errors import ProjectError
+from gvtools.untrusted import reading
 
 if TYPE_CHECKING:
     import pycolmap
@@ -156,14 +157,9 @@ def undistortion(
     *,
     what: str,
 ) -> Undistortion:
-    """The mapping of a camera given by COLMAP's model name and parameters.
+    """The mapping of a camera of COLMAP's; pinholes without distortion are passed untouched.
 
-    Pinhole models without distortion are passed untouched.
-
-    Args:
-        params: its parameters, in COLMAP's order; pixels, first pixel centre (0.5, 0.5).
-        size: width and height of the recorded picture, pixels.
-        what: where the camera was read, for the message.
+    ``what`` says where the camera was read, for messages.
     """
     import pycolmap
 
@@ -178,25 +174,13 @@ def undistortion(
             model="PINHOLE",
             width=camera.width,
             height=camera.height,
-            params=[
-                camera.focal_length_x,
-                camera.focal_length_y,
-                camera.principal_point_x,
-                camera.principal_point_y,
-            ],
+            params=camera.calibration_matrix()[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(),
         )
         return Undistortion(camera, target, True)
-    try:
+    with reading(f"{what}: {model} {list(params)}", "expected a lens that can be undistorted"):
         target = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
-    except (ValueError, RuntimeError) as error:
-        raise ProjectError(
-            f"{what}: {model} {list(params)} cannot be undistorted ({error})"
-        ) from None
-    if _impossible(target):
-        raise ProjectError(
-            f"{what}: {model} {list(params)} cannot be undistorted: what results "
-            f"{_impossible(target)}; solve or export the model again"
-        )
+        if _impossible(target):
+            raise ValueError(f"what results {_impossible(target)}; solve or export it again")
     return Undistortion(camera, target, False)
 
 
@@ -207,13 +191,7 @@ def camera_of(
     *,
     what: str,
 ) -> pycolmap.Camera:
-    """A camera of COLMAP from its model's name and parameters, checked.
-
-    Args:
-        params: its parameters, in COLMAP's order.
-        size: width and height, pixels.
-        what: where the camera was read, for the message.
-    """
+    """A camera of COLMAP from its model's name, parameters and size, checked."""
     import pycolmap
 
     if model not in pycolmap.CameraModelId.__members__ or model == "INVALID":

@@ -161,7 +161,7 @@ def test_features_start_pairs_that_motion_alone_does_not(walked, recording) -> N
     poses = walked[0]
     found = read_unposed(recording, RgbdOptions())
     assert found is not None
-    frames = RgbdFrames(rgbd_scene(found, RgbdOptions()))
+    frames = RgbdFrames(rgbd_scene(found))
     far = COUNT // 2
     truth = {0: poses[0], far: poses[far]}
     start = start_from_features(frames.features(far), frames.features(0), frames.feature_K)

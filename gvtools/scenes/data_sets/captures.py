@@ -69,7 +69,7 @@ def _read_scannet(root: Path, scene: str) -> Scene:
     folder = root / scene
     if SCANNET.matches(folder):
         recording = SCANNET_FOLDER.record(folder, RgbdOptions(), strict=False)
-        return rgbd_scene(recording, RgbdOptions(), kind="data set", strict=False)
+        return rgbd_scene(recording, kind="data set", strict=False)
     path = min(folder.glob("*.sens"), default=None)
     if path is None:
         raise ProjectError(f"{folder}: neither exported folders nor a .sens file")
