@@ -138,7 +138,9 @@ class Fit:
         self.begin = begin
         # The limit of Gaussians does not count those of an earlier fit.
         self._begun_with = len(start.values) if begin else 0
-        self._validation = () if begin else validation_rows(len(self.views))
+        rows = () if begin else validation_rows(len(self.views))
+        # What is masked everywhere tells nothing.
+        self._validation = tuple(row for row in rows if _shows(self.views[row]))
         self._checks = tuple(share for share in POSE_CHECKS if share > begin)
         # Recorded depth fixes Gaussians along the ray, as photographs from more directions would.
         self._left_out = 0.0 if self.recorded else min(MOST_LEFT_OUT, LEFT_OUT / len(self.views))
@@ -431,6 +433,10 @@ def validation_rows(views: int) -> tuple[int, ...]:
     """Numbers of the validation photographs among ``views`` photographs, evenly spread."""
     count = min(views // VALIDATION_EVERY, MOST_VALIDATION)
     return tuple((2 * k + 1) * views // (2 * count) for k in range(count))
+
+
+def _shows(view: FitView) -> bool:
+    return view.mask is None or bool(view.mask.any())
 
 
 def _psnr(error: float) -> float:

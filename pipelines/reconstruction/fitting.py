@@ -91,6 +91,8 @@ def fit_views(
 ) -> list[FitView]:
     """The context's photographs, with recorded or estimated depth; poses in ``frame``."""
     views = [plan.scene[name] for name in plan.context]
+    if any(view.camera.K[0, 0, 1] for view in views):
+        raise ShapeError("cameras with skew; expected none; undistort the photographs first")
     poses = frame.cam_from_local(plan.scene.subset(plan.context).cameras.cam_from_world)
     frames = prefetch(lambda view: view.load(), views)
     return [
@@ -121,8 +123,6 @@ def _estimate(
 
 def first_gaussians(plan: Plan, views: Sequence[FitView], frame: LocalFrame) -> Gaussians:
     """Gaussians at recorded depth, else at sparse points and, if these are few, estimated depth."""
-    if any(view.K[0, 1] for view in views):
-        raise ShapeError("cameras with skew; expected none; undistort the photographs first")
     seed, most = plan.config.seed, plan.config.refine.most_gaussians
     if any(view.depth is not None for view in views):
         return from_depth(views, frame=frame, seed=seed, most=most)

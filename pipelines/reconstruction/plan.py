@@ -18,6 +18,7 @@ from gvtools.errors import OptionError
 from gvtools.runs.digests import array_digest, fingerprint
 from gvtools.runs.poses import RunPoses, posed, with_poses
 from gvtools.scenes.layout import is_address
+from gvtools.scenes.matching import natural
 from gvtools.scenes.resized import reduced
 from gvtools.scenes.scene import Scene, View
 from gvtools.scenes.selection import check_disjoint, select
@@ -150,7 +151,7 @@ def resolve_targets(
         return _file(Path(path), context_cameras)
     try:
         # By name, as the context: what one target adds, the next ones are completed on.
-        chosen = tuple(sorted(select(scene.names, spec)))
+        chosen = natural(select(scene.names, spec))
     except OptionError as error:
         raise OptionError(f"targets {spec!r}: {error}; or give {FORMS}") from None
     if not allow_overlap:
@@ -207,7 +208,7 @@ def _project(path: str, selection: str, scene: Scene, *, max_side: int | None) -
         other = open_project(path, root=scene.origin.root)
         address = other.address
     other = reduced(other, max_side)
-    chosen = tuple(sorted(select(other.names, selection)))
+    chosen = natural(select(other.names, selection))
     views = tuple(other[name] for name in chosen)
     files = tuple(file for view in views for file in view.files)
     return Targets(other.subset(chosen).cameras, views, "project", files, address)

@@ -17,6 +17,7 @@ from gvtools.poses.views import FitView
 from gvtools.prefetch import prefetch
 from gvtools.runs.layout import POSES, TUNED
 from gvtools.runs.poses import RunPoses, posed, with_poses
+from gvtools.scenes.matching import natural
 from gvtools.scenes.resized import reduced
 from gvtools.scenes.scene import Frame, Scene
 from gvtools.scenes.selection import select
@@ -62,7 +63,7 @@ def make_plan(
     scene = reduced(scene, config.max_side)
     completer = config.effort.wrap(create(config.completer, **config.completer_options))
     # By name: a project may list its views in any order, and merging depends on theirs.
-    context = tuple(sorted(select(scene.names, config.context)))
+    context = natural(select(scene.names, config.context))
     if config.tune.wanted:
         check_tuning(completer, context)
     targets = resolve_targets(

@@ -325,6 +325,16 @@ def test_validation_photographs_are_left_out_until_they_join():
         np.testing.assert_allclose(fit.predicted[held].rgb, expected.rgb, atol=1e-5)
 
 
+def test_a_photograph_that_is_masked_everywhere_validates_nothing():
+    views = photographs(walk(16))
+    first, second = validation_rows(16)
+    views[first] = replace(views[first], mask=np.zeros((HEIGHT, WIDTH), np.bool_))
+    fit = Fit(rough_gaussians(), views, options=FitOptions())
+    assert np.isfinite(fit.left_out_psnr())
+    fit._add_validation()
+    assert list(fit.predicted) == [second]
+
+
 def test_harmonics_join_one_degree_after_the_other(views):
     fit = Fit(rough_gaussians(), views, options=FitOptions())
     for degree, share in ((0, 0.0), (1, 0.13), (2, 0.25)):
