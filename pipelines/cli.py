@@ -13,31 +13,31 @@ import gvtools
 from gvtools.errors import GvError
 from gvtools.system_libraries import advice, missing_libraries
 from pipelines.console import Console
-from pipelines.options import add_actions, add_command
+from pipelines.options import Arguments, add_command
 
-# Each module has SUMMARY, EXAMPLES, and ACTIONS or NameArguments with run(arguments, console).
+# The module of each command, which has it as a class: demo is DemoCommand.
 COMMANDS = {
-    "demo": "pipelines.commands.demo",
+    "demo": "pipelines.commands.reconstruct",
     "capture": "pipelines.commands.capture",
-    "check": "pipelines.commands.check",
+    "check": "pipelines.commands.data",
     "reconstruct": "pipelines.commands.reconstruct",
-    "refine": "pipelines.commands.refine",
-    "split": "pipelines.commands.split",
-    "merge": "pipelines.commands.merge",
+    "refine": "pipelines.commands.reconstruct",
+    "split": "pipelines.commands.blocks",
+    "merge": "pipelines.commands.blocks",
     "render": "pipelines.commands.render",
-    "tradeoff": "pipelines.commands.tradeoff",
+    "tradeoff": "pipelines.commands.sweep",
     "evaluate": "pipelines.commands.evaluate",
-    "judge": "pipelines.commands.judge",
-    "benchmark": "pipelines.commands.benchmark",
-    "fleet": "pipelines.commands.fleet",
-    "trajectory": "pipelines.commands.trajectory",
-    "report": "pipelines.commands.report",
-    "plot": "pipelines.commands.plot",
+    "judge": "pipelines.commands.evaluate",
+    "benchmark": "pipelines.commands.sweep",
+    "fleet": "pipelines.commands.sweep",
+    "trajectory": "pipelines.commands.evaluate",
+    "report": "pipelines.commands.view",
+    "plot": "pipelines.commands.view",
     "weights": "pipelines.commands.weights",
     "data": "pipelines.commands.data",
     "train": "pipelines.commands.train",
     "export": "pipelines.commands.export",
-    "film": "pipelines.commands.film",
+    "film": "pipelines.commands.render",
     "view": "pipelines.commands.view",
     "bench": "pipelines.commands.bench",
 }
@@ -71,18 +71,10 @@ def build_parser(
         if only in modules and name != only:
             commands.add_parser(name)
             continue
-        module = import_module(path)
-        command = add_command(commands, name, summary=module.SUMMARY, examples=module.EXAMPLES)
-        command.add_argument("--quiet", action="store_true", help="print nothing but warnings")
-        command.add_argument("--debug", action="store_true", help="show tracebacks of errors")
-        if only not in (None, name):
-            continue
-        if hasattr(module, "ACTIONS"):
-            add_actions(command, name, module.ACTIONS)
-        else:
-            arguments = getattr(module, f"{name.capitalize()}Arguments")
-            command.set_defaults(job=(module.run, arguments))
-            arguments.add(command)
+        command: type[Arguments] = getattr(import_module(path), f"{name.capitalize()}Command")
+        added = add_command(commands, name, command, whole=only in (None, name))
+        added.add_argument("--quiet", action="store_true", help="print nothing but warnings")
+        added.add_argument("--debug", action="store_true", help="show tracebacks of errors")
     return parser
 
 
@@ -103,8 +95,7 @@ def main(argv: Sequence[str] | None = None, *, modules: Mapping[str, str] = COMM
         if args.command is None:
             parser.print_help()
             return 2
-        run, arguments = args.job
-        run(arguments.read(args), Console(quiet=args.quiet))
+        args.command_class.read(args).run(Console(quiet=args.quiet))
     except BrokenPipeError:
         # The reader of the output, such as ``head``, has seen enough; nothing is left to flush.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

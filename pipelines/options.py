@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, TypeVar, Union
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar, Union
 from typing import get_args as parts_of
 from typing import get_origin as origin_of
 
@@ -24,11 +24,12 @@ A = TypeVar("A", bound="Arguments")
 
 
 class Arguments(Settings):
-    """Arguments of a command: a field each, which may end in "_" where its name is taken.
+    """A command, or what several share: a field for each argument.
 
-    What stands in brackets at the end of a field's text is its unit or what the help calls its
-    value. "[A B]" takes two values, "[NAME ...]" any number after the option; other sequences are
-    given by repeating the option. Mappings are no options.
+    The docstring is the command's summary. A field ends in "_" where its name is taken. What stands
+    in brackets at the end of a field's text is its unit or what the help calls its value. "[A B]"
+    takes two values, "[NAME ...]" any number after the option; other sequences are given by
+    repeating the option. Mappings are no options.
 
     >>> from pydantic import Field
     >>> class Blur(Arguments):
@@ -48,6 +49,9 @@ class Arguments(Settings):
     # Most are never asked for: the parser needs the fields alone.
     model_config = ConfigDict(defer_build=True)
 
+    examples: ClassVar[tuple[str, ...]] = ()  # for the help, which begins with the docstring
+    # Of a command that has several; their examples begin after the action's name.
+    actions: ClassVar[Mapping[str, type[Arguments]]] = {}
     positional: ClassVar[tuple[str, ...]] = ()
     exclusive: ClassVar[tuple[tuple[str, ...], ...]] = ()  # of each, one option may be given
     # Settings of something else by the options that give them; ``settings`` has what was given.
@@ -100,6 +104,10 @@ class Arguments(Settings):
         if cls.settings_of:
             values["settings"] = given_settings(args, cls.settings_of)
         return cls(**{name: value for name, value in values.items() if value is not None})
+
+    def run(self, console: Console) -> None:
+        """Do what the command is for."""
+        raise NotImplementedError
 
 
 def _flag(name: str) -> str:
@@ -199,40 +207,33 @@ class HelpSettings(argparse.Action):
         parser.exit()
 
 
-class Action(NamedTuple):
-    """What a command with several actions does for one of them."""
-
-    run: Callable[[Any, Console], None]  # given its arguments
-    arguments: type[Arguments]
-    summary: str  # one line
-    examples: tuple[str, ...]  # what follows the action's name
-
-
 def add_command(
-    parsers: Any, name: str, *, summary: str, examples: Sequence[str]
+    parsers: Any, name: str, command: type[Arguments], *, whole: bool = True, before: str = ""
 ) -> argparse.ArgumentParser:
-    """The parser of a command or an action, whose help begins with examples."""
-    lines = "\n".join(f"  {line}".rstrip() for line in examples)
-    added: argparse.ArgumentParser = parsers.add_parser(
+    """The parser of a command or an action; without its arguments, unless ``whole``.
+
+    ``before`` is what its examples leave out: the program's name and the command's.
+    """
+    text = " ".join((command.__doc__ or "").split()).removesuffix(".")
+    lines = "\n".join(f"  {before}{line}".rstrip() for line in command.examples)
+    parser: argparse.ArgumentParser = parsers.add_parser(
         name,
-        help=summary,
-        description=f"examples:\n{lines}\n\n{summary}.",
+        help=text[:1].lower() + text[1:],
+        description=f"examples:\n{lines}\n\n{text}.",
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
-    return added
-
-
-def add_actions(parser: argparse.ArgumentParser, command: str, actions: dict[str, Action]) -> None:
-    """A parser for each action; ``args.job`` is the chosen one's function and arguments."""
-    parsers = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
-    for name, action in actions.items():
-        lines = [f"gvtools {command} {name} {words}" for words in action.examples]
-        added = add_command(parsers, name, summary=action.summary, examples=lines)
-        added.set_defaults(job=(action.run, action.arguments))
-        # As of every command; given before the action they hold as well.
-        for option, text in (("quiet", "print nothing but warnings"), ("debug", "tracebacks")):
-            added.add_argument(
-                f"--{option}", action="store_true", default=argparse.SUPPRESS, help=text
-            )
-        action.arguments.add(added)
+    parser.set_defaults(command_class=command)
+    if not whole:
+        return parser
+    command.add(parser)
+    if command.actions:
+        actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
+        for action, its_class in command.actions.items():
+            added = add_command(actions, action, its_class, before=f"{parser.prog} {action} ")
+            # As of every command; given before the action they hold as well.
+            for option, what in (("quiet", "print nothing but warnings"), ("debug", "tracebacks")):
+                added.add_argument(
+                    f"--{option}", action="store_true", default=argparse.SUPPRESS, help=what
+                )
+    return parser

@@ -46,10 +46,11 @@ def test_missing_libraries_are_found_by_loading_them(bare):
      (OSError("no space left on device"), False), (ValueError("libGL.so.1"), False)],
 )  # fmt: skip
 def test_a_command_names_the_libraries_that_it_lacks(bare, monkeypatch, capsys, error, told):
-    def run(args: object, console: object) -> None:
-        raise error
+    class Lacking(Arguments):
+        def run(self, console: object) -> None:
+            raise error
 
-    module = SimpleNamespace(SUMMARY="", EXAMPLES=(), LackingArguments=Arguments, run=run)
+    module = SimpleNamespace(LackingCommand=Lacking)
     monkeypatch.setitem(sys.modules, "lacking", module)
     status = cli.main(["lacking"], modules={"lacking": "lacking"})
     said = capsys.readouterr().err

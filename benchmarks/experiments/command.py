@@ -15,11 +15,6 @@ from pipelines.options import Arguments
 if TYPE_CHECKING:
     from pipelines.console import Console
 
-SUMMARY = "measure the generative core on scenes that no training saw, against classical fillers"
-EXAMPLES = (
-    "python -m benchmarks.experiments completion --scenes 64 --markdown completion.md",
-    "python -m benchmarks.experiments few-steps --teacher DIR --json steps.json",
-)
 # Each module has run(options) -> (figures, tables), and in READS the options that it reads.
 EXPERIMENTS = {
     "completion": "fillers, hint features, student and teacher, on generated pixels",
@@ -32,9 +27,13 @@ EXPERIMENTS = {
 }
 
 
-class ExperimentArguments(Arguments, ExperimentOptions):
-    """The command's arguments."""
+class ExperimentCommand(Arguments, ExperimentOptions):
+    """Measure the generative core on scenes that no training saw, against classical fillers."""
 
+    examples = (
+        "python -m benchmarks.experiments completion --scenes 64 --markdown completion.md",
+        "python -m benchmarks.experiments few-steps --teacher DIR --json steps.json",
+    )
     positional = ("what",)
 
     what: str = Field(
@@ -45,29 +44,27 @@ class ExperimentArguments(Arguments, ExperimentOptions):
     markdown: Path | None = None
     """Write the tables there. [FILE]"""
 
+    def run(self, console: Console) -> None:
+        from gvtools.evaluation.tables import markdown
+        from gvtools.files import check_parent, write_json, write_text
 
-def run(args: ExperimentArguments, console: Console) -> None:
-    """Run an experiment."""
-    from gvtools.evaluation.tables import markdown
-    from gvtools.files import check_parent, write_json, write_text
-
-    if args.what not in EXPERIMENTS:
-        raise OptionError(f"no experiment {args.what!r}; expected {', '.join(EXPERIMENTS)}")
-    module = import_module(f"benchmarks.experiments.{args.what.replace('-', '_')}")
-    given = args.model_fields_set & ExperimentOptions.model_fields.keys()
-    unread = sorted(given - set(module.READS))
-    if unread:
-        raise OptionError(
-            f"experiment {args.what} does not look at --{', --'.join(unread)}; leave "
-            f"{'it' if len(unread) == 1 else 'them'} out"
-        )
-    for path in (args.json_, args.markdown):
-        if path is not None:
-            check_parent(path)
-    figures, tables = module.run(args)
-    text = "\n\n".join(markdown(table).strip() for table in tables) + "\n"
-    console.line(text)
-    if args.markdown is not None:
-        write_text(args.markdown, text)
-    if args.json_ is not None:
-        write_json(args.json_, {"experiment": args.what, **figures})
+        if self.what not in EXPERIMENTS:
+            raise OptionError(f"no experiment {self.what!r}; expected {', '.join(EXPERIMENTS)}")
+        module = import_module(f"benchmarks.experiments.{self.what.replace('-', '_')}")
+        given = self.model_fields_set & ExperimentOptions.model_fields.keys()
+        unread = sorted(given - set(module.READS))
+        if unread:
+            raise OptionError(
+                f"experiment {self.what} does not look at --{', --'.join(unread)}; leave "
+                f"{'it' if len(unread) == 1 else 'them'} out"
+            )
+        for path in (self.json_, self.markdown):
+            if path is not None:
+                check_parent(path)
+        figures, tables = module.run(self)
+        text = "\n\n".join(markdown(table).strip() for table in tables) + "\n"
+        console.line(text)
+        if self.markdown is not None:
+            write_text(self.markdown, text)
+        if self.json_ is not None:
+            write_json(self.json_, {"experiment": self.what, **figures})

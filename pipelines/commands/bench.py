@@ -19,15 +19,6 @@ if TYPE_CHECKING:
     from pipelines.bench.side_by_side import Comparison
     from pipelines.console import Console
 
-SUMMARY = (
-    "time fusing or projecting against Open3D in one process, as ratios; or the generative core, "
-    "stage by stage"
-)
-EXAMPLES = (
-    "gvtools bench splat --repeat 15 --json splat.json",
-    "gvtools bench complete --config base",
-    "gvtools bench complete --config base --memory --card 24",
-)
 
 POINTS = {"fuse": 3_200_000, "splat": 4_000_000}
 # Options of ``CompleteOptions`` that bear its fields' names; --repeat is of all benchmarks.
@@ -38,9 +29,14 @@ COMPLETE = {
 }  # fmt: skip
 
 
-class BenchArguments(Arguments):
-    """The command's arguments."""
+class BenchCommand(Arguments):
+    """Time fusing or projecting against Open3D, as ratios; or the generative core, by stage."""
 
+    examples = (
+        "gvtools bench splat --repeat 15 --json splat.json",
+        "gvtools bench complete --config base",
+        "gvtools bench complete --config base --memory --card 24",
+    )
     positional = ("what",)
 
     settings_of = COMPLETE
@@ -66,33 +62,31 @@ class BenchArguments(Arguments):
         defaults = CompleteOptions.model_construct()
         add_settings(group, defaults, COMPLETE, metavars={"size": "HxW|N", "weights": "DIR"})
 
+    def run(self, console: Console) -> None:
+        given = self.settings
+        if self.what == "complete":
+            if self.points is not None:
+                raise OptionError("bench complete: --points is of fuse and splat")
+            _run_complete(self, given, console)
+            return
+        if given:
+            names = ", ".join(sorted(f"--{name.replace('_', '-')}" for name in given))
+            raise OptionError(f"bench {self.what}: {names} given, which only complete knows")
+        points = POINTS[self.what] if self.points is None else self.points
+        import os
 
-def run(args: BenchArguments, console: Console) -> None:
-    """Run the benchmark and show or write its rows."""
-    given = args.settings
-    if args.what == "complete":
-        if args.points is not None:
-            raise OptionError("bench complete: --points is of fuse and splat")
-        _run_complete(args, given, console)
-        return
-    if given:
-        names = ", ".join(sorted(f"--{name.replace('_', '-')}" for name in given))
-        raise OptionError(f"bench {args.what}: {names} given, which only complete knows")
-    points = POINTS[args.what] if args.points is None else args.points
-    import os
+        if self.what == "fuse":
+            from pipelines.bench.side_by_side import fuse_rows
 
-    if args.what == "fuse":
-        from pipelines.bench.side_by_side import fuse_rows
+            rows = fuse_rows(points, repeat=self.repeat)
+        else:
+            from pipelines.bench.side_by_side import splat_rows
 
-        rows = fuse_rows(points, repeat=args.repeat)
-    else:
-        from pipelines.bench.side_by_side import splat_rows
-
-        rows = splat_rows(points, repeat=args.repeat)
-    report(rows, console, args.json_, bench=args.what, points=points, load=os.getloadavg()[0])
+            rows = splat_rows(points, repeat=self.repeat)
+        report(rows, console, self.json_, bench=self.what, points=points, load=os.getloadavg()[0])
 
 
-def _run_complete(args: BenchArguments, given: dict[str, Any], console: Console) -> None:
+def _run_complete(args: BenchCommand, given: dict[str, Any], console: Console) -> None:
     from pipelines.bench.complete import complete_figures, show
 
     chosen = CompleteOptions(repeat=args.repeat, **given)

@@ -19,17 +19,9 @@ if TYPE_CHECKING:
     from gvtools.capture.rgbd_project import RgbdCaptureReport
     from gvtools.features import LightGlueMatcher
     from gvtools.scenes.scene import Scene
-    from pipelines.commands.reconstruct import ReconstructArguments
+    from pipelines.commands.reconstruct import ReconstructCommand
     from pipelines.console import Console
 
-SUMMARY = "find the cameras of photographs, a video or an RGB-D recording; write a project"
-EXAMPLES = (
-    "gvtools capture photos/garden --out garden",
-    "gvtools capture walk.mp4 --frames 80 --out walk",
-    "gvtools capture photos/room --distance IMG_01.jpg,IMG_09.jpg,2.4 --out room",
-    "gvtools capture panoramas/hall --out hall",
-    "gvtools capture recordings/kitchen --color-intrinsics 525,525,319.5,239.5 --out kitchen",
-)
 # The picture of the cameras, in the project.
 PICTURE = "capture.png"
 # Options of photographs and videos.
@@ -46,9 +38,16 @@ def _distance(text: Any) -> Any:
     return first, second, float(metres)
 
 
-class CaptureArguments(RecordingArguments):
-    """The command's arguments."""
+class CaptureCommand(RecordingArguments):
+    """Find the cameras of photographs, a video or an RGB-D recording; write a project."""
 
+    examples = (
+        "gvtools capture photos/garden --out garden",
+        "gvtools capture walk.mp4 --frames 80 --out walk",
+        "gvtools capture photos/room --distance IMG_01.jpg,IMG_09.jpg,2.4 --out room",
+        "gvtools capture panoramas/hall --out hall",
+        "gvtools capture recordings/kitchen --color-intrinsics 525,525,319.5,239.5 --out kitchen",
+    )
     positional = ("input",)
 
     input: Path
@@ -69,11 +68,11 @@ class CaptureArguments(RecordingArguments):
     lens: Literal["auto", "perspective", "equirectangular", "fisheye"] | None = None
     """Of the pictures (auto: recognised from them); panoramas are cut into faces."""
 
-
-def run(args: CaptureArguments, console: Console) -> None:
-    """Find the cameras and write the project."""
-    given = {name: getattr(args, name) for name in PHOTOGRAPHIC if getattr(args, name) is not None}
-    capture(args.input, args.out, console=console, reading=args.reading(), **given)
+    def run(self, console: Console) -> None:
+        given = {
+            name: getattr(self, name) for name in PHOTOGRAPHIC if getattr(self, name) is not None
+        }
+        capture(self.input, self.out, console=console, reading=self.reading(), **given)
 
 
 def capture(
@@ -126,7 +125,7 @@ def capture(
     console.line(f"{out}: gvtools check {out}; gvtools reconstruct {out} --out RUN")
 
 
-def open_or_capture(args: ReconstructArguments, console: Console) -> tuple[Scene, dict[str, Any]]:
+def open_or_capture(args: ReconstructCommand, console: Console) -> tuple[Scene, dict[str, Any]]:
     """The scene that ``reconstruct`` is asked for, and how it is read.
 
     An input without cameras is captured to ``OUT-project`` beside the run's folder where --capture
@@ -153,7 +152,7 @@ def open_or_capture(args: ReconstructArguments, console: Console) -> tuple[Scene
 
 
 def _check_capture(
-    args: ReconstructArguments, project: Path, *, console: Console, unposed: UnposedError
+    args: ReconstructCommand, project: Path, *, console: Console, unposed: UnposedError
 ) -> None:
     """Refuse a capture that nobody asked for, and options that it cannot heed."""
     source, out = (shlex.quote(str(path)) for path in (args.project, project))

@@ -1,23 +1,26 @@
-"""``gvtools evaluate``: every measure on finished runs, or the protocol on a project."""
+"""``gvtools evaluate``, ``judge`` and ``trajectory``: measures against references."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
+
+from pydantic import Field
 
 from gvtools.errors import OptionError
-from pipelines.commands.arguments import MeasurementArguments, SceneArguments
+from pipelines.commands.arguments import (
+    MeasurementArguments,
+    RootArguments,
+    SceneArguments,
+    refuse_root,
+)
 from pipelines.options import Arguments
 
 if TYPE_CHECKING:
+    from gvtools.evaluation.trajectories import PoseErrors
     from pipelines.console import Console
-
-SUMMARY = "measure finished runs: pictures, consistency, poses, beside published figures"
-EXAMPLES = (
-    "gvtools evaluate runs/kitchen --json kitchen.json",
-    "gvtools evaluate scans/kitchen --protocol long --stride 3 --out runs/kitchen_long",
-)
+    from pipelines.scoring.method_pictures import JudgeReference
 
 
 class ProtocolArguments(Arguments):
@@ -37,9 +40,13 @@ class ProtocolArguments(Arguments):
     """A setting. [KEY=VALUE]"""
 
 
-class EvaluateArguments(MeasurementArguments, ProtocolArguments, SceneArguments):
-    """The command's arguments."""
+class EvaluateCommand(MeasurementArguments, ProtocolArguments, SceneArguments):
+    """Measure finished runs: pictures, consistency, poses, beside published figures."""
 
+    examples = (
+        "gvtools evaluate runs/kitchen --json kitchen.json",
+        "gvtools evaluate scans/kitchen --protocol long --stride 3 --out runs/kitchen_long",
+    )
     positional = ("runs",)
 
     runs: tuple[Path, ...]
@@ -56,45 +63,38 @@ class EvaluateArguments(MeasurementArguments, ProtocolArguments, SceneArguments)
     project: Path | None = None
     """Where the run's project lies, if it was moved. [DIR]"""
 
+    def run(self, console: Console) -> None:
+        from gvtools.evaluation.published import benchmark_names
+        from gvtools.files import write_json
+        from pipelines.scoring import evaluation
 
-def run(args: EvaluateArguments, console: Console) -> None:
-    """Measure, print, write."""
-    from gvtools.evaluation.published import benchmark_names
-    from gvtools.files import write_json
-    from pipelines.scoring.evaluation import (
-        evaluate_runs,
-        load_benchmarks,
-        load_runs,
-        write_evaluation,
-    )
-
-    shown = benchmark_names() if "all" in args.against else args.against
-    benchmarks = load_benchmarks(shown, args.data_set)
-    if args.project is not None and len(args.runs) > 1:
-        raise OptionError("--project: names the project of one run; give one run")
-    out = _folder(args)
-    options = args.measures()
-    paths: Sequence[Path] = args.runs
-    if args.protocol is not None:
-        paths = [_run_protocol(args, args.protocol, out, console=console)]
-    runs = load_runs(paths, project=args.project)
-    evaluations = evaluate_runs(runs, options, console=console)
-    figures = write_evaluation(
-        runs,
-        evaluations,
-        options,
-        name=args.name,
-        data_set=args.data_set,
-        benchmarks=benchmarks,
-        shown=shown,
-        out=out,
-        console=console,
-    )
-    if args.json_ is not None:
-        write_json(args.json_, figures)
+        shown = benchmark_names() if "all" in self.against else self.against
+        benchmarks = evaluation.load_benchmarks(shown, self.data_set)
+        if self.project is not None and len(self.runs) > 1:
+            raise OptionError("--project: names the project of one run; give one run")
+        out = _folder(self)
+        options = self.measures()
+        paths: Sequence[Path] = self.runs
+        if self.protocol is not None:
+            paths = [_run_protocol(self, self.protocol, out, console=console)]
+        runs = evaluation.load_runs(paths, project=self.project)
+        evaluations = evaluation.evaluate_runs(runs, options, console=console)
+        figures = evaluation.write_evaluation(
+            runs,
+            evaluations,
+            options,
+            name=self.name,
+            data_set=self.data_set,
+            benchmarks=benchmarks,
+            shown=shown,
+            out=out,
+            console=console,
+        )
+        if self.json_ is not None:
+            write_json(self.json_, figures)
 
 
-def _folder(args: EvaluateArguments) -> Path:
+def _folder(args: EvaluateCommand) -> Path:
     if args.protocol is not None:
         if args.out is None or len(args.runs) != 1:
             raise OptionError(
@@ -111,7 +111,7 @@ def _folder(args: EvaluateArguments) -> Path:
     return args.runs[0] / "evaluation"
 
 
-def _run_protocol(args: EvaluateArguments, protocol: str, out: Path, *, console: Console) -> Path:
+def _run_protocol(args: EvaluateCommand, protocol: str, out: Path, *, console: Console) -> Path:
     from pipelines.scoring.evaluation import run_protocol
 
     return run_protocol(
@@ -126,3 +126,202 @@ def _run_protocol(args: EvaluateArguments, protocol: str, out: Path, *, console:
         reading=args.reading(),
         console=console,
     )
+
+
+class JudgeCommand(MeasurementArguments, SceneArguments):
+    """Judge pictures of any method, several side by side, with the figures of evaluate."""
+
+    examples = (
+        "gvtools judge runs/kitchen gsplat/results/kitchen nerfstudio/renders --against "
+        "runs/kitchen --out judged",
+        "gvtools judge renders --against scans/kitchen --context not:every:8 --targets every:8 "
+        "--out judged",
+    )
+    positional = ("pictures",)
+
+    pictures: tuple[Path, ...]
+    """Of one method each: a folder of pictures, a run of gvtools, or what nerfstudio, gsplat or
+    NerfBaselines wrote. [PICTURES]"""
+    against: Path
+    """A finished run (its targets, truths, memory and settings count), or a project. [PROJECT]"""
+    name: tuple[str, ...] = ()
+    """Of a method, in their order. [NAME]"""
+    context: str | None = None
+    """Of a project: the views that were given. [SPEC]"""
+    targets: str | None = None
+    """Of a project: the views that the pictures stand for. [SPEC]"""
+    cameras: Path | None = None
+    """A TUM, KITTI or EuRoC trajectory with the cameras of the pictures, where they are none of the
+    project's; figures that need a truth are left out then. [FILE]"""
+    match: Literal["auto", "name", "order"] = "auto"
+    """Pictures with views: by name, or by order where no name matches."""
+    out: Path
+    """For the results. [DIR]"""
+    sheet_views: int = Field(12, ge=0)
+    """Views on contact sheets. [N]"""
+
+    def run(self, console: Console) -> None:
+        from gvtools.files import make_folder, write_json
+        from pipelines.scoring.judging import judge
+        from pipelines.scoring.method_pictures import method_names
+
+        names = method_names(self.pictures, self.name)
+        _check_apart(self.pictures, self.out)
+        options = self.measures()
+        make_folder(self.out)
+        figures = judge(
+            self.pictures,
+            names,
+            _reference(self, console),
+            options=options,
+            rule=self.match,
+            sheet_views=self.sheet_views,
+            out=self.out,
+            console=console,
+        )
+        if self.json_ is not None:
+            write_json(self.json_, figures)
+
+
+def _check_apart(pictures: Sequence[Path], out: Path) -> None:
+    """Refuse results among the pictures, where the next call would take sheets for pictures."""
+    from gvtools.runs.layout import RECORD
+
+    for path in pictures:
+        if out.resolve().is_relative_to(path.resolve()) and not (path / RECORD).is_file():
+            raise OptionError(f"--out {out}: lies in the pictures {path}; give a folder elsewhere")
+
+
+def _reference(args: JudgeCommand, console: Console) -> JudgeReference:
+    from gvtools.runs.layout import RECORD
+    from pipelines.scoring.method_pictures import open_reference, reference_from_context
+
+    if (args.against / RECORD).is_file():
+        given = [name for name in ("context", "targets") if getattr(args, name) is not None]
+        if given:
+            raise OptionError(
+                f"--{given[0]}: {args.against} is a run, whose views are its own; leave it out"
+            )
+        return open_reference(args.against, cameras=args.cameras)
+    return reference_from_context(
+        args.open_scene(args.against),
+        args.out / "memory",
+        context=args.context,
+        targets=args.targets,
+        cameras=args.cameras,
+        reading=args.reading(),
+        console=console,
+    )
+
+
+# All pairs of longer trajectories are too many, and say no more.
+MOST_FOR_AUC = 2000
+
+
+class TrajectoryCommand(RootArguments):
+    """Measure the pose errors (ATE, RPE, AUC) of a trajectory against its reference."""
+
+    examples = (
+        "gvtools trajectory ate groundtruth.txt estimate.txt --align sim3",
+        "gvtools trajectory rpe colmap/sparse/0 runs/mine --delta 10 --all-pairs --json rpe.json",
+    )
+    positional = ("metric", "reference", "estimate")
+
+    metric: Literal["ate", "rpe"]
+    """Absolute or relative error."""
+    reference: Path
+    """A TUM, KITTI or EuRoC file, a COLMAP model, a project, or a run. [REFERENCE]"""
+    estimate: Path
+    """Likewise. [ESTIMATE]"""
+    align: Literal["none", "se3", "sim3"] = "sim3"
+    """Of the estimate's centres to the reference's."""
+    delta: int = 1
+    """Frames between the poses of a pair. [N]"""
+    all_pairs: bool = False
+    """Pairs start at every frame."""
+    associate: Literal["auto", "time", "name", "index"] = "auto"
+    """Auto: what both have, in the order name, time, index."""
+    max_difference: float = Field(0.01, ge=0)
+    """Of times that belong together. [seconds]"""
+    offset: float = 0.0
+    """To add to the estimate's. [seconds]"""
+    layout: Literal["auto", "tum", "kitti", "euroc"] = "auto"
+    """Of trajectory files."""
+    allow_mirrored: bool = False
+    """Give figures also where the estimate is the reference's mirror image."""
+    json_: Path | None = None
+    """Write the figures there. [FILE]"""
+
+    def run(self, console: Console) -> None:
+        from gvtools.evaluation.trajectories import absolute_errors, pose_auc, relative_errors
+        from gvtools.files import write_json
+        from pipelines.inputs.trajectory_source import associate, open_trajectory
+        from pipelines.scoring.measurement import pose_figures
+
+        refuse_root(self.root, (self.reference, self.estimate))
+        reference = open_trajectory(self.reference, layout=self.layout, root=self.root)
+        estimate = open_trajectory(self.estimate, layout=self.layout, root=self.root)
+        first, second, how = associate(
+            reference,
+            estimate,
+            how=self.associate,
+            max_difference=self.max_difference,
+            offset=self.offset,
+        )
+        poses = reference.poses[first], estimate.poses[second]
+        refuse = not self.allow_mirrored
+        if self.metric == "ate":
+            errors = absolute_errors(*poses, align=self.align, refuse_mirrored=refuse)
+            auc = pose_auc(*poses) if len(first) <= MOST_FOR_AUC else None
+        else:
+            errors = relative_errors(
+                *poses,
+                align=self.align,
+                delta=self.delta,
+                all_pairs=self.all_pairs,
+                refuse_mirrored=refuse,
+            )
+            auc = None
+        pairs = {"delta": self.delta, "all_pairs": self.all_pairs}
+        figures = {
+            "metric": self.metric,
+            "align": self.align,
+            "association": how,
+            "poses_reference": len(reference),
+            "poses_estimate": len(estimate),
+            "associated": len(first),
+            **(pairs if self.metric == "rpe" else {}),
+            **pose_figures(errors, auc),
+        }
+        if self.metric == "ate" and auc is None:
+            figures["notes"]["auc"] = f"not measured over more than {MOST_FOR_AUC} poses"
+        if self.json_ is not None:
+            write_json(self.json_, figures)
+        else:
+            _print(figures, errors, console)
+        if not errors.ok:
+            console.warn(f"no figures: {errors.status}")
+
+
+def _print(figures: dict[str, Any], errors: PoseErrors, console: Console) -> None:
+    from pipelines.scoring.measurement import POSE_STATISTICS, statistics_figures
+
+    console.line(
+        f"{figures['metric'].upper()}: {figures['associated']} poses of "
+        f"{figures['poses_reference']} and {figures['poses_estimate']}, associated by "
+        f"{figures['association']}; {figures['status']}"
+        + (f", scale {errors.scale:.6g}" if figures["align"] == "sim3" and errors.scale else "")
+    )
+    columns = (*POSE_STATISTICS, "n")
+    rows = {
+        "translation, scene units": statistics_figures(errors.translation),
+        f"translation / extent {errors.extent:.4g}": statistics_figures(errors.translation_share),
+        "rotation, degrees": statistics_figures(errors.rotation_deg),
+    }
+    values = [[name, *(row[key] for key in columns)] for name, row in rows.items()]
+    console.table(["error", *columns], values)
+    if figures.get("auc"):
+        shares = ", ".join(
+            f"@{key} {value:.4f}" for key, value in figures["auc"].items() if value is not None
+        )
+        console.line(f"pose AUC over {figures['auc_pairs']} pairs, degrees: {shares or '-'}")

@@ -14,21 +14,20 @@ from pipelines.options import Arguments
 if TYPE_CHECKING:
     from pipelines.console import Console
 
-SUMMARY = "write a run as point cloud, splats, mesh, cameras or recording, in the input's frame"
-EXAMPLES = (
-    "gvtools export runs/kitchen --format splat --out kitchen.ply",
-    "gvtools export runs/kitchen --format mesh --out kitchen.glb --max-triangles 200000",
-    "gvtools export runs/kitchen --format las --out kitchen.laz --observed",
-)
 _FORMATS = "; ".join(
     f"{each.name}: {each.holds}" + (f" ({', '.join(each.suffixes)})" if each.suffixes else "")
     for each in FORMATS.values()
 )
 
 
-class ExportArguments(Arguments, ExportOptions):
-    """The command's arguments."""
+class ExportCommand(Arguments, ExportOptions):
+    """Write a run as point cloud, splats, mesh, cameras or recording, in the input's frame."""
 
+    examples = (
+        "gvtools export runs/kitchen --format splat --out kitchen.ply",
+        "gvtools export runs/kitchen --format mesh --out kitchen.glb --max-triangles 200000",
+        "gvtools export runs/kitchen --format las --out kitchen.laz --observed",
+    )
     positional = ("memory",)
 
     memory: Path
@@ -40,42 +39,42 @@ class ExportArguments(Arguments, ExportOptions):
     round: int | None = None
     """The memory as it was after round R. [R]"""
 
+    def run(self, console: Console) -> None:
+        from gvtools.runs.run import load_memory
+        from pipelines.export.source import ExportSource
 
-def run(args: ExportArguments, console: Console) -> None:
-    """Write the export."""
-    from gvtools.runs.run import load_memory
-    from pipelines.export.source import ExportSource
-
-    form = FORMATS[args.format]
-    for name in (name for name in ExportOptions.model_fields if name in args.model_fields_set):
-        if name not in form.options:
-            takers = ", ".join(each.name for each in FORMATS.values() if name in each.options)
+        form = FORMATS[self.format]
+        for name in (name for name in ExportOptions.model_fields if name in self.model_fields_set):
+            if name not in form.options:
+                takers = ", ".join(each.name for each in FORMATS.values() if name in each.options)
+                raise OptionError(
+                    f"{self.key(name)}: --format {form.name} does not take it ({takers} do); leave "
+                    "it out"
+                )
+        if self.format in ("colmap", "transforms", "mesh") and self.memory.suffix.lower() == ".ply":
             raise OptionError(
-                f"{args.key(name)}: --format {form.name} does not take it ({takers} do); leave "
-                "it out"
+                f"--format {self.format}: {self.memory} is a PLY, which holds no cameras; give the "
+                "run's folder or its memory.npz"
             )
-    if args.format in ("colmap", "transforms", "mesh") and args.memory.suffix.lower() == ".ply":
-        raise OptionError(
-            f"--format {args.format}: {args.memory} is a PLY, which holds no cameras; give the "
-            "run's folder or its memory.npz"
-        )
-    form.check_path(args.out, args.memory)
-    write = form.load()
-    memory = load_memory(args.memory, up_to=args.round)
-    if not len(memory):
-        raise OptionError(f"{args.memory}: an empty memory; expected one that views were fused in")
-    if args.format != "ply" or args.max_points is not None:
-        shown = memory.overview()
-        if len(shown) < len(memory):
+        form.check_path(self.out, self.memory)
+        write = form.load()
+        memory = load_memory(self.memory, up_to=self.round)
+        if not len(memory):
+            raise OptionError(
+                f"{self.memory}: an empty memory; expected one that views were fused in"
+            )
+        if self.format != "ply" or self.max_points is not None:
+            shown = memory.overview()
+            if len(shown) < len(memory):
+                console.line(
+                    f"{len(memory):,} observations exceed the memory's budget; {len(shown):,} "
+                    "stand for them"
+                )
+            memory = shown
+        console.line(write(ExportSource(self.memory, memory, self.round), self.out, self))
+        made = memory.generated_count / len(memory)
+        if made and "observed" in form.options and not self.observed:
             console.line(
-                f"{len(memory):,} observations exceed the memory's budget; {len(shown):,} stand "
-                "for them"
+                f"{made:.0%} of the observations are generated: a completer's, or depth that only "
+                "fitted Gaussians tell; --observed leaves them out"
             )
-        memory = shown
-    console.line(write(ExportSource(args.memory, memory, args.round), args.out, args))
-    made = memory.generated_count / len(memory)
-    if made and "observed" in form.options and not args.observed:
-        console.line(
-            f"{made:.0%} of the observations are generated: a completer's, or depth that only "
-            "fitted Gaussians tell; --observed leaves them out"
-        )

@@ -1,30 +1,25 @@
-"""gvtools reconstruct: fuse, project, complete, fuse back, round by round."""
+"""``gvtools reconstruct``, ``demo`` and ``refine``: fuse, project, complete, fuse back."""
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
+from importlib import import_module
+from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field
 
 from pipelines.commands.arguments import SceneArguments
-from pipelines.options import HelpSettings, add_settings, given_settings
+from pipelines.console import Console
+from pipelines.options import Arguments, HelpSettings, add_settings, given_settings
 
 if TYPE_CHECKING:
     from gvtools.settings import Settings
-    from pipelines.console import Console
     from pipelines.reconstruction.settings import RunSettings
 
-SUMMARY = "grow a memory from a posed project, round by round"
-EXAMPLES = (
-    "gvtools reconstruct scan/ --context every:2 --targets every:2+1 --out runs/scan",
-    "gvtools reconstruct colmap/ --targets orbit:24 --completer inpaint --out runs/orbit",
-    "gvtools reconstruct walk.mp4 --capture --out runs/walk",
-    "gvtools reconstruct photographs/ --cloud survey.laz --out runs/survey",
-)
 
 # Options and the settings that they give; their help is the settings'.
 OPTIONS = {
@@ -71,9 +66,15 @@ class RunArguments(SceneArguments):
         parser.add_argument("--help-settings", action=HelpSettings, settings=_settings)
 
 
-class ReconstructArguments(RunArguments):
-    """The command's arguments."""
+class ReconstructCommand(RunArguments):
+    """Grow a memory from a posed project, round by round."""
 
+    examples = (
+        "gvtools reconstruct scan/ --context every:2 --targets every:2+1 --out runs/scan",
+        "gvtools reconstruct colmap/ --targets orbit:24 --completer inpaint --out runs/orbit",
+        "gvtools reconstruct walk.mp4 --capture --out runs/walk",
+        "gvtools reconstruct photographs/ --cloud survey.laz --out runs/survey",
+    )
     positional = ("project",)
 
     project: Path
@@ -86,36 +87,34 @@ class ReconstructArguments(RunArguments):
     capture: bool = False
     """Where the input has no cameras, find them first, without asking: see gvtools capture."""
 
+    def run(self, console: Console) -> None:
+        from pipelines.commands.capture import open_or_capture
+        from pipelines.reconstruction.run import reconstruct
+        from pipelines.report import draw_run
+        from pipelines.viewing.serve import live_viewer
+
+        config = run_settings(self.settings, texts=self.set, file=self.config)
+        scene, reading = open_or_capture(self, console)
+        watched = self.live and not self.dry_run
+        with live_viewer(self.out, console) if watched else nullcontext():
+            reconstruct(
+                scene,
+                config,
+                self.out,
+                console=console,
+                resume=self.resume,
+                dry_run=self.dry_run,
+                reading=reading,
+                draw=draw_run,
+            )
+            copy_figures(self, self.out)
+
 
 def _settings(args: argparse.Namespace) -> list[Settings]:
     from gvtools.completers.base import options_of_all
 
     given = given_settings(args, OPTIONS)
     return [run_settings(given, texts=args.set or (), file=args.config), *options_of_all()]
-
-
-def run(args: ReconstructArguments, console: Console) -> None:
-    """Run ``gvtools reconstruct``."""
-    from pipelines.commands.capture import open_or_capture
-    from pipelines.reconstruction.run import reconstruct
-    from pipelines.report import draw_run
-    from pipelines.viewing.serve import live_viewer
-
-    config = run_settings(args.settings, texts=args.set, file=args.config)
-    scene, reading = open_or_capture(args, console)
-    watched = args.live and not args.dry_run
-    with live_viewer(args.out, console) if watched else nullcontext():
-        reconstruct(
-            scene,
-            config,
-            args.out,
-            console=console,
-            resume=args.resume,
-            dry_run=args.dry_run,
-            reading=reading,
-            draw=draw_run,
-        )
-        copy_figures(args, args.out)
 
 
 def copy_figures(args: RunArguments, out: Path) -> None:
@@ -151,3 +150,115 @@ def run_settings(
         if key in own and (key == "scan.file" or Path(own[key]).is_file()):
             own[key] = str(Path(own[key]).resolve())
     return with_texts(with_values(config, own), others)
+
+
+# Steps of the fit unless told otherwise: a first look takes seconds and is the same every time.
+FIT_STEPS = 300
+# Writers of the samples, in ``gvtools.procedural``; the last is of nature and takes no seed.
+SAMPLES = {
+    "room": "room_sample.write_room", "noisy-room": "noisy_room.write_noisy_room",
+    "motorcycle": "stereo_sample.write_motorcycle",
+}  # fmt: skip
+
+
+class DemoCommand(RunArguments):
+    """Run the main job on a sample that needs no download."""
+
+    examples = (
+        "gvtools demo",
+        "gvtools demo --sample motorcycle --out runs/motorcycle",
+        "gvtools demo --sample noisy-room",
+    )
+    sample: Literal["room", "noisy-room", "motorcycle"] = "room"
+    """noisy-room is the room as a cheap RGB-D camera records it."""
+    out: Path | None = None
+    """The run's folder. [PATH]"""
+
+    def run(self, console: Console) -> None:
+        config = run_settings(self.settings, texts=self.set, file=self.config)
+        default = Path("runs") / f"demo-{self.sample}"
+        # Absolute, since the sample's folder is named after it, and "." has no name.
+        out = self.out.absolute() if self.out else free_folder(default, resume=self.resume)
+        from gvtools.runs.folder import RunDirectory
+
+        RunDirectory(out).refuse_foreign()
+        sample = out.with_name(f"{out.name}-sample")
+        from gvtools.procedural.room_sample import KERNELS
+        from gvtools.scenes.project import open_project
+        from pipelines.reconstruction.run import compile_kernels, reconstruct
+        from pipelines.report import draw_run
+
+        compile_kernels(config, console, more=(KERNELS,) if self.sample != "motorcycle" else ())
+        console.line(f"sample {self.sample}, seed {config.seed}: writing {sample}")
+        module, _, writer = SAMPLES[self.sample].partition(".")
+        seed = {"seed": config.seed} if self.sample != "motorcycle" else {}
+        written = getattr(import_module(f"gvtools.procedural.{module}"), writer)(sample, **seed)
+        for name in ("context", "targets"):
+            if name not in self.settings:
+                config = config.replaced(**{name: ",".join(getattr(written, name))})
+        if config.refine.seconds is None and config.refine.steps is None:
+            config = config.replaced(refine=config.refine.replaced(steps=FIT_STEPS))
+        if not {"views_per_round", "rounds"} & self.settings.keys():
+            config = config.replaced(views_per_round=4)
+        reconstruct(
+            open_project(sample),
+            config,
+            out,
+            console=console,
+            resume=self.resume,
+            dry_run=self.dry_run,
+            draw=draw_run,
+        )
+        copy_figures(self, out)
+        if not self.dry_run and (out / "round_001").is_dir():
+            console.line(
+                f"look at {out / 'growth.png'} and at the pictures in {out}/round_001: guidance_* "
+                "is what the completer was given, generated_* what it made of it, after_* what the "
+                "memory knows now"
+            )
+
+
+def free_folder(path: Path, *, resume: bool) -> Path:
+    """``path``, or the first of path-2, path-3, ... that is not there yet (the last when resuming).
+
+    A demo is run again and again; its default folder must not refuse.
+    """
+    last = candidate = path
+    for number in count(2):
+        if not candidate.exists():
+            return last if resume and last.exists() else candidate
+        last, candidate = candidate, path.with_name(f"{path.name}-{number}")
+    raise AssertionError
+
+
+class RefineCommand(Arguments):
+    """Fit a run's Gaussians further, and make the run again with them."""
+
+    examples = (
+        "gvtools refine runs/kitchen --seconds 600",
+        "gvtools refine runs/kitchen --steps 2000",
+    )
+    positional = ("folder",)
+    exclusive = (("seconds", "steps"),)
+
+    folder: Path
+    """A run's folder, finished or not. [RUN]"""
+    seconds: float = Field(120.0, gt=0)
+    """Fit so long. [S]"""
+    steps: int | None = Field(None, ge=1)
+    """So many steps, with the same result every time. [N]"""
+    project: Path | None = None
+    """Where the run's project lies, if it was moved. [DIR]"""
+
+    def run(self, console: Console) -> None:
+        from pipelines.reconstruction.run import refine
+        from pipelines.report import draw_run
+
+        refine(
+            self.folder,
+            seconds=self.seconds if self.steps is None else None,
+            steps=self.steps,
+            project=self.project,
+            console=console,
+            draw=draw_run,
+        )

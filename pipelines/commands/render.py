@@ -1,32 +1,37 @@
-"""``gvtools render``: a saved memory seen from cameras, as pictures and as figures."""
+"""``gvtools render`` and ``film``: a saved memory as pictures, figures and films."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import time
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pydantic import Field
+
 from gvtools.errors import OptionError
 from pipelines.commands.arguments import LpipsArguments, SceneArguments
+from pipelines.options import Arguments
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from gvtools.cameras import Cameras
     from gvtools.memory.spatial_memory import SpatialMemory
     from gvtools.memory.splat.api import SplatOptions
     from gvtools.scenes.scene import Scene
     from pipelines.console import Console
 
-SUMMARY = "project a saved memory into cameras, and measure it against their pictures"
-EXAMPLES = (
-    "gvtools render runs/kitchen --cameras scans/kitchen --views every:20 --out renders",
-    "gvtools render runs/kitchen --cameras scans/kitchen --views every:20+10 --against-images "
-    "--out renders --json figures.json",
-)
 
+class RenderCommand(LpipsArguments, SceneArguments):
+    """Project a saved memory into cameras, and measure it against their pictures."""
 
-class RenderArguments(LpipsArguments, SceneArguments):
-    """The command's arguments."""
-
+    examples = (
+        "gvtools render runs/kitchen --cameras scans/kitchen --views every:20 --out renders",
+        "gvtools render runs/kitchen --cameras scans/kitchen --views every:20+10 --against-images "
+        "--out renders --json figures.json",
+    )
     positional = ("memory",)
 
     memory: Path
@@ -49,56 +54,56 @@ class RenderArguments(LpipsArguments, SceneArguments):
     json_: Path | None = None
     """Write the figures there. [FILE]"""
 
+    def run(self, console: Console) -> None:
+        from gvtools.files import write_json
+        from gvtools.runs.layout import file_stems
+        from gvtools.runs.run import load_appearance, load_memory
+        from gvtools.scenes.selection import select
+        from pipelines.rendering import measure, render_view, summary, write_view
 
-def run(args: RenderArguments, console: Console) -> None:
-    """Project, write pictures, measure."""
-    from gvtools.files import write_json
-    from gvtools.runs.layout import file_stems
-    from gvtools.runs.run import load_appearance, load_memory
-    from gvtools.scenes.selection import select
-    from pipelines.rendering import measure, render_view, summary, write_view
-
-    if args.out is None and not args.against_images:
-        raise OptionError("--out: nothing would be left; give a folder, or --against-images")
-    short = {"backend": args.backend, "device": args.device}
-    given = [f"splat.{key}={value}" for key, value in short.items() if value is not None]
-    options = splat_options([*given, *args.set])
-    memory, appearance = load_memory(args.memory), load_appearance(args.memory)
-    if not len(memory.views):
-        raise OptionError(f"{args.memory}: an empty memory; expected one that views were fused in")
-    cameras, scene = _cameras(args, memory)
-    if args.against_images and scene is None:
-        raise OptionError(
-            f"--against-images: {args.cameras} is a trajectory without pictures; give a project"
-        )
-    names = select(cameras.names, args.views)
-    row_of = {name: row for row, name in enumerate(cameras.names)}
-    stems = file_stems(names)
-    lpips, no_lpips = args.open_lpips() if args.against_images else (None, None)
-    # The first projection compiles or loads the kernels and is not timed.
-    memory.project(cameras[row_of[names[0]]], options=options)
-    views = []
-    for name in console.track(names, "rendering"):
-        guidance, seconds = render_view(
-            memory, cameras[row_of[name]], options, appearance=appearance
-        )
-        frame = scene[name].load() if scene is not None and args.against_images else None
-        if args.out is not None:
-            write_view(args.out, stems[name], guidance)
-        views.append(measure(name, guidance, frame, seconds=seconds, lpips=lpips))
-    figures = summary(views, compared=args.against_images, no_lpips=no_lpips)
-    if args.json_ is not None:
-        write_json(args.json_, figures)
-    else:
-        columns = ("view", "psnr", "ssim", "psnr_valid", "ssim_valid", "depth_rel_valid",
-                   "coverage", "seconds")  # fmt: skip
-        mean = {**figures, "view": "all", "seconds": figures["seconds_per_view"]}
-        console.table(columns, [[row[column] for column in columns] for row in [*views, mean]])
-        for reason in dict.fromkeys(figures["notes"].values()):
-            keys = [key for key, note in figures["notes"].items() if note == reason]
-            console.line(f"{', '.join(keys)}: {reason}")
-    if args.out is not None:
-        console.line(f"{len(views)} views in {args.out}")
+        if self.out is None and not self.against_images:
+            raise OptionError("--out: nothing would be left; give a folder, or --against-images")
+        short = {"backend": self.backend, "device": self.device}
+        given = [f"splat.{key}={value}" for key, value in short.items() if value is not None]
+        options = splat_options([*given, *self.set])
+        memory, appearance = load_memory(self.memory), load_appearance(self.memory)
+        if not len(memory.views):
+            raise OptionError(
+                f"{self.memory}: an empty memory; expected one that views were fused in"
+            )
+        cameras, scene = _cameras(self, memory)
+        if self.against_images and scene is None:
+            raise OptionError(
+                f"--against-images: {self.cameras} is a trajectory without pictures; give a project"
+            )
+        names = select(cameras.names, self.views)
+        row_of = {name: row for row, name in enumerate(cameras.names)}
+        stems = file_stems(names)
+        lpips, no_lpips = self.open_lpips() if self.against_images else (None, None)
+        # The first projection compiles or loads the kernels and is not timed.
+        memory.project(cameras[row_of[names[0]]], options=options)
+        views = []
+        for name in console.track(names, "rendering"):
+            guidance, seconds = render_view(
+                memory, cameras[row_of[name]], options, appearance=appearance
+            )
+            frame = scene[name].load() if scene is not None and self.against_images else None
+            if self.out is not None:
+                write_view(self.out, stems[name], guidance)
+            views.append(measure(name, guidance, frame, seconds=seconds, lpips=lpips))
+        figures = summary(views, compared=self.against_images, no_lpips=no_lpips)
+        if self.json_ is not None:
+            write_json(self.json_, figures)
+        else:
+            columns = ("view", "psnr", "ssim", "psnr_valid", "ssim_valid", "depth_rel_valid",
+                       "coverage", "seconds")  # fmt: skip
+            mean = {**figures, "view": "all", "seconds": figures["seconds_per_view"]}
+            console.table(columns, [[row[column] for column in columns] for row in [*views, mean]])
+            for reason in dict.fromkeys(figures["notes"].values()):
+                keys = [key for key, note in figures["notes"].items() if note == reason]
+                console.line(f"{', '.join(keys)}: {reason}")
+        if self.out is not None:
+            console.line(f"{len(views)} views in {self.out}")
 
 
 def splat_options(texts: Sequence[str]) -> SplatOptions:
@@ -112,7 +117,7 @@ def splat_options(texts: Sequence[str]) -> SplatOptions:
     return with_texts(RunSettings(), texts).splat
 
 
-def _cameras(args: RenderArguments, memory: SpatialMemory) -> tuple[Cameras, Scene | None]:
+def _cameras(args: RenderCommand, memory: SpatialMemory) -> tuple[Cameras, Scene | None]:
     if args.cameras.is_file() and args.cameras.suffix.lower() != ".json":
         from gvtools.trajectory_files import read_trajectory
 
@@ -127,3 +132,113 @@ def _cameras(args: RenderArguments, memory: SpatialMemory) -> tuple[Cameras, Sce
         return read_trajectory(args.cameras, photographed[0].camera), None
     scene = args.open_scene(args.cameras)
     return scene.cameras, scene
+
+
+class FilmCommand(Arguments):
+    """Write a film of a path through a memory."""
+
+    examples = (
+        "gvtools film runs/kitchen --path spiral:240 --out kitchen.mp4",
+        "gvtools film runs/kitchen --path orbit:120 --compare observed,completed --out both.mp4",
+        "gvtools film runs/kitchen --path interpolate:60 --growth --width 480 --out growth.gif",
+    )
+    positional = ("memory",)
+    exclusive = (("complete", "depth", "compare"),)
+
+    memory: Path
+    """A run or a memory.npz. [RUN_OR_MEMORY]"""
+    path: str = "interpolate"
+    """orbit:N, spiral:N, interpolate:N (N frames, 120 by default), cameras (the captured views), a
+    TUM or KITTI file, a transforms.json such as 'gvtools view' saves, or a project (the last two
+    also PATH@SELECTION). [PATH]"""
+    out: Path
+    """FILE.mp4, FILE.gif or FILE.webp. [FILE]"""
+    fps: float = Field(24.0, gt=0, le=240)
+    """Frames a second. [N]"""
+    width: int | None = Field(None, ge=16)
+    """Of a panel; the height follows (the cameras'). [pixels]"""
+    round: int | None = None
+    """The memory as it was after round R. [R]"""
+    complete: bool = False
+    """Fill what the memory leaves open (inpaint)."""
+    depth: bool = False
+    """Depth in colours, near is red."""
+    compare: str | None = None
+    """Panels side by side, of memory, observed, completed, depth. [A,B]"""
+    growth: bool = False
+    """The path once for each round, as memory was then."""
+
+    def run(self, console: Console) -> None:
+        from gvtools.runs.run import load_memory
+        from pipelines.film import check_suffix, film_cameras, write_film
+
+        check_suffix(self.out)
+        if self.growth and self.round is not None:
+            raise OptionError("--growth shows every round; leave --round out")
+        panels = _panels(self)
+        memory = load_memory(self.memory, up_to=self.round)
+        if not len(memory):
+            raise OptionError(
+                f"{self.memory}: an empty memory; expected one that views were fused in"
+            )
+        cameras = film_cameras(memory, self.path, width=self.width)
+        rounds = memory.rounds if self.growth else (self.round,)
+        del memory
+        start = time.perf_counter()
+        spent = [0.0]
+        frames = _frames(self, cameras, rounds, panels=panels, console=console, spent=spent)
+        write_film(self.out, frames, fps=self.fps)
+        count = len(cameras) * len(rounds)
+        each = (time.perf_counter() - start) / count
+        console.line(
+            f"{self.out}: {count} frames of {len(panels) * int(cameras.width[0])}x"
+            f"{int(cameras.height[0])}, {count / self.fps:.1f} s; {each:.3f} s a frame, of which "
+            f"projecting {spent[0] / count:.3f}"
+        )
+
+
+def _panels(args: FilmCommand) -> tuple[str, ...]:
+    from pipelines.film import PANELS
+
+    if args.complete:
+        return ("completed",)
+    if args.depth:
+        return ("depth",)
+    if args.compare is None:
+        return ("memory",)
+    panels = tuple(args.compare.split(","))
+    unknown = [panel for panel in panels if panel not in PANELS]
+    if unknown or len(panels) < 2:
+        raise OptionError(
+            f"--compare {args.compare!r}; expected two or more of {', '.join(PANELS)}, by commas"
+        )
+    return panels
+
+
+def _frames(
+    args: FilmCommand,
+    cameras: Cameras,
+    rounds: tuple[int | None, ...],
+    *,
+    panels: tuple[str, ...],
+    console: Console,
+    spent: list[float],
+) -> Iterator[NDArray[np.uint8]]:
+    """All frames in order; ``spent`` receives the seconds of projecting."""
+    import numpy as np
+
+    from pipelines.film import FilmRenderer, captioned
+
+    for number in rounds:
+        renderer = FilmRenderer(args.memory, cameras, up_to=number)
+        label = "drawing frames" if not args.growth else f"drawing frames of round {number}"
+        for index in console.track(range(len(cameras)), label):
+            frame = renderer.frame(index, panels)
+            if len(panels) > 1:
+                parts = np.split(frame, len(panels), axis=1)
+                pairs = zip(parts, panels, strict=True)
+                frame = np.concatenate([captioned(part, panel) for part, panel in pairs], axis=1)
+            if args.growth:
+                frame = captioned(frame, f"round {number}") if len(panels) == 1 else frame
+            yield frame
+        spent[0] += renderer.projecting

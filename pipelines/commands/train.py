@@ -1,13 +1,14 @@
-"""``gvtools train``: the generative core's stages, each resumable to the step after a kill.
+"""``gvtools train``: the stages of the generative core, and its weights tuned to one scene.
 
-Several processes train together: ``torchrun --nproc-per-node N --no-python gvtools train ...``;
-the setting ``parallel`` says what each of them holds.
+Every stage is resumable to the step after a kill. Several processes train together: ``torchrun
+--nproc-per-node N --no-python gvtools train ...``; the setting ``parallel`` says what each holds.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import tempfile
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -15,25 +16,126 @@ from typing import TYPE_CHECKING, Literal
 from pydantic import Field
 
 from gvtools.errors import OptionError
-from pipelines.commands.tune import NAME, TuneArguments, run_tune
+from pipelines.commands.arguments import RootArguments
 from pipelines.options import HelpSettings
 
 if TYPE_CHECKING:
+    from gvtools.scenes.scene import Scene
     from gvtools.settings import Settings
     from pipelines.console import Console
-
-SUMMARY = "train the generative core: encoder, denoisers, distillation; or tune it to a scene"
-EXAMPLES = (
-    "gvtools train tiny --stage all --out training/tiny",
-    "gvtools train my_training.json --stage denoiser --out training/mine --resume",
-    "gvtools train base --init weights/base --out training/base",
-    "gvtools train tune --scene scan/ --context every:2 --minutes 10 --out tuned/scan",
-)
+    from pipelines.reconstruction.settings import RunSettings
 
 
-class TrainArguments(TuneArguments):
-    """The command's arguments."""
+NAME = "tune"
+# Of the stages; tuning does not look at them.
+STAGE_OPTIONS = ("stage", "resume", "until", "set", "sheets")
 
+
+class TuneArguments(RootArguments):
+    """What ``tune`` takes beside --init, --out, --device and --json."""
+
+    title = (
+        "tune: CONFIG tune trains the denoisers to predict views of one scene from each other. "
+        "Some of the views judge; the tuned weights are kept if they predict these better than "
+        "before. --init is the model that ships unless given, and --out a folder for --set "
+        "completer.weights=DIR"
+    )
+
+    scene: Path | None = None
+    """As reconstruct takes it. [PROJECT]"""
+    context: str = "all"
+    """Views that may be looked at. [SPEC]"""
+    depth: str = "auto"
+    """Of the views, as of reconstruct. [SOURCE]"""
+    minutes: float = 10.0
+    """How long. [min]"""
+    steps: int | None = None
+    """Steps instead of a time: the same result each time. [N]"""
+    seed: int = 0
+    """Of everything random. [N]"""
+
+
+def run_tune(args: TrainCommand, console: Console) -> None:
+    """Tune, and write the weights."""
+    from gvtools.completers.geoverse.completer import SHIPPED
+    from gvtools.files import check_parent, write_json
+    from gvtools.scenes.project import open_project
+    from pipelines.tuning.tune import check_tunable, tune
+
+    if args.scene is None:
+        raise OptionError("train tune needs --scene PROJECT, the scene that is tuned to")
+    config = _checked(args)
+    weights = args.init or SHIPPED
+    check_tunable(weights)
+    if args.json_ is not None:
+        check_parent(args.json_)
+    if args.out.exists() and not (args.out.is_dir() and not any(args.out.iterdir())):
+        raise OptionError(f"--out {args.out}: holds something already; give a new folder")
+    with tempfile.TemporaryDirectory() as folder:
+        project = open_project(args.scene, root=args.root)
+        scene = context_of(project, config, Path(folder), console=console)
+        tuning = tune(
+            scene,
+            weights,
+            args.out,
+            options=config.tune,
+            completer={"device": args.device},
+            seed=config.seed,
+            say=console.line,
+        )
+    console.line(f"gvtools reconstruct ... --completer geoverse --set completer.weights={args.out}")
+    if args.json_ is not None:
+        write_json(args.json_, tuning.to_dict())
+
+
+def _checked(args: TrainCommand) -> RunSettings:
+    """Settings of a run that would read the scene likewise."""
+    from gvtools.settings import with_values
+    from pipelines.reconstruction.settings import RunSettings
+
+    for name in STAGE_OPTIONS:
+        if name in args.model_fields_set:
+            raise OptionError(f"train tune does not look at {args.key(name)}; leave it out")
+    if {"minutes", "steps"} <= args.model_fields_set:
+        raise OptionError("--minutes and --steps: expected one of them; leave the other out")
+    given = {"tune.minutes": args.minutes, "tune.steps": args.steps, "context": args.context,
+             "depth": args.depth, "seed": args.seed}  # fmt: skip
+    config = with_values(RunSettings(), given)
+    if not config.tune.wanted:
+        raise OptionError("no minutes and no steps: nothing to do; give --minutes or --steps")
+    return config
+
+
+def context_of(scene: Scene, config: RunSettings, folder: Path, *, console: Console) -> Scene:
+    """A scene's context with the depth and the poses that a run without a fit would take.
+
+    Targets of ``config`` are not looked at; computed depth goes into ``folder``.
+    """
+    from gvtools.runs.context_depth import DepthCache
+    from gvtools.settings import with_values
+    from pipelines.reconstruction.prepare import make_plan, with_depth
+
+    # The context stands for the targets, and an edge that nothing is fused with is not sought.
+    reading = {"completer": "none", "voxel": 1.0, "allow_overlap": True, "tune.minutes": 0.0}
+    reading |= {"tune.steps": None, "targets": config.context}
+    plan = make_plan(scene, with_values(config, reading), say=console.line).posed
+    console.line(
+        f"{scene.root}: {len(plan.context)} context views; depth {plan.source.name} "
+        f"({plan.source_reason})"
+    )
+    cache = DepthCache(plan.scene, plan.context, plan.source, folder=folder)
+    return with_depth(plan.scene, plan.context, cache)
+
+
+class TrainCommand(TuneArguments):
+    """Train the generative core: encoder, denoisers, distillation; or tune it to a scene."""
+
+    examples = (
+        "gvtools train tiny --stage all --out training/tiny",
+        "gvtools train my_training.json --stage denoiser --out training/mine --resume",
+        "gvtools train base --init weights/base --out training/base",
+        "gvtools train tune --scene scan/ --context every:2 --minutes 10 --out tuned/scan",
+    )
     positional = ("config",)
 
     config: str
@@ -68,6 +170,59 @@ class TrainArguments(TuneArguments):
         super().add(parser)
         parser.add_argument("--help-settings", action=HelpSettings, settings=_settings)
 
+    def run(self, console: Console) -> None:
+        from gvtools.completers.geoverse.weights import WHOLE_FILE
+        from gvtools.files import check_parent, make_folder, write_text
+        from gvtools.runs.folder import folder_lock
+        from gvtools.settings import with_texts
+        from gvtools.training.distributed import join_processes
+        from gvtools.training.options import shipped_or_read
+        from gvtools.training.records import STAGES
+        from gvtools.training.run import StageRun
+
+        if self.config == NAME:
+            run_tune(self, console)
+            return
+        for name in TuneArguments.model_fields:
+            if name in self.model_fields_set:
+                raise OptionError(f"{self.key(name)} belongs to 'gvtools train tune'; leave it out")
+        config, folder = shipped_or_read(self.config)
+        config = with_texts(config, self.set)
+        stages: tuple[str, ...] = (self.stage,)
+        if self.stage == "all":
+            stages = tuple(stage for stage in STAGES if getattr(config, stage) is not None)
+            if self.init is not None and not (self.init / WHOLE_FILE).is_file():
+                # A published encoder has its training behind it.
+                stages = tuple(stage for stage in stages if stage != "encoder")
+        if self.json_ is not None:
+            check_parent(self.json_)
+        make_folder(self.out)
+        figures: dict[str, dict[str, float]] = {}
+        with ExitStack() as held:
+            processes = held.enter_context(join_processes(self.device))
+            if processes.first:
+                held.enter_context(folder_lock(self.out))
+            for stage in stages:
+                stage_run = StageRun(
+                    config,
+                    stage,
+                    self.out,
+                    processes=processes,
+                    model_folder=folder,
+                    init=self.init if stage == stages[0] else None,
+                )
+                figures[stage] = stage_run.train(
+                    resume=self.resume,
+                    until=self.until,
+                    sheet_every=self.sheets,
+                    say=console.line if processes.first else lambda text: None,
+                )
+                if figures[stage].get("step", 0) < stage_run.options.optimizer.steps:
+                    # --until: the next stage has nothing to start from yet.
+                    break
+            if self.json_ is not None and processes.first:
+                write_text(self.json_, json.dumps(figures, indent=2) + "\n")
+
 
 def _settings(args: argparse.Namespace) -> list[Settings]:
     from gvtools.settings import with_texts
@@ -75,58 +230,3 @@ def _settings(args: argparse.Namespace) -> list[Settings]:
 
     known = TrainingSettings() if args.config is None else shipped_or_read(args.config)[0]
     return [with_texts(known, args.set or ())]
-
-
-def run(args: TrainArguments, console: Console) -> None:
-    """Train the stages that were asked for."""
-    from gvtools.completers.geoverse.weights import WHOLE_FILE
-    from gvtools.files import check_parent, make_folder, write_text
-    from gvtools.runs.folder import folder_lock
-    from gvtools.settings import with_texts
-    from gvtools.training.distributed import join_processes
-    from gvtools.training.options import shipped_or_read
-    from gvtools.training.records import STAGES
-    from gvtools.training.run import StageRun
-
-    if args.config == NAME:
-        run_tune(args, console)
-        return
-    for name in TuneArguments.model_fields:
-        if name in args.model_fields_set:
-            raise OptionError(f"{args.key(name)} belongs to 'gvtools train tune'; leave it out")
-    config, folder = shipped_or_read(args.config)
-    config = with_texts(config, args.set)
-    stages: tuple[str, ...] = (args.stage,)
-    if args.stage == "all":
-        stages = tuple(stage for stage in STAGES if getattr(config, stage) is not None)
-        if args.init is not None and not (args.init / WHOLE_FILE).is_file():
-            # A published encoder has its training behind it.
-            stages = tuple(stage for stage in stages if stage != "encoder")
-    if args.json_ is not None:
-        check_parent(args.json_)
-    make_folder(args.out)
-    figures: dict[str, dict[str, float]] = {}
-    with ExitStack() as held:
-        processes = held.enter_context(join_processes(args.device))
-        if processes.first:
-            held.enter_context(folder_lock(args.out))
-        for stage in stages:
-            stage_run = StageRun(
-                config,
-                stage,
-                args.out,
-                processes=processes,
-                model_folder=folder,
-                init=args.init if stage == stages[0] else None,
-            )
-            figures[stage] = stage_run.train(
-                resume=args.resume,
-                until=args.until,
-                sheet_every=args.sheets,
-                say=console.line if processes.first else lambda text: None,
-            )
-            if figures[stage].get("step", 0) < stage_run.options.optimizer.steps:
-                # --until: the next stage has nothing to start from yet.
-                break
-        if args.json_ is not None and processes.first:
-            write_text(args.json_, json.dumps(figures, indent=2) + "\n")

@@ -1,4 +1,4 @@
-"""``gvtools view``: a run or an exported file in the browser, in a window, or as one picture."""
+"""``gvtools view``, ``report`` and ``plot``: runs to look at."""
 
 from __future__ import annotations
 
@@ -7,27 +7,27 @@ from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
 
-from gvtools.errors import OptionError
+from gvtools.errors import OptionError, ProjectError
 from pipelines.options import Arguments
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from pipelines.console import Console
 
-SUMMARY = "look at a run or an exported file: web page, Open3D window or picture"
-EXAMPLES = (
-    "gvtools view runs/kitchen",
-    "gvtools view runs/kitchen --screenshot kitchen.png --color source",
-    "gvtools view kitchen.spz",
-)
 
+class ViewCommand(Arguments):
+    """Look at a run or an exported file: web page, Open3D window or picture."""
 
-class ViewArguments(Arguments):
-    """The command's arguments."""
-
-    positional = ("run",)
+    examples = (
+        "gvtools view runs/kitchen",
+        "gvtools view runs/kitchen --screenshot kitchen.png --color source",
+        "gvtools view kitchen.spz",
+    )
+    positional = ("folder",)
     exclusive = (("web", "open3d", "screenshot"),)
 
-    run: Path
+    folder: Path
     """A run, memory.npz, or a file of gvtools export: splats and points (.ply, .spz, .las, .laz,
     .usdc, .usda, .glb), meshes (.ply, .glb, .obj), recordings (.rrd, by rerun). [RUN_OR_FILE]"""
     web: bool = False
@@ -53,42 +53,164 @@ class ViewArguments(Arguments):
     project: Path | None = None
     """Where the run's project lies now, if moved. [PATH]"""
 
+    def run(self, console: Console) -> None:
+        from pipelines.viewing.serve import RECORDING, open_recording, read_round, serve
+        from pipelines.viewing.source import ViewSource
 
-def run(args: ViewArguments, console: Console) -> None:
-    """Show the run."""
-    from pipelines.viewing.serve import RECORDING, open_recording, read_round, serve
-    from pipelines.viewing.source import ViewSource
-
-    if args.live and (args.open3d or args.screenshot):
-        raise OptionError("--live: the web page alone follows a run; leave the other option out")
-    if args.screenshot is not None and args.screenshot.suffix.lower() != ".png":
-        raise OptionError(f"--screenshot {args.screenshot}: expected a name that ends with .png")
-    if args.run.suffix.lower() == RECORDING:
-        if args.screenshot is not None or args.open3d:
+        if self.live and (self.open3d or self.screenshot):
             raise OptionError(
-                f"{args.run}: recordings open in rerun's own viewer; leave --screenshot and "
-                "--open3d out"
+                "--live: the web page alone follows a run; leave the other option out"
             )
-        open_recording(args.run, host=args.host, port=args.port)
-        return
-    source, mode = ViewSource(args.run, project=args.project), args.color
-    if args.live or not (args.open3d or args.screenshot):
-        try:
-            serve(
-                source, host=args.host, port=args.port, max_points=args.max_points,
-                round=args.round, mode=mode, live=args.live, console=console,
-            )  # fmt: skip
-        except KeyboardInterrupt:
-            console.line("viewer ended")
-        return
-    shown, number = read_round(source, args.round)
-    if args.screenshot is not None:
-        from viz.viewer.render import chosen_camera, write_screenshot
+        if self.screenshot is not None and self.screenshot.suffix.lower() != ".png":
+            raise OptionError(
+                f"--screenshot {self.screenshot}: expected a name that ends with .png"
+            )
+        if self.folder.suffix.lower() == RECORDING:
+            if self.screenshot is not None or self.open3d:
+                raise OptionError(
+                    f"{self.folder}: recordings open in rerun's own viewer; leave --screenshot and "
+                    "--open3d out"
+                )
+            open_recording(self.folder, host=self.host, port=self.port)
+            return
+        source, mode = ViewSource(self.folder, project=self.project), self.color
+        if self.live or not (self.open3d or self.screenshot):
+            try:
+                serve(
+                    source, host=self.host, port=self.port, max_points=self.max_points,
+                    round=self.round, mode=mode, live=self.live, console=console,
+                )  # fmt: skip
+            except KeyboardInterrupt:
+                console.line("viewer ended")
+            return
+        shown, number = read_round(source, self.round)
+        if self.screenshot is not None:
+            from viz.viewer.render import chosen_camera, write_screenshot
 
-        camera = chosen_camera(shown, args.camera)
-        write_screenshot(args.screenshot, shown, camera, round=number, mode=mode)
-        console.line(f"{args.screenshot}: round {number} from {camera.name}")
-    else:
-        from viz.viewer.window import Open3dViewer
+            camera = chosen_camera(shown, self.camera)
+            write_screenshot(self.screenshot, shown, camera, round=number, mode=mode)
+            console.line(f"{self.screenshot}: round {number} from {camera.name}")
+        else:
+            from viz.viewer.window import Open3dViewer
 
-        Open3dViewer(shown, round=number, mode=mode, say=console.line).run_until_closed()
+            Open3dViewer(shown, round=number, mode=mode, say=console.line).run_until_closed()
+
+
+class ReportCommand(Arguments):
+    """Write a run's report: one HTML page with plots, pictures, figures and settings."""
+
+    examples = (
+        "gvtools report runs/kitchen",
+        "gvtools report runs/kitchen --pictures 30 --out kitchen.html",
+    )
+    positional = ("folder",)
+
+    folder: Path
+    """A run's folder, finished or not. [RUN]"""
+    out: Path | None = None
+    """Default RUN/report.html. [FILE]"""
+    pictures: int = Field(12, ge=1)
+    """Targets whose pictures are shown, at most. [N]"""
+    project: Path | None = None
+    """Where the run's project lies, if it was moved. [DIR]"""
+
+    def run(self, console: Console) -> None:
+        from gvtools.files import write_text
+        from pipelines.report import PAGE, collect
+        from viz.report.page import report_html
+
+        out = self.out or self.folder / PAGE
+        if out.suffix.lower() not in (".html", ".htm"):
+            raise OptionError(f"--out {out}: expected a name that ends with .html")
+        if out.is_dir():
+            raise OptionError(f"--out {out}: is a folder; expected a file's name")
+        report = collect(self.folder, project=self.project, most=self.pictures)
+        page = report_html(report)
+        write_text(out, page)
+        for warning in report.warnings:
+            console.warn(warning)
+        shown = len(report.sheets.rows)
+        console.line(f"{out}: {len(page) / 2**20:.1f} MiB, {shown} targets with pictures")
+
+
+FORMATS = ("png", "svg", "pdf")
+DPI = 150
+
+
+class PlotCommand(Arguments):
+    """Draw one figure of a run or a training."""
+
+    examples = (
+        "gvtools plot trajectories runs/kitchen --out kitchen.svg",
+        "gvtools plot losses training/tiny --out losses.png",
+    )
+    positional = ("what", "folder")
+
+    what: Literal["growth", "coverage", "timing", "trajectories", "losses"]
+    """growth: of a run: what is stored, what became of the points, coverage, time; coverage: of a
+    run: coverage against round; timing: of a run: time by stage and by round; trajectories: of a
+    run: given, requested and estimated cameras; losses: of a training, or of one stage's folder:
+    loss curves."""
+    folder: Path
+    """Of the run or training. [DIR]"""
+    out: Path
+    """Ends with .png, .svg or .pdf. [FILE]"""
+
+    def run(self, console: Console) -> None:
+        from gvtools.files import replaced_when_written
+
+        ending = self.out.suffix.lower().lstrip(".")
+        if ending not in FORMATS:
+            raise OptionError(
+                f"--out {self.out}: expected a name that ends with .png, .svg or .pdf"
+            )
+        figure = _figure(self.what, self.folder)
+        with replaced_when_written(self.out) as temporary:
+            figure.savefig(temporary, format=ending, dpi=DPI)
+        console.line(f"{self.what} of {self.folder} in {self.out}")
+
+
+def _figure(what: str, folder: Path) -> Figure:
+    title = folder.resolve().name
+    if what == "losses":
+        from viz.plots.losses import draw_losses
+
+        return draw_losses(read_training(folder), title=title)
+    from gvtools.runs.run import load_run
+
+    run = load_run(folder)
+    rounds = run.rounds
+    if what == "trajectories":
+        from pipelines.report import open_sources, read_measures, report_poses
+        from viz.plots.trajectories import draw_trajectories
+
+        sources = open_sources(run)
+        probe = read_measures(run).poses
+        poses = report_poses(rounds, sources.scene, run.context, probe=probe).cameras
+        if poses is None:
+            raise ProjectError(f"{folder}: no cameras to draw ({sources.problem or 'no rounds'})")
+        return draw_trajectories(poses, title=title)
+    if what in ("growth", "coverage"):
+        from viz.plots.rounds import draw_growth
+
+        return draw_growth(rounds, title=title, panels=None if what == "growth" else [what])
+    from viz.plots.rounds import draw_timing
+
+    return draw_timing(rounds, title=title)
+
+
+def read_training(folder: Path) -> dict[str, list[dict[str, object]]]:
+    """The logs of a training's stages by name, or of the one stage whose folder it is."""
+    from gvtools.training.records import STAGES, read_log
+
+    logs = {stage: read_log(folder / stage) for stage in STAGES}
+    logs = {stage: records for stage, records in logs.items() if records}
+    if not logs:
+        own = read_log(folder)
+        logs = {folder.resolve().name: own} if own else {}
+    if not logs:
+        raise ProjectError(
+            f"{folder}: holds no log.jsonl with a record, nor do {', '.join(STAGES)} in it; "
+            "expected the folder of a training or of one of its stages"
+        )
+    return logs

@@ -9,17 +9,14 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from gvtools.errors import CheckpointError, GvError, OptionError, ProjectError
-from pipelines.options import Action, Arguments
+from pipelines.options import Arguments
 
 if TYPE_CHECKING:
     from gvtools.completers.geoverse.config import GeoVerseConfig
     from pipelines.console import Console
-
-SUMMARY = "tell which weights the generative core needs, and whether a folder of them fits"
-EXAMPLES = ("gvtools weights list base", "gvtools weights check weights/base --json check.json")
 
 # What ``list`` calls the networks that give depth alone.
 DEPTH = "depth"
@@ -27,18 +24,33 @@ DEPTH = "depth"
 _INTERVAL = 10.0
 
 
-class ListWeightsArguments(Arguments):
-    """Of ``weights list``."""
+class ListWeights(Arguments):
+    """Files, publishers, licences, sizes."""
 
+    examples = ("", "base")
     positional = ("config",)
 
     config: str | None = None
     """base, gld, tiny or a config.json; all by default. [CONFIG]"""
 
+    def run(self, console: Console) -> None:
+        from gvtools.completers.geoverse.config import NAMES
+        from pipelines.weights import print_depth, print_needed
 
-class CheckWeightsArguments(Arguments):
-    """Of ``weights check``."""
+        names = (DEPTH, *NAMES) if self.config is None else (self.config,)
+        for number, name in enumerate(names):
+            if number:
+                console.line("")
+            if name == DEPTH:
+                print_depth(console)
+            else:
+                print_needed(_config(name), console)
 
+
+class CheckWeights(Arguments):
+    """Say precisely what does not fit."""
+
+    examples = ("weights/base", "DIR --config tiny")
     positional = ("folder",)
 
     folder: Path
@@ -48,10 +60,44 @@ class CheckWeightsArguments(Arguments):
     json_: Path | None = None
     """Write the report there. [FILE]"""
 
+    def run(self, console: Console) -> None:
+        from gvtools.completers.geoverse.weights import check_folder, check_is_folder, config_of
+        from gvtools.files import write_json
+        from pipelines.weights import print_parts
 
-class CreateArguments(Arguments):
-    """Of ``weights create``."""
+        folder = self.folder
+        report: dict[str, Any] = {"folder": str(folder), "config": None, "ok": False, "parts": []}
+        try:
+            check_is_folder(folder)
+            config = config_of(folder) if self.config is None else _config(self.config)
+            report["config"] = config.name
+            parts = check_folder(folder, config)
+        except GvError as error:
+            if self.json_ is not None:
+                write_json(self.json_, {**report, "problem": str(error)})
+            raise
+        bad = [part for part in parts if not part.ok]
+        problem = None
+        if bad:
+            first = bad[0].name if bad[0].path is None else str(bad[0].path)
+            problem = (
+                f"{folder}: {len(bad)} of {len(parts)} parts cannot be loaded, first {first}: "
+                f"{bad[0].summary}"
+            )
+        if self.json_ is not None:
+            found = [part.to_dict() for part in parts]
+            write_json(self.json_, {**report, "ok": not bad, "parts": found, "problem": problem})
+            console.line(f"report written to {self.json_}")
+        else:
+            print_parts(folder, config, parts, console=console)
+        if problem:
+            raise CheckpointError(problem)
 
+
+class CreateWeights(Arguments):
+    """Write an untrained model, for tests and as a start of training."""
+
+    examples = ("tiny weights/untrained", "tiny weights/other --seed 1")
     positional = ("config", "folder")
 
     config: str
@@ -61,10 +107,43 @@ class CreateArguments(Arguments):
     seed: int = 0
     """Of the numbers. [N]"""
 
+    def run(self, console: Console) -> None:
+        import torch
 
-class PackArguments(Arguments):
-    """Of ``weights pack``."""
+        from gvtools.completers.geoverse.model import GeoVerse, empty_model
+        from gvtools.completers.geoverse.weights import VIDEO_FOLDER, save_pretrained
+        from pipelines.weights import size_text
 
+        config, folder = _config(self.config), self.folder
+        if folder.is_file() or (
+            folder.is_dir() and any(path.name != VIDEO_FOLDER for path in folder.iterdir())
+        ):
+            raise ProjectError(
+                f"{folder} is there already, and not empty; nothing is overwritten; choose another "
+                "folder"
+            )
+        empty_model(config, where=self.config)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(self.seed)
+            model = GeoVerse(replace(config, trained=False))
+        path = save_pretrained(model, folder, about=f"untrained, seed {self.seed}")
+        numbers = sum(tensor.numel() for tensor in model.state_dict().values())
+        console.line(f"{path}: {numbers:,} numbers, {size_text(path.stat().st_size)}")
+        console.line(
+            f"this {config.name} model is UNTRAINED (seed {self.seed}): a start for training, and "
+            "for tests; what it generates is noise"
+        )
+        if config.video is not None and not (folder / VIDEO_FOLDER).is_dir():
+            console.line(
+                f"it needs the video prior as well: gvtools weights truncate-wan SOURCE "
+                f"{folder / VIDEO_FOLDER}"
+            )
+
+
+class PackWeights(Arguments):
+    """Write a trained model in half precision, with its training's record."""
+
+    examples = ("training/tiny weights/tiny",)
     positional = ("source", "folder")
 
     source: Path
@@ -72,10 +151,20 @@ class PackArguments(Arguments):
     folder: Path
     """The folder to make or to renew. [DIR]"""
 
+    def run(self, console: Console) -> None:
+        from pipelines.weights import pack, packed_bytes, size_text
 
-class TruncateArguments(Arguments):
-    """Of ``weights truncate-wan``."""
+        source = pack(self.source, self.folder)
+        console.line(f"{self.folder}: {size_text(packed_bytes(self.folder))}, from {source}")
 
+
+class TruncateWan(Arguments):
+    """Make the video prior's folder from published Wan2.2-VACE weights."""
+
+    examples = (
+        "Wan2.2-VACE-Fun-A14B weights/base/video --vae Wan2.1-VACE-diffusers/vae",
+        "Wan2.2-VACE-Fun-14B-diffusers weights/base/video",
+    )
     positional = ("source", "folder")
 
     source: Path
@@ -87,10 +176,25 @@ class TruncateArguments(Arguments):
     blocks: int = 16
     """Backbone blocks to keep. [N]"""
 
+    def run(self, console: Console) -> None:
+        from gvtools.completers.geoverse.wan import EMPTY_PROMPT
+        from gvtools.completers.geoverse.wan_checkpoint import truncate
 
-class PromptArguments(Arguments):
-    """Of ``weights empty-prompt``."""
+        progress = _progress(console)
+        truncate(self.source, self.folder, blocks=self.blocks, vae=self.vae, progress=progress)
+        console.line(
+            f"{self.folder} is written; it still needs {EMPTY_PROMPT}: gvtools weights "
+            f"empty-prompt TEXT_ENCODER {self.folder}"
+        )
 
+
+class WriteEmptyPrompt(Arguments):
+    """Add the empty prompt's embedding to the video prior's folder."""
+
+    examples = (
+        "Wan2.2-VACE-Fun-14B-diffusers/text_encoder weights/base/video",
+        "text_encoder weights/base/video",
+    )
     positional = ("source", "folder")
 
     source: Path
@@ -98,118 +202,32 @@ class PromptArguments(Arguments):
     folder: Path
     """The video prior's folder. [DIR]"""
 
+    def run(self, console: Console) -> None:
+        from gvtools.completers.geoverse.wan import EMPTY_PROMPT
+        from gvtools.completers.geoverse.wan_checkpoint import write_empty_prompt
 
-def _list(args: ListWeightsArguments, console: Console) -> None:
-    from gvtools.completers.geoverse.config import NAMES
-    from pipelines.weights import print_depth, print_needed
-
-    names = (DEPTH, *NAMES) if args.config is None else (args.config,)
-    for number, name in enumerate(names):
-        if number:
-            console.line("")
-        if name == DEPTH:
-            print_depth(console)
-        else:
-            print_needed(_config(name), console)
-
-
-def _pack(args: PackArguments, console: Console) -> None:
-    from pipelines.weights import pack, packed_bytes, size_text
-
-    source = pack(args.source, args.folder)
-    console.line(f"{args.folder}: {size_text(packed_bytes(args.folder))}, from {source}")
+        path = self.folder / EMPTY_PROMPT
+        if not self.folder.is_dir():
+            raise ProjectError(
+                f"no folder {self.folder}; make it with gvtools weights truncate-wan"
+            )
+        if path.exists():
+            raise ProjectError(f"{path} is there already; nothing is overwritten")
+        write_empty_prompt(self.source, self.folder)
+        console.line(f"{path} is written")
 
 
-def _check(args: CheckWeightsArguments, console: Console) -> None:
-    from gvtools.completers.geoverse.weights import check_folder, check_is_folder, config_of
-    from gvtools.files import write_json
-    from pipelines.weights import print_parts
+class WeightsCommand(Arguments):
+    """Tell which weights the generative core needs, and whether a folder of them fits."""
 
-    folder = args.folder
-    report: dict[str, Any] = {"folder": str(folder), "config": None, "ok": False, "parts": []}
-    try:
-        check_is_folder(folder)
-        config = config_of(folder) if args.config is None else _config(args.config)
-        report["config"] = config.name
-        parts = check_folder(folder, config)
-    except GvError as error:
-        if args.json_ is not None:
-            write_json(args.json_, {**report, "problem": str(error)})
-        raise
-    bad = [part for part in parts if not part.ok]
-    problem = None
-    if bad:
-        first = bad[0].name if bad[0].path is None else str(bad[0].path)
-        problem = (
-            f"{folder}: {len(bad)} of {len(parts)} parts cannot be loaded, first {first}: "
-            f"{bad[0].summary}"
-        )
-    if args.json_ is not None:
-        found = [part.to_dict() for part in parts]
-        write_json(args.json_, {**report, "ok": not bad, "parts": found, "problem": problem})
-        console.line(f"report written to {args.json_}")
-    else:
-        print_parts(folder, config, parts, console=console)
-    if problem:
-        raise CheckpointError(problem)
-
-
-def _create(args: CreateArguments, console: Console) -> None:
-    import torch
-
-    from gvtools.completers.geoverse.model import GeoVerse, empty_model
-    from gvtools.completers.geoverse.weights import VIDEO_FOLDER, save_pretrained
-    from pipelines.weights import size_text
-
-    config, folder = _config(args.config), args.folder
-    if folder.is_file() or (
-        folder.is_dir() and any(path.name != VIDEO_FOLDER for path in folder.iterdir())
-    ):
-        raise ProjectError(
-            f"{folder} is there already, and not empty; nothing is overwritten; choose another "
-            "folder"
-        )
-    empty_model(config, where=args.config)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(args.seed)
-        model = GeoVerse(replace(config, trained=False))
-    path = save_pretrained(model, folder, about=f"untrained, seed {args.seed}")
-    numbers = sum(tensor.numel() for tensor in model.state_dict().values())
-    console.line(f"{path}: {numbers:,} numbers, {size_text(path.stat().st_size)}")
-    console.line(
-        f"this {config.name} model is UNTRAINED (seed {args.seed}): a start for training, and for "
-        "tests; what it generates is noise"
+    examples = (
+        "gvtools weights list base",
+        "gvtools weights check weights/base --json check.json",
     )
-    if config.video is not None and not (folder / VIDEO_FOLDER).is_dir():
-        console.line(
-            f"it needs the video prior as well: gvtools weights truncate-wan SOURCE "
-            f"{folder / VIDEO_FOLDER}"
-        )
-
-
-def _truncate(args: TruncateArguments, console: Console) -> None:
-    from gvtools.completers.geoverse.wan import EMPTY_PROMPT
-    from gvtools.completers.geoverse.wan_checkpoint import truncate
-
-    progress = _progress(console)
-    truncate(args.source, args.folder, blocks=args.blocks, vae=args.vae, progress=progress)
-    console.line(
-        f"{args.folder} is written; it still needs {EMPTY_PROMPT}: gvtools weights empty-prompt "
-        f"TEXT_ENCODER {args.folder}"
-    )
-
-
-def _empty_prompt(args: PromptArguments, console: Console) -> None:
-    from gvtools.completers.geoverse.wan import EMPTY_PROMPT
-    from gvtools.completers.geoverse.wan_checkpoint import write_empty_prompt
-
-    path = args.folder / EMPTY_PROMPT
-    if not args.folder.is_dir():
-        raise ProjectError(f"no folder {args.folder}; make it with gvtools weights truncate-wan")
-    if path.exists():
-        raise ProjectError(f"{path} is there already; nothing is overwritten")
-    write_empty_prompt(args.source, args.folder)
-    console.line(f"{path} is written")
+    actions: ClassVar = {
+        "list": ListWeights, "check": CheckWeights, "create": CreateWeights, "pack": PackWeights,
+        "truncate-wan": TruncateWan, "empty-prompt": WriteEmptyPrompt,
+    }  # fmt: skip
 
 
 def _progress(console: Console) -> Callable[[int, int], None]:
@@ -238,44 +256,3 @@ def _config(name: str) -> GeoVerseConfig:
     if path.is_file():
         return read(path)
     raise OptionError(f"no configuration {name!r}; expected {', '.join(NAMES)} or a config.json")
-
-
-ACTIONS = {
-    "list": Action(_list, ListWeightsArguments, "files, publishers, licences, sizes", ("", "base")),
-    "check": Action(
-        _check,
-        CheckWeightsArguments,
-        "say precisely what does not fit",
-        ("weights/base", "DIR --config tiny"),
-    ),
-    "create": Action(
-        _create,
-        CreateArguments,
-        "write an untrained model, for tests and as a start of training",
-        ("tiny weights/untrained", "tiny weights/other --seed 1"),
-    ),
-    "pack": Action(
-        _pack,
-        PackArguments,
-        "write a trained model in half precision, with its training's record",
-        ("training/tiny weights/tiny",),
-    ),
-    "truncate-wan": Action(
-        _truncate,
-        TruncateArguments,
-        "make the video prior's folder from published Wan2.2-VACE weights",
-        (
-            "Wan2.2-VACE-Fun-A14B weights/base/video --vae Wan2.1-VACE-diffusers/vae",
-            "Wan2.2-VACE-Fun-14B-diffusers weights/base/video",
-        ),
-    ),
-    "empty-prompt": Action(
-        _empty_prompt,
-        PromptArguments,
-        "add the empty prompt's embedding to the video prior's folder",
-        (
-            "Wan2.2-VACE-Fun-14B-diffusers/text_encoder weights/base/video",
-            "text_encoder weights/base/video",
-        ),
-    ),
-}

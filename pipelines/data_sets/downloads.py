@@ -25,7 +25,7 @@ from pipelines.data_sets.log_histogram import LogHistogram
 
 if TYPE_CHECKING:
     from gvtools.scenes.scene import Scene
-    from pipelines.commands.data import DownloadArguments, ListDataArguments
+    from pipelines.commands.data import DownloadArguments, ListData
     from pipelines.console import Console
 
 COLUMNS = ("data set", "kind", "scenes", "images", "weight", "roles", "layout")
@@ -39,7 +39,7 @@ PERCENTILES = (5, 25, 50, 75, 95)
 # --- list -------------------------------------------------------------------------------------
 
 
-def list_data_sets(args: ListDataArguments, console: Console) -> None:
+def list_data_sets(args: ListData, console: Console) -> None:
     """Print a table of the data sets, or everything about one."""
     names = spec_names() if args.name is None else (args.name,)
     specs = [load_spec(name) for name in names]

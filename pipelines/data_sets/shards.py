@@ -10,14 +10,14 @@ from gvtools.errors import OptionError, ProjectError
 if TYPE_CHECKING:
     from gvtools.scenes.shard_writer import WrittenShard
     from gvtools.scenes.shards import Skipped
-    from pipelines.commands.data import ShardsArguments, VerifyArguments
+    from pipelines.commands.data import VerifyShards, WriteShards
     from pipelines.console import Console
 
 # Of what could not be converted, so many are named; all are in index.json.
 NAMED = 5
 
 
-def shards(args: ShardsArguments, console: Console) -> None:
+def shards(args: WriteShards, console: Console) -> None:
     """Convert scenes to shards, or go on where a conversion stopped."""
     from gvtools.scenes.data_sets.catalogue import spec_names
     from gvtools.scenes.layout import SPEC
@@ -60,7 +60,7 @@ def _warn(skipped: tuple[Skipped, ...], console: Console) -> None:
         console.warn(f"left out: {len(skipped) - NAMED} more, listed in index.json")
 
 
-def verify(args: VerifyArguments, console: Console) -> None:
+def verify(args: VerifyShards, console: Console) -> None:
     """Compare shards with their checksums."""
     from gvtools.scenes.shards import read_index
     from gvtools.scenes.shards import verify as problems_of

@@ -54,7 +54,7 @@ def test_the_parser_knows_what_the_viewers_know():
     args = arguments("view", "run")
     assert (args.host, args.port, args.max_points) == (LOCAL, PORT, BUDGET)
     assert LOCAL == "127.0.0.1"
-    assert tuple(MODES) == get_args(view.ViewArguments.model_fields["color"].annotation)
+    assert tuple(MODES) == get_args(view.ViewCommand.model_fields["color"].annotation)
 
 
 def test_a_picture_needs_no_display(small_run, tmp_path, monkeypatch, capsys):

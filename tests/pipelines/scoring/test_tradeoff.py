@@ -12,7 +12,7 @@ import pytest
 from gvtools.completers.base import create
 from gvtools.errors import GvError, OptionError
 from gvtools.settings import with_texts, with_values
-from pipelines.commands.tradeoff import parse_seconds
+from pipelines.commands.sweep import parse_seconds
 from pipelines.console import Console
 from pipelines.reconstruction.plan import Plan
 from pipelines.reconstruction.settings import RunSettings

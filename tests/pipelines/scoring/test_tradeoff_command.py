@@ -14,7 +14,7 @@ from tiny_scan import write_scan
 from gvtools.runs.folder import folder_lock
 from gvtools.settings import changes, with_texts, with_values
 from pipelines.cli import main
-from pipelines.commands.tradeoff import asked_for
+from pipelines.commands.sweep import asked_for
 from pipelines.reconstruction.settings import RunSettings
 from pipelines.scoring.tradeoff import EQUAL, changed
 
