@@ -277,9 +277,10 @@ def asked_for(args: TradeoffCommand, profile: str | None = None) -> RunSettings:
     from pipelines.reconstruction.settings import RunSettings
 
     texts: Sequence[str] = args.set
-    if profile is not None:
+    given = {} if profile is None else {"profile": profile}
+    if given:
         texts = [text for text in texts if text.partition("=")[0].strip() != "profile"]
-    config = run_settings({"profile": profile}, texts=texts, file=args.config)
+    config = run_settings(given, texts=texts, file=args.config)
     split = {**SPLIT, **changes(RunSettings(), config)}
     return config.replaced(
         context=args.context or split["context"], targets=args.targets or split["targets"]
