@@ -151,11 +151,12 @@ def write_ply(
         more: further ones, written as they come.
         count: of all; None for N.
     """
-    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {c}" for c in comments)]
+    # Comments come last: some readers of Gaussians take the third line for the count.
+    lines = ["ply", "format binary_little_endian 1.0"]
     lines.append(f"element vertex {len(vertices) if count is None else count}")
     names = vertices.dtype.names or ()
     lines += [f"property {NAMES[vertices.dtype[name].str[1:]]} {name}" for name in names]
-    lines.append("end_header\n")
+    lines += [*(f"comment {c}" for c in comments), "end_header\n"]
     with replaced_when_written(path) as temporary, temporary.open("wb") as file:
         file.write("\n".join(lines).encode("ascii"))
         for part in chain([vertices], more):

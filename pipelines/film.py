@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -44,6 +45,10 @@ KEY_FRAMES = 12
 # The colours of depth span these percentiles of the depth of so many frames.
 RANGE_FRAMES, RANGE = 9, (2.0, 98.0)
 SUFFIXES = (".mp4", ".gif", ".webp")
+# Number of the primaries and of the transfer of HD television (H.273).
+BT709 = 1
+# The least time that browsers show a frame of an animation for as they are told [ms].
+LEAST_SHOWN = 20
 # x264's constant rate factor: 18 is visually almost lossless, 23 is its default.
 QUALITY = 18
 WEBP_QUALITY = 80
@@ -239,6 +244,7 @@ def write_film(path: Path, frames: Iterable[NDArray[np.uint8]], *, fps: float) -
 
 def _write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]], *, fps: float) -> None:
     import av
+    from av.video.reformatter import ColorRange, Colorspace
 
     rate = Fraction(fps).limit_denominator(1001)
     # "faststart" moves the index to the front, so that browsers play it while it loads.
@@ -246,10 +252,17 @@ def _write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]], *, fps: float) -
         stream = container.add_stream("libx264", rate=rate, options={"crf": str(QUALITY)})
         # The pixel format that every player can decode.
         stream.pix_fmt = "yuv420p"
+        # Of what players otherwise guess by the picture's size.
+        coder = stream.codec_context
+        coder.color_range, coder.colorspace = ColorRange.MPEG, Colorspace.ITU709
+        coder.color_primaries, coder.color_trc = BT709, BT709
         for number, frame in enumerate(frames):
             if number == 0:
                 stream.height, stream.width = frame.shape[:2]
             picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")
+            picture = picture.reformat(
+                format="yuv420p", dst_colorspace=Colorspace.ITU709, dst_color_range=ColorRange.MPEG
+            )
             container.mux(stream.encode(picture))
         container.mux(stream.encode())
 
@@ -261,8 +274,29 @@ def _write_animation(
 
     images = [Image.fromarray(frame) for frame in frames]
     options = {"quality": WEBP_QUALITY} if form == "WEBP" else {}
+    shown, durations = shown_frames(len(images), fps=fps, unit=10 if form == "GIF" else 1)
+    first, *others = (images[number] for number in shown)
     with path.open("wb") as file:
-        images[0].save(
-            file, format=form, save_all=True, append_images=images[1:],
-            duration=max(1, round(1000 / fps)), loop=0, **options,
+        first.save(
+            file, format=form, save_all=True, append_images=others, duration=durations, loop=0,
+            **options,
         )  # fmt: skip
+
+
+def shown_frames(frames: int, *, fps: float, unit: int) -> tuple[list[int], list[int]]:
+    """Frames of an animation that are shown, and for how many ms each: ``frames`` / ``fps`` in all.
+
+    Browsers show what stands for less than ``LEAST_SHOWN`` ms for ten times as long, so frames are
+    left out instead. ``unit``: ms that durations are multiples of.
+
+    >>> shown_frames(6, fps=60, unit=10)
+    ([0, 2, 3, 4], [30, 20, 20, 30])
+    """
+    begins = [unit * round(1000 * number / fps / unit) for number in range(frames + 1)]
+    shown = [0]
+    for number in range(1, frames):
+        late = begins[number] - begins[shown[-1]] >= LEAST_SHOWN
+        if late and begins[frames] - begins[number] >= LEAST_SHOWN:
+            shown.append(number)
+    times = [begins[number] for number in shown] + [max(begins[frames], LEAST_SHOWN)]
+    return shown, [after - before for before, after in pairwise(times)]

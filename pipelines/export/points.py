@@ -10,7 +10,7 @@ the other exports.
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, MutableMapping
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,8 @@ from pipelines.export.source import ExportSource, box_middle
 POINT_FORMAT, VERSION = 7, "1.4"
 # Steps of coordinates in a voxel, at least, and the largest number of them.
 STEPS_PER_VOXEL, MOST_STEPS = 10, 2**31 - 1
+# glTF: a type of numbers, and the extension that shows colours as they are.
+UINT16, UNLIT = 5123, "KHR_materials_unlit"
 # 8 bits to 16: 255 becomes 65535.
 TO_16_BITS = 257
 # Viewers of USD and glTF are slow beyond it.
@@ -52,6 +54,8 @@ def write_las(source: ExportSource, path: Path, options: ExportOptions) -> str:
     columns, rows = memory.columns, points.rows
     header = laspy.LasHeader(point_format=POINT_FORMAT, version=VERSION)
     header.generating_software = "gvtools"
+    # What point formats from 6 on have to say.
+    header.global_encoding.wkt = True
     header.offsets = np.round(points.middle)
     reach = float(np.abs(points.positions - header.offsets).max())
     # A power of ten, as other software writes it.
@@ -92,6 +96,11 @@ def write_usd(source: ExportSource, path: Path, options: ExportOptions) -> str:
     stage = Usd.Stage.CreateInMemory()
     # Where a stage does not say, its unit is a centimetre: rooms would open far too small.
     UsdGeom.SetStageMetersPerUnit(stage, UsdGeom.LinearUnits.meters)
+    # USD knows these two; the nearer one to the cameras' up.
+    up = -sum(
+        (view.camera.cam_from_world[0, 1, :3] for view in memory.views.photographed), np.zeros(3)
+    )
+    UsdGeom.SetStageUpAxis(stage, "Y" if abs(up[1]) > abs(up[2]) else "Z")
     root = UsdGeom.Xform.Define(stage, ROOT)
     root.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*center.tolist()))
     stage.SetDefaultPrim(root.GetPrim())
@@ -124,8 +133,41 @@ def write_usd(source: ExportSource, path: Path, options: ExportOptions) -> str:
     return f"{source.points_summary(points)} in {path}, in the input's axes"
 
 
+def _as_photographed(items: MutableMapping[Any, bytes], tree: dict[str, Any]) -> None:
+    """Vertex colours as glTF has them, linear, and materials that no light shines on."""
+    keys = list(items)
+    for mesh in tree["meshes"]:
+        for part in mesh["primitives"]:
+            if "material" not in part:
+                part["material"] = len(tree.setdefault("materials", []))
+                tree["materials"].append({})
+            place = part["attributes"].get("COLOR_0")
+            if place is None:
+                continue
+            accessor = list(tree["accessors"].values())[place]
+            if accessor["componentType"] == UINT16:
+                continue  # one that another part shares
+            key = keys[accessor["bufferView"]]
+            stored = np.frombuffer(items[key], np.uint8)[: 4 * accessor["count"]].reshape(-1, 4)
+            values = np.empty(stored.shape, "<u2")
+            values[:, :3] = np.rint(65535 * _linear(stored[:, :3]))
+            values[:, 3] = stored[:, 3].astype("<u2") * TO_16_BITS
+            items[key] = values.tobytes()
+            accessor |= {"componentType": UINT16, "normalized": True, "byteOffset": 0}
+            accessor |= {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
+    for number, material in enumerate(tree.get("materials", [])):
+        physical = {"baseColorFactor": [1.0] * 4, "metallicFactor": 0.0, "roughnessFactor": 1.0}
+        texture = material.get("pbrMetallicRoughness", {}).get("baseColorTexture")
+        physical |= {} if texture is None else {"baseColorTexture": texture}
+        named = {"name": material["name"]} if "name" in material else {}
+        tree["materials"][number] = {
+            **named, "pbrMetallicRoughness": physical, "extensions": {UNLIT: {}},
+        }  # fmt: skip
+    tree["extensionsUsed"] = sorted({*tree.get("extensionsUsed", ()), UNLIT})
+
+
 def _linear(colors: np.ndarray) -> np.ndarray:
-    """Bytes of sRGB as the linear light that USD's colours are, (N, 3) float32."""
+    """Bytes of sRGB as the linear light that USD's and glTF's colours are, (N, 3) float32."""
     share = np.arange(256) / 255
     table = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
     return table.astype(np.float32)[colors]
@@ -174,6 +216,6 @@ def write_glb_scene(
         transform=move,
         metadata={"origin": center.tolist(), "frame": FRAME, **(extras or {})},
     )
-    buffer = io.BytesIO(scene.export(file_type="glb"))
+    buffer = io.BytesIO(scene.export(file_type="glb", buffer_postprocessor=_as_photographed))
     with replaced_when_written(path) as temporary:
         temporary.write_bytes(buffer.getbuffer())

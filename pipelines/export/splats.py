@@ -53,6 +53,8 @@ BITS, MOST_FRACTIONAL = 24, 23
 STEPS_PER_SIZE, SMALLEST = 8, 0.05
 # Colours are stored as 0.15 f_dc + 0.5, logarithms of sizes as 16 (log + 10).
 COLOR, SCALE, SHIFT = 0.15, 16, 10
+# Coefficients of a channel above degree 0, in a PLY.
+REST = 15
 # Bits of harmonics that are kept, by degree.
 HARMONIC_BITS = (5, 4)
 # A component's 9 bits of magnitude; the three smallest are at most this.
@@ -73,12 +75,14 @@ def write_splat_ply(source: ExportSource, path: Path, options: ExportOptions) ->
 
 def ply_rows(splats: Splats) -> NDArray[np.void]:
     """(N,) rows as the PLY has them; normals are zero, as INRIA's are."""
-    rest = splats.harmonics[:, 1:].transpose(0, 2, 1).reshape(len(splats), -1)
+    # As many as degree 3 has, whatever is used: readers of a fixed layout count on them.
+    rest = np.zeros((len(splats), 3, REST), np.float32)
+    rest[:, :, : splats.harmonics.shape[1] - 1] = splats.harmonics[:, 1:].transpose(0, 2, 1)
     columns: dict[tuple[str, ...], NDArray[Any]] = {
         ("x", "y", "z"): splats.positions,
         ("nx", "ny", "nz"): np.zeros((len(splats), 3)),
         _numbered("f_dc", 3): splats.harmonics[:, 0],
-        _numbered("f_rest", rest.shape[1]): rest,
+        _numbered("f_rest", 3 * REST): rest.reshape(len(splats), -1),
         ("opacity",): splats.logits[:, None],
         _numbered("scale", 3): splats.log_scales,
         _numbered("rot", 4): splats.quaternions,

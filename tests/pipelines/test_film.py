@@ -11,7 +11,7 @@ from PIL import Image, ImageSequence
 from tiny_scan import write_scan
 
 from pipelines.cli import main
-from pipelines.film import FilmRenderer, captioned, film_cameras
+from pipelines.film import FilmRenderer, captioned, film_cameras, write_film
 
 pytestmark = pytest.mark.usefixtures("unpainted")
 
@@ -122,3 +122,31 @@ def _memory(run: Path):
     from gvtools.runs.run import load_memory
 
     return load_memory(run)
+
+
+@pytest.mark.parametrize("width", [640, 1280])
+def test_an_mp4_says_its_colours_and_shows_them(tmp_path, width):
+    av = pytest.importorskip("av")
+    frame = np.full((width // 2, width, 3), (121, 29, 33), np.uint8)
+    write_film(tmp_path / "film.mp4", [frame] * 3, fps=30)
+    with av.open(str(tmp_path / "film.mp4")) as film:
+        coder = film.streams.video[0].codec_context
+        tags = (coder.color_primaries, coder.color_trc, coder.colorspace, coder.color_range)
+        assert tags == (1, 1, 1, 1)
+        decoded = next(film.decode(video=0))
+    shown = decoded.reformat(format="rgb24", src_colorspace="ITU709").to_ndarray()
+    assert np.abs(shown.astype(int) - (121, 29, 33)).max() <= 3
+
+
+@pytest.mark.parametrize(("suffix", "unit"), [("gif", 10), ("webp", 1)])
+@pytest.mark.parametrize("fps", [12, 24, 60, 144])
+def test_an_animation_lasts_as_long_as_its_frames_and_browsers_obey(tmp_path, suffix, unit, fps):
+    frames = [np.full((16, 16, 3), 4 * number, np.uint8) for number in range(60)]
+    write_film(tmp_path / f"film.{suffix}", frames, fps=fps)
+    with Image.open(tmp_path / f"film.{suffix}") as film:
+        times = []
+        for frame in ImageSequence.Iterator(film):
+            frame.load()
+            times.append(frame.info["duration"])
+    assert min(times) >= 20
+    assert abs(sum(times) - 60_000 / fps) <= unit

@@ -7,7 +7,7 @@ import numpy as np
 import pycolmap
 import pytest
 from box_project import VOXEL, fused
-from export_runs import export_run
+from export_runs import export_run, glb_colors
 from memory_scenes import points
 from PIL import Image
 from plyfile import PlyData
@@ -163,7 +163,10 @@ def test_glb_is_what_trimesh_reads(memory, saved, tmp_path):
     (cloud,) = scene.dump()
     kept = thinned(memory, None)
     np.testing.assert_allclose(cloud.vertices, memory.positions[kept.rows], atol=1e-6)
-    np.testing.assert_array_equal(cloud.colors[:, :3], memory.columns.colors[kept.rows])
+    colors, material = glb_colors(tmp_path / "cloud.glb")
+    np.testing.assert_array_equal(colors, memory.columns.colors[kept.rows])
+    assert "KHR_materials_unlit" in material["extensions"]
+    assert material["pbrMetallicRoughness"]["metallicFactor"] == 0
 
 
 def test_glb_keeps_millimetres_far_from_the_origin(scene, tmp_path):

@@ -54,6 +54,7 @@ def test_las_keeps_its_steps_far_from_the_origin(far, tmp_path):
     memory, positions = far
     export_run(memory, "las", tmp_path / "out.las")
     cloud = laspy.read(tmp_path / "out.las")
+    assert cloud.header.global_encoding.wkt
     np.testing.assert_allclose(cloud.xyz, positions, atol=0.51 * cloud.header.scales[0] + 1e-6)
 
 
@@ -66,7 +67,10 @@ def test_pxr_reads_the_points(bare_run, tmp_path, suffix):
     export_run(bare_run.folder, "usd", out)
     assert sorted(tmp_path.iterdir()) == [out]
     stage = Usd.Stage.Open(str(out))
-    assert UsdGeom.GetStageMetersPerUnit(stage) == 1
+    assert UsdGeom.GetStageMetersPerUnit(stage) == 1 and stage.HasAuthoredMetadata("upAxis")
+    validation = pytest.importorskip("pxr.UsdValidation")
+    every = validation.ValidationRegistry().GetOrLoadAllValidators()
+    assert [e.GetMessage() for e in validation.ValidationContext(every).Validate(stage)] == []
     (cloud,) = (UsdGeom.Points(prim) for prim in stage.Traverse() if prim.IsA(UsdGeom.Points))
     world = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(cloud.GetPrim()))
     local = np.array(cloud.GetPointsAttr().Get(), np.float64)
