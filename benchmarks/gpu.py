@@ -244,8 +244,8 @@ def training_step(sizes: Sizes) -> Figures:
     size = sizes.core or (config.image_size, config.image_size)
     views = random_views(size, context=2, targets=2)
     samples = sizes.samples if config.image_size < LARGE else 1
-    rows = torch.zeros(samples, dtype=torch.long)
-    batch = TrainingBatch(views, views.images, views.depth + 1.5 * ~views.valid).samples(rows)
+    views = views.samples(torch.zeros(samples, dtype=torch.long))
+    batch = TrainingBatch(views, views.images, views.depth + 1.5 * ~views.valid)
     batch = batch.to("cuda")
     stage = DenoiserStage(random_model(config, "cuda"), DenoiserStageOptions()).to("cuda")
     set_recompute(stage, config.image_size >= LARGE)

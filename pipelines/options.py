@@ -15,7 +15,7 @@ from pydantic import ConfigDict
 from gvtools.errors import GvError
 from gvtools.settings import Settings
 from gvtools.settings.base import Entry, entries
-from gvtools.settings.documentation import accepts, shown
+from gvtools.settings.documentation import accepts, text_of
 
 if TYPE_CHECKING:
     from pipelines.console import Console
@@ -180,7 +180,7 @@ def _form(entry: Entry, value: Any, *, metavar: str | None = None) -> dict[str, 
             form["action"] = "append"
     if value not in (None, ()) and kind is not bool:
         unit = entry.unit if entry.unit.islower() else ""
-        notes.append(f"default {shown(value)} {unit}".rstrip())
+        notes.append(f"default {text_of(value)} {unit}".rstrip())
     about = f" ({'; '.join(notes)})" if notes else ""
     return {**form, "help": f"{entry.doc.removesuffix('.')}{about}".replace("%", "%%")}
 

@@ -33,39 +33,28 @@ Float32 = NDArray[np.float32]
 class ScaleStatus(str, Enum):
     """How a view's generated depth was brought into scene units, or why it was refused."""
 
-    # One factor, fitted to the memory's depth on the pixels that both know.
-    MEMORY_DEPTH = "memory_depth"
-    # A smooth field of factors, fitted to the memory's depth.
-    MEMORY_FIELD = "memory_field"
-    # No factor: the memory's surfaces, in scene units, were continued into the holes.
-    MEMORY_SURFACES = "memory_surfaces"
-    # One factor, fitted to the depth of the context views.
-    CONTEXT_DEPTH = "context_depth"
-    # One factor, fitted between predicted and given camera centres.
-    CAMERA_CENTRES = "camera_centres"
-    # The view has no hole.
-    NOTHING_TO_COMPLETE = "nothing_to_complete"
-    # Refused: too few pixels or camera centres to fit a factor.
-    UNSUPPORTED = "unsupported"
-    # Refused: the depth differs from known depth by more than a factor.
-    CONTRADICTED = "contradicted"
+    words: str  # for the user
+
+    def __new__(cls, value: str, words: str = "") -> ScaleStatus:
+        """A member of a value, which finds it, and its words."""
+        member = str.__new__(cls, value)
+        member._value_, member.words = value, words
+        return member
+
+    MEMORY_DEPTH = "memory_depth", "one factor to the memory's depth"
+    MEMORY_FIELD = "memory_field", "a smooth field of factors to the memory's depth"
+    # No factor: they are in scene units.
+    MEMORY_SURFACES = "memory_surfaces", "the memory's own surfaces, continued"
+    CONTEXT_DEPTH = "context_depth", "the depth of the context views"
+    CAMERA_CENTRES = "camera_centres", "the camera centres"
+    NOTHING_TO_COMPLETE = "nothing_to_complete", "nothing to complete"
+    UNSUPPORTED = "unsupported", "refused: too little to find a scale from"
+    CONTRADICTED = "contradicted", "refused: known depth contradicts it"
 
     @property
     def accepted(self) -> bool:
         """Whether the view's generated depth may be fused."""
         return self not in (ScaleStatus.UNSUPPORTED, ScaleStatus.CONTRADICTED)
-
-
-_IN_WORDS = {
-    ScaleStatus.MEMORY_DEPTH: "one factor to the memory's depth",
-    ScaleStatus.MEMORY_FIELD: "a smooth field of factors to the memory's depth",
-    ScaleStatus.MEMORY_SURFACES: "the memory's own surfaces, continued",
-    ScaleStatus.CONTEXT_DEPTH: "the depth of the context views",
-    ScaleStatus.CAMERA_CENTRES: "the camera centres",
-    ScaleStatus.NOTHING_TO_COMPLETE: "nothing to complete",
-    ScaleStatus.UNSUPPORTED: "refused: too little to find a scale from",
-    ScaleStatus.CONTRADICTED: "refused: known depth contradicts it",
-}
 
 
 @dataclass(frozen=True)
@@ -109,14 +98,26 @@ class ScaleAlignment:
             figures.append(f"{self.centres} camera centres")
         if np.isfinite(self.correlation):
             figures.append(f"correlation {self.correlation:.2f}")
-        return f"{_IN_WORDS[self.status]} ({', '.join(figures)})"
+        return f"{self.status.words} ({', '.join(figures)})"
 
     def to_json(self) -> dict[str, Any]:
         """As a round's report holds it."""
         figures = asdict(self)
         status = figures.pop("status").value
-        told = {"accepted": self.accepted, "description": self.describe()}
-        return {"status": status, **told, **figures}
+        words = {"accepted": self.accepted, "description": self.describe()}
+        return {"status": status, **words, **figures}
+
+
+# What pixels have beside rows and columns: colours, and Plücker rays.
+CHANNELS = {"rgb": (3,), "rays": (6,)}
+
+
+def check_shapes(what: str, shape: tuple[int, ...], **images: NDArray[np.generic] | None) -> None:
+    """Refuse images that have not ``shape`` and the channels of their name."""
+    for name, image in images.items():
+        expected = (*shape, *CHANNELS.get(name, ()))
+        if image is not None and image.shape != expected:
+            raise ShapeError(f"{what}: {name} {image.shape}; expected {expected}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,17 +133,16 @@ class ContextView:
     def __post_init__(self) -> None:
         if self.rgb.dtype == np.uint8:
             object.__setattr__(self, "rgb", self.rgb.astype(np.float32) / 255)
-        size = (int(self.camera.height[0]), int(self.camera.width[0]))
-        if len(self.camera) != 1 or self.rgb.shape != (*size, 3):
-            raise ShapeError(
-                f"context view {self.name}: rgb {self.rgb.shape} with {len(self.camera)} camera(s) "
-                f"of {size[1]}x{size[0]} pixels; expected one camera and rgb of its size"
-            )
-        for what, value in (("depth", self.depth), ("confidence", self.confidence)):
-            if value is not None and value.shape != size:
-                raise ShapeError(
-                    f"context view {self.name}: {what} {value.shape}; expected {size} like rgb"
-                )
+        what, size = f"context view {self.name}", (self.camera.height[0], self.camera.width[0])
+        if len(self.camera) != 1:
+            raise ShapeError(f"{what}: {len(self.camera)} cameras; expected one")
+        check_shapes(
+            what,
+            (int(size[0]), int(size[1])),
+            rgb=self.rgb,
+            depth=self.depth,
+            confidence=self.confidence,
+        )
 
     @cached_property
     def nonfinite_pixels(self) -> int:
@@ -177,18 +177,14 @@ class Completion:
 
     def __post_init__(self) -> None:
         shape = self.depth.shape
-        if len(shape) != 3 or self.rgb.shape != (*shape, 3) or self.confidence.shape != shape:
-            raise ShapeError(
-                f"completion: rgb {self.rgb.shape}, depth {shape}, confidence "
-                f"{self.confidence.shape}; expected (V, H, W, 3), (V, H, W) and (V, H, W)"
-            )
+        if len(shape) != 3:
+            raise ShapeError(f"completion: depth {shape}; expected (V, H, W)")
+        check_shapes("completion", shape, rgb=self.rgb, confidence=self.confidence, rays=self.rays)
         if self.scale_alignment is not None and len(self.scale_alignment) != shape[0]:
             raise ShapeError(
                 f"completion: scale alignment of {len(self.scale_alignment)} views; "
                 f"expected {shape[0]}"
             )
-        if self.rays is not None and self.rays.shape != (*shape, 6):
-            raise ShapeError(f"completion: rays {self.rays.shape}; expected {(*shape, 6)}")
 
     @classmethod
     def of_memory(cls, guidance: Guidance) -> Completion:
@@ -320,11 +316,9 @@ def check_views(context: Sequence[ContextView], guidance: Guidance) -> None:
     Depth of the context that is not finite counts as none.
     """
     shape = guidance.valid.shape
-    if len(shape) != 3 or guidance.rgb.shape != (*shape, 3) or guidance.depth.shape != shape:
-        raise ShapeError(
-            f"guidance: rgb {guidance.rgb.shape}, depth {guidance.depth.shape}, valid {shape}; "
-            "expected (V, H, W, 3), (V, H, W) and (V, H, W)"
-        )
+    if len(shape) != 3:
+        raise ShapeError(f"guidance: valid {shape}; expected (V, H, W)")
+    check_shapes("guidance", shape, rgb=guidance.rgb, depth=guidance.depth)
     wrong = {view.name: view.nonfinite_pixels for view in context}
     finite = np.isfinite(guidance.depth) & np.isfinite(guidance.confidence)
     colors = np.isfinite(guidance.rgb)
@@ -350,11 +344,7 @@ def run_completer(
     these; context and seed stay the same.
     """
     completion = _complete_in_parts(completer, context, guidance, seed=seed)
-    if completion.depth.shape != guidance.valid.shape:
-        raise ShapeError(
-            f"completer {completer.name} returned depth {completion.depth.shape}; expected "
-            f"{guidance.valid.shape} like the guidance"
-        )
+    check_shapes(f"completer {completer.name}", guidance.valid.shape, depth=completion.depth)
     for what in ("rgb", "depth", "confidence"):
         values = getattr(completion, what)
         if not np.isfinite(values).all():

@@ -68,9 +68,9 @@ class InpaintCompleter(Completer):
         self, context: Sequence[ContextView], guidance: Guidance, *, seed: int = 0
     ) -> Completion:
         """Fill the holes of all views; see ``Completer.complete``. Nothing here is random."""
-        return self.filled(context, guidance)[0]
+        return self.fill(context, guidance)[0]
 
-    def filled(
+    def fill(
         self, context: Sequence[ContextView], guidance: Guidance
     ) -> tuple[Completion, NDArray[np.float32]]:
         """The completion, and (V, H, W) the weight of the photographs that holes were seen in."""

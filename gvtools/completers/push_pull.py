@@ -45,7 +45,7 @@ def push_pull(values: Tensor, valid: Tensor) -> Tensor:
     known = torch.where(weight > 0, values, values.new_zeros(()))
     pyramid = [(known, weight)]
     while max(known.shape[-2:]) > 1:
-        total, weight = _halved(known * weight), _halved(weight)
+        total, weight = _halve(known * weight), _halve(weight)
         known = total / weight.clamp_min(torch.finfo(values.dtype).tiny)
         # An average counts by its share of known pixels, wholly from a quarter on.
         weight = (4 * weight).clamp_max(1)
@@ -67,6 +67,6 @@ def push_pull_depth(depth: Tensor, valid: Tensor) -> Tensor:
     return torch.where(known.flatten(1).any(1)[:, None, None, None], filled, 0.0)
 
 
-def _halved(x: Tensor) -> Tensor:
+def _halve(x: Tensor) -> Tensor:
     """Means of 2x2 windows; the odd last row and column stand for themselves and count in full."""
     return F.avg_pool2d(x, 2, ceil_mode=True, count_include_pad=False)

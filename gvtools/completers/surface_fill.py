@@ -40,7 +40,7 @@ def surface_fill(
     A view without a valid pixel keeps its zeros, unless something is carried there: ``shared``
     carries fills from view to view, whatever their order.
     """
-    completion, looked_up = InpaintCompleter().filled(context, guidance)
+    completion, looked_up = InpaintCompleter().fill(context, guidance)
     known = guidance.valid
     if shared and len(guidance) > 1:
         known = _share_fills(context, guidance, completion, looked_up=looked_up)
@@ -81,7 +81,7 @@ def _share_fills(
             surer &= carried.confidence > SURER * completion.confidence[index]
             if surer.any():
                 view = _with_carried(view, carried, surer)
-                again, weight = InpaintCompleter().filled(context, view)
+                again, weight = InpaintCompleter().fill(context, view)
                 completion.rgb[index], completion.depth[index] = again.rgb[0], again.depth[0]
                 completion.confidence[index], looked_up[index] = again.confidence[0], weight[0]
                 known[index] = view.valid[0]

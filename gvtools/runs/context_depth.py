@@ -117,7 +117,7 @@ class DepthCache:
         return self.source.covers(view)
 
     @property
-    def kept(self) -> int:
+    def file_count(self) -> int:
         """How many of the views have a file."""
         return sum(path.exists() for path in self._file.values())
 

@@ -105,7 +105,7 @@ def check_sums(folder: Path, names: Iterable[str] | None = None) -> None:
         lines = read_text(path).splitlines()
         sums = {name: total for total, name in (line.split("  ", 1) for line in lines)}
     except (OSError, ValueError) as error:
-        raise _damaged(path, str(error)) from None
+        raise _damage(path, str(error)) from None
     for name in sums if names is None else names:
         if name not in sums:
             continue
@@ -113,12 +113,12 @@ def check_sums(folder: Path, names: Iterable[str] | None = None) -> None:
         try:
             whole = sums[name] == file_digest(file)
         except OSError as error:
-            raise _damaged(folder / name, error.strerror or str(error)) from None
+            raise _damage(folder / name, error.strerror or str(error)) from None
         if not whole:
-            raise _damaged(folder / name, "its bytes are not those that were written")
+            raise _damage(folder / name, "its bytes are not those that were written")
 
 
-def _damaged(path: Path, why: str) -> ProjectError:
+def _damage(path: Path, why: str) -> ProjectError:
     folder = path.parent
     # A run writes anew what is made of its rounds.
     anew = "" if (folder / RECORD).is_file() else f"remove {folder} and "

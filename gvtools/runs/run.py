@@ -283,13 +283,13 @@ def read_record(path: Path) -> dict[str, Any]:
         _Settings.model_validate(resolved_settings(record))
     except ValidationError as error:
         first = error.errors()[0]
-        raise _outdated(file, f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+        raise _version_error(file, f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise _outdated(file, repr(error)) from None
+        raise _version_error(file, repr(error)) from None
     return record
 
 
-def _outdated(file: Path, reason: str) -> ProjectError:
+def _version_error(file: Path, reason: str) -> ProjectError:
     return ProjectError(
         f"{file}: no record of a run of this version ({reason}); run reconstruct again"
     )

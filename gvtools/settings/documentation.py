@@ -58,7 +58,7 @@ def _sections(settings: Any, prefix: str = "", doc: str = "") -> Iterator[tuple[
             continue
         key, value = f"{prefix}{name}", getattr(settings, name, "(required)")
         if entry.section is None:
-            rows.append((key, shown(value), accepts(entry), entry))
+            rows.append((key, text_of(value), accepts(entry), entry))
         else:
             # What an absent section would hold.
             inner.append((key, entry.section() if value is None else value, entry.doc))
@@ -68,10 +68,10 @@ def _sections(settings: Any, prefix: str = "", doc: str = "") -> Iterator[tuple[
         yield from _sections(value, f"{key}.", doc)
 
 
-def shown(value: Any) -> str:
+def text_of(value: Any) -> str:
     """A value as it is given on the command line."""
     if isinstance(value, tuple):
-        return f"[{', '.join(map(shown, value))}]"
+        return f"[{', '.join(map(text_of, value))}]"
     named = {None: "none", True: "true", False: "false"}
     known = value is None or isinstance(value, bool)
     return named[value] if known else f"{value:g}" if isinstance(value, float) else str(value)

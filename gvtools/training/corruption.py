@@ -17,8 +17,6 @@ from gvtools.cameras import Cameras
 from gvtools.settings import Settings
 
 Float32 = NDArray[np.float32]
-
-
 Share = Annotated[float, Field(ge=0, le=1)]
 Strength = Annotated[float, Field(ge=0)]
 

@@ -156,7 +156,7 @@ class Trainer:
                 self.progress.seconds = before + time.monotonic() - begun
                 step = self.progress.step
                 if step % LOG_EVERY == 0 or step == last:
-                    means = self.processes.mean(_averaged(values))
+                    means = self.processes.mean(_means(values))
                     means |= {
                         "rate": self.options.rate_at(step - 1),
                         "skipped": float(self.progress.skipped),
@@ -233,10 +233,10 @@ class Trainer:
             values.append({"gradient_norm": norm})
         self.optimizer.zero_grad(set_to_none=True)
         self.progress.step += 1
-        return _averaged(values)
+        return _means(values)
 
 
-def _averaged(values: Sequence[dict[str, float]]) -> dict[str, float]:
+def _means(values: Sequence[dict[str, float]]) -> dict[str, float]:
     """Mean of every key over the records that have it."""
     names = {name for record in values for name in record}
     return {

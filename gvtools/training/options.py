@@ -18,8 +18,6 @@ from gvtools.training.corruption import GENTLE, CorruptionOptions
 
 # Trainings that ship; NAME_model.json beside one is a model's configuration of its own.
 SHIPPED = Path(__file__).parent / "configs"
-
-
 Share = Annotated[float, Field(ge=0, le=1)]
 Decay = Annotated[float, Field(ge=0, lt=1)]
 Count = Annotated[int, Field(ge=1)]

@@ -14,7 +14,6 @@ from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -22,7 +21,7 @@ from gvtools.cameras import Cameras
 from gvtools.completers.base import ContextView
 from gvtools.completers.geoverse.conditioning import ViewBatch
 from gvtools.completers.geoverse.flow import seeded_noise, view_seed
-from gvtools.completers.geoverse.views import view_batch
+from gvtools.completers.geoverse.views import resample_nearest, view_batch
 from gvtools.completers.surface_fill import surface_fill
 from gvtools.errors import ShapeError
 from gvtools.guidance import Guidance
@@ -148,7 +147,8 @@ def make_sample(
         views, cameras = view_batch(observation.views, guidance, size, fill=over)
     order = [*context, *targets]
     true_depth = torch.from_numpy(truth.depth[order])[:, None]
-    unit = _mean_known([_at_size(view.depth, size) for view in observation.views])
+    observed = [view.depth for view in observation.views if view.depth is not None]
+    unit = _mean_known([resample_nearest(depth, size).numpy() for depth in observed])
     unit = unit or _mean_known([truth.depth[list(context)]]) or 1.0
     # The batch's own unit is one of its cameras; here lengths are in one of depth.
     factor = 1 / (_mean_known([views.depth[0, : len(context)].numpy()]) or 1.0)
@@ -186,21 +186,12 @@ def _one_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def _at_size(depth: Float32 | None, size: tuple[int, int]) -> Float32:
-    """(1, 1, h, w) depth under the model's pixel centres; nothing where there is none."""
-    if depth is None:
-        return np.zeros((1, 1, 0, 0), np.float32)
-    return F.interpolate(
-        torch.from_numpy(depth)[None, None], size=size, mode="nearest-exact"
-    ).numpy()
-
-
 def _mean_known(depths: Sequence[Float32]) -> float:
     """Mean of all depth above 0; 0 where there is none.
 
     Not by torch, whose sums depend on the number of threads in their last digit.
     """
-    known = np.concatenate([depth[depth > 0] for depth in depths]).astype(np.float64)
+    known = np.concatenate([np.zeros(0), *(depth[depth > 0] for depth in depths)])
     return float(known.mean()) if known.size else 0.0
 
 
@@ -237,9 +228,6 @@ class TrainingBatch:
     # how often what happened when its samples were drawn
     notes: Mapping[str, int] = field(default_factory=dict)
 
-    def __len__(self) -> int:
-        return len(self.images)
-
     @property
     def true_views(self) -> ViewBatch:
         """The same views with true pictures and depth everywhere."""
@@ -275,10 +263,6 @@ class TrainingBatch:
         """(B, V, 3) true camera centres in the frame of the first view."""
         rotation, translation = self.relative[..., :3, :3], self.relative[..., :3, 3:]
         return -(rotation.mT @ translation)[..., 0].to(self.images.dtype)
-
-    def samples(self, index: Tensor) -> TrainingBatch:
-        """Some samples of the batch, without its notes."""
-        return TrainingBatch(self.views.samples(index), self.images[index], self.depth[index])
 
     def to(self, device: torch.device | str) -> TrainingBatch:
         """On another device."""

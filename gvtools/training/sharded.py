@@ -49,9 +49,9 @@ class Sharded(Replicated):
             register_fsdp_forward_method(teacher, "velocity1")
         for model in models:
             _move_rest(model, self.processes.device)
-        self.about = self._described([self.stage, *teachers, *networks.values()])
+        self.about = self._shares([self.stage, *teachers, *networks.values()])
 
-    def _described(self, modules: Iterable[nn.Module]) -> str:
+    def _shares(self, modules: Iterable[nn.Module]) -> str:
         parameters = [p for module in modules for p in module.parameters()]
         shared = [p for p in parameters if isinstance(p, DTensor)]
         own = sum(p.to_local().numel() for p in shared)

@@ -289,8 +289,8 @@ def log_error(depth: Tensor, truth: Tensor, judged: Tensor) -> Tensor:
     return masked_mean(error.abs(), judged)
 
 
-# Completions of so many samples are kept; of 8 views at 96 x 96 that is 1 GB.
-KEPT = 3072
+# Completions of so many samples are cached; of 8 views at 96 x 96 that is 1 GB.
+CACHED = 3072
 # A view with fewer pixels to generate does not count.
 FEWEST = 16
 # Squared error below which a view's errors are no longer counted up.
@@ -317,7 +317,7 @@ class RefinerStage(Stage):
                 "its configuration, such as tiny"
             )
         super().__init__(model, options)
-        self._kept: dict[bytes, tuple[Tensor, Tensor]] = {}
+        self._cache: dict[bytes, tuple[Tensor, Tensor]] = {}
 
     def learning_parts(self) -> Iterable[nn.Module | None]:
         """The refiner."""
@@ -359,40 +359,38 @@ class RefinerStage(Stage):
     def _completions(self, views: ViewBatch) -> tuple[Tensor, Tensor]:
         """Pictures (B, T, 3, H, W) and depth (B, T, H, W) of the core, made once a sample."""
         keys = [_key(image, views.context) for image in views.images]
-        fresh = [row for row, key in enumerate(keys) if key not in self._kept]
-        made = {}
+        fresh = [row for row, key in enumerate(keys) if key not in self._cache]
+        pairs = {}
         if fresh:
             rows = torch.tensor(fresh, device=views.images.device)
             names = [
                 [f"{keys[row].hex()} {view}" for view in range(views.images.shape[1])]
                 for row in fresh
             ]
-            rgb, depth = self._made(views.samples(rows), names)
-            made = {keys[row]: (rgb[i], depth[i]) for i, row in enumerate(fresh)}
-            room = max(0, KEPT - len(self._kept))
-            for key in list(made)[:room]:
-                self._kept[key] = (made[key][0].half().cpu(), made[key][1].half().cpu())
-        found = [made.get(key) or self._kept[key] for key in keys]
+            rgb, depth = self._generate(views.samples(rows), names)
+            # Rounded, whether from the cache or not.
+            pairs = {keys[row]: (rgb[i].half(), depth[i].half()) for i, row in enumerate(fresh)}
+            for key in list(pairs)[: max(0, CACHED - len(self._cache))]:
+                self._cache[key] = (pairs[key][0].cpu(), pairs[key][1].cpu())
         device = views.images.device
-        # Rounded, whether kept or just made.
-        rgb, depth = (
-            torch.stack([pair[i].half().float().to(device) for pair in found]) for i in (0, 1)
-        )
+        chosen = [pairs.get(key) or self._cache[key] for key in keys]
+        rgb, depth = (torch.stack([pair[i].float().to(device) for pair in chosen]) for i in (0, 1))
         return rgb, depth
 
-    def _made(self, views: ViewBatch, names: list[list[str]]) -> tuple[Tensor, Tensor]:
+    def _generate(self, views: ViewBatch, names: list[list[str]]) -> tuple[Tensor, Tensor]:
         """As ``_completions``, by the model."""
         model, context = self.model, views.context
         training = model.training
         model.eval()
-        found = model.generate(views, names=names, bounds=(1.0, 0.0), targets_alone=True)
-        found = remove_seams(found, model.config.patch)
+        generated = model.generate(views, names=names, bounds=(1.0, 0.0), targets_alone=True)
+        generated = remove_seams(generated, model.config.patch)
         model.train(training)
-        assert found.hint is not None
-        shown = fill_holes(views, model.config.hints)
-        rgb, _ = compose(shown, found.decoded, found.hint)
-        known, valid = (values[:, context:].flatten(0, 1) for values in (shown.depth, shown.valid))
-        first, second = (d.depth.flatten(0, 1)[:, None] for d in (found.decoded, found.hint))
+        decoded, hint = generated.decoded, generated.hint
+        assert hint is not None
+        hints = fill_holes(views, model.config.hints)
+        rgb, _ = compose(hints, decoded, hint)
+        known, valid = (values[:, context:].flatten(0, 1) for values in (hints.depth, hints.valid))
+        first, second = (each.depth.flatten(0, 1)[:, None] for each in (decoded, hint))
         depth = correct_depth(known, first, second, valid=valid)
         return rgb.clamp(0, 1), depth.unflatten(0, rgb.shape[:2])[:, :, 0]
 

@@ -9,11 +9,10 @@ from typing import Any, Literal, Protocol
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras, concatenate
-from gvtools.completers.geoverse.views import resample
+from gvtools.completers.geoverse.views import crop_to_aspect, resample, resample_nearest
 from gvtools.errors import DegenerateError, GvError, ProjectError
 from gvtools.procedural.layouts import scene
 from gvtools.procedural.paths import camera_path
@@ -375,17 +374,12 @@ def reduced_view(view: View, size: tuple[int, int]) -> SampleView:
     out has no depth.
     """
     frame = view.load()
-    height, width = frame.rgb.shape[:2]
-    aspect = size[0] / size[1]
-    rows = min(height, max(1, round(width * aspect)))
-    columns = min(width, max(1, round(height / aspect)))
-    top, left = (height - rows) // 2, (width - columns) // 2
-    window = np.s_[top : top + rows, left : left + columns]
-    depth = np.zeros((height, width), np.float32) if frame.depth is None else frame.depth
+    window, camera = crop_to_aspect(view.camera, size[0] / size[1])
+    depth = np.zeros(frame.rgb.shape[:2], np.float32) if frame.depth is None else frame.depth
     depth = np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
     if frame.mask is not None:
         depth = np.where(frame.mask, depth, np.float32(0))
-    camera = view.camera.cropped(left, top, width=columns, height=rows)
+    rows, columns = int(camera.height[0]), int(camera.width[0])
     factor = max(1, min(DETAIL, rows // size[0], columns // size[1]))
     parts = [
         _resized(frame.rgb[window], depth[window], camera, size=(size[0] * times, size[1] * times))
@@ -403,11 +397,8 @@ def _resized(
     """A clip of one view: filtered colours, and the depth of the pixel under each centre."""
     picture = torch.from_numpy(np.ascontiguousarray(rgb)).permute(2, 0, 1)[None].float()
     picture = resample(picture, size)[0].permute(1, 2, 0).round().clamp(0, 255)
-    lengths = torch.from_numpy(np.ascontiguousarray(depth))[None, None]
-    lengths = F.interpolate(lengths, size=size, mode="nearest-exact")[0]
-    return Clip(
-        picture.to(torch.uint8).numpy()[None], lengths.numpy(), camera.resized(size[1], size[0])
-    )
+    lengths = resample_nearest(depth, size).numpy()
+    return Clip(picture.to(torch.uint8).numpy()[None], lengths, camera.resized(size[1], size[0]))
 
 
 def concatenate_clips(clips: Sequence[Clip]) -> Clip:

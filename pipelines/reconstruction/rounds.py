@@ -262,9 +262,9 @@ def fuse_context(
         scene, plan.context, plan.source,
         folder=folder, unfinished=True, fallback=_depth_from_memory(plan, memory),
     )  # fmt: skip
-    if cache.kept:
+    if cache.file_count:
         console.line(
-            f"taking over the depth of {cache.kept} of {len(plan.context)} context views, "
+            f"taking over the depth of {cache.file_count} of {len(plan.context)} context views, "
             "which an interrupted attempt at this run had computed"
         )
     total, scan = FuseReport(), None

@@ -164,7 +164,7 @@ class _Careless(Completer):
     [
         ("changed", "changed colours where the guidance is valid"),
         ("not finite", "depth holds NaN or infinity"),
-        ("too few", "expected .* like the guidance"),
+        ("too few", r"careless: depth \(1, 4, 8\); expected \(1, 6, 8\)"),
         ("nothing", "returned a NoneType; expected a Completion"),
     ],
 )
@@ -213,8 +213,10 @@ def test_none_passes_valid_pixels_and_leaves_the_rest_empty():
 
 def test_shapes_that_do_not_fit_are_refused():
     image = np.zeros((6, 8, 3), np.float32)
-    with pytest.raises(ShapeError, match="expected one camera"):
+    with pytest.raises(ShapeError, match=r"view a: rgb \(6, 8, 3\); expected \(6, 9, 3\)"):
         ContextView("a", _camera(9), image)
+    with pytest.raises(ShapeError, match="2 cameras; expected one"):
+        ContextView("a", _camera()[[0, 0]], image)
     with pytest.raises(ShapeError, match="depth"):
         ContextView("a", _camera(), image, np.zeros((6, 7), np.float32))
     with pytest.raises(ShapeError, match="completion"):

@@ -14,8 +14,6 @@ from gvtools.settings import with_values
 from pipelines.reconstruction.settings import RunSettings
 
 HEIGHT, WIDTH = 60, 80
-
-
 OWN = ScaleAlignment(ScaleStatus.CAMERA_CENTRES)
 
 

@@ -22,8 +22,6 @@ from gvtools.networks.depth_anything.rays import (
 )
 
 SIZE = (84, 112)
-
-
 GRID = (24, 32)
 
 
@@ -246,8 +244,6 @@ def test_rays_that_hold_no_camera():
 
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-
-
 TOLD = HintConfig(cameras=True, camera_unit="depth")
 
 

@@ -25,8 +25,6 @@ from pipelines.cli import main
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 SHORT = ["--device", "cpu", "--sheets", "0", "--quiet"]
-
-
 SAMPLES: list[str] = []
 
 

@@ -134,8 +134,8 @@ def training_batch() -> TrainingBatch:
 def test_it_completes_a_sample_once_and_learns_from_it(stage):
     batch = training_batch()
     calls = []
-    made = stage._made
-    stage._made = lambda views, names: calls.append(len(names)) or made(views, names)
+    made = stage._generate
+    stage._generate = lambda views, names: calls.append(len(names)) or made(views, names)
     assert {name.split(".")[1] for name, p in stage.named_parameters() if p.requires_grad} == {
         "refiner"
     }
@@ -155,7 +155,7 @@ def test_it_completes_a_sample_once_and_learns_from_it(stage):
 
 def test_what_is_kept_is_what_is_made(stage):
     batch = training_batch()
-    stage._kept.clear()
+    stage._cache.clear()
     fresh = stage._completions(batch.views)
     kept = stage._completions(batch.views)
     turned = stage._completions(batch.views.samples(torch.tensor([1, 0])))

@@ -191,7 +191,7 @@ class GeoVerseCompleter(Completer):
                 nothing = (ScaleAlignment(ScaleStatus.NOTHING_TO_COMPLETE),) * len(complete)
                 rays = camera_rays(guidance.cameras[complete], known.depth.shape)
                 yield complete, replace(known, rays=rays, scale_alignment=nothing, whole=whole)
-            filled = self._filled(context, guidance.select(incomplete)) if incomplete else None
+            filled = self._fill_holes(context, guidance.select(incomplete)) if incomplete else None
             for first in range(0, len(incomplete), targets_per_pass):
                 rows = incomplete[first : first + targets_per_pass]
                 part = guidance.select(rows)
@@ -204,7 +204,7 @@ class GeoVerseCompleter(Completer):
 
         return Completion.joined(parts(), guidance.cameras)
 
-    def _filled(self, context: Sequence[ContextView], guidance: Guidance) -> Filled | None:
+    def _fill_holes(self, context: Sequence[ContextView], guidance: Guidance) -> Filled | None:
         """Fill of the holes that the model gets as hint; None if the model fills them itself."""
         if self.config.hints.fill != "surfaces":
             return None

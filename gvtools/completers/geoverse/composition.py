@@ -65,13 +65,13 @@ def without_seams(values: Tensor, patch: int) -> Tensor:
 def remove_seams(made: Generated, patch: int) -> Generated:
     """A pass whose pictures are ``without_seams``."""
 
-    def joined(found: Decoded) -> Decoded:
+    def smooth(found: Decoded) -> Decoded:
         shape = found.rgb.shape[:2]
         rgb = without_seams(found.rgb.float().flatten(0, 1), patch).unflatten(0, shape)
         return replace(found, rgb=rgb)
 
-    hint = None if made.hint is None else joined(made.hint)
-    return replace(made, decoded=joined(made.decoded), hint=hint)
+    hint = None if made.hint is None else smooth(made.hint)
+    return replace(made, decoded=smooth(made.decoded), hint=hint)
 
 
 def correct_color(filled: Tensor, made: Tensor, hint: Tensor, *, valid: Tensor) -> Tensor:

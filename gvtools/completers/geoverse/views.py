@@ -100,12 +100,12 @@ def view_batch(
     height, width = int(targets.cameras.height[0]), int(targets.cameras.width[0])
     pictures, depths, cameras = [], [], []
     for view in context:
-        picture, observed, camera = _cropped(view, height / width)
+        picture, observed, camera = _crop(view, height / width)
         image = torch.from_numpy(np.ascontiguousarray(picture)).permute(2, 0, 1)[None].float()
         pictures.append(resample(image, size)[0].clamp(0, 1))
-        depths.append(_nearest(observed, size))
+        depths.append(resample_nearest(observed, size))
         cameras.append(camera.resized(size[1], size[0]))
-    rgb, projected, valid = _reduced(targets, size)
+    rgb, projected, valid = _reduce(targets, size)
     if fill is not None:
         rgb, projected = _over(rgb, projected, valid, fill=fill)
     cameras.append(targets.cameras.resized(size[1], size[0]))
@@ -147,21 +147,25 @@ def context_depth(
 ) -> NDArray[np.float32]:
     """(C, H, W) known depth of the context as ``view_batch`` crops it, scene units; 0 = none."""
     aspect = int(targets.cameras.height[0]) / int(targets.cameras.width[0])
-    depths = [_nearest(_cropped(view, aspect)[1], size)[0].numpy() for view in context]
+    depths = [resample_nearest(_crop(view, aspect)[1], size)[0].numpy() for view in context]
     return np.stack(depths).astype(np.float32)
 
 
-def _cropped(
-    view: ContextView, aspect: float
-) -> tuple[NDArray[np.float32], NDArray[np.float32], Cameras]:
-    """The middle of a view, height / width near ``aspect``."""
-    height, width = view.rgb.shape[:2]
+def crop_to_aspect(camera: Cameras, aspect: float) -> tuple[tuple[slice, slice], Cameras]:
+    """The middle of a picture, height / width near ``aspect``: rows and columns, and its camera."""
+    height, width = int(camera.height[0]), int(camera.width[0])
     rows = min(height, max(1, round(width * aspect)))
     columns = min(width, max(1, round(height / aspect)))
     top, left = (height - rows) // 2, (width - columns) // 2
     window = np.s_[top : top + rows, left : left + columns]
-    depth = np.zeros((height, width), np.float32) if view.depth is None else view.depth
-    camera = view.camera.cropped(left, top, width=columns, height=rows)
+    return window, camera.cropped(left, top, width=columns, height=rows)
+
+
+def _crop(
+    view: ContextView, aspect: float
+) -> tuple[NDArray[np.float32], NDArray[np.float32], Cameras]:
+    window, camera = crop_to_aspect(view.camera, aspect)
+    depth = np.zeros(view.rgb.shape[:2], np.float32) if view.depth is None else view.depth
     return view.rgb[window], depth[window], camera
 
 
@@ -183,13 +187,13 @@ def _evidence(fill: Filled, context: int, size: tuple[int, int]) -> Tensor:
     return torch.cat((evidence.new_zeros((context, 2, *size)), evidence))[None]
 
 
-def _nearest(depth: NDArray[np.float32], size: tuple[int, int]) -> Tensor:
+def resample_nearest(depth: NDArray[np.float32], size: tuple[int, int]) -> Tensor:
     """(H, W) to (1, h, w), the pixel under each cell's centre."""
     image = torch.from_numpy(np.ascontiguousarray(depth)).float()[None, None]
     return F.interpolate(image, size=size, mode="nearest-exact")[0]
 
 
-def _reduced(targets: Guidance, size: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
+def _reduce(targets: Guidance, size: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
     """Colour (T, 3, h, w), depth (T, 1, h, w) and validity (T, 1, h, w) of projections."""
     # Chosen, not multiplied: a NaN in a hole stays there.
     rgb, depth = (

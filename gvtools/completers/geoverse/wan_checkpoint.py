@@ -105,7 +105,7 @@ def truncate(
         for component in COMPONENTS:
             (temporary / component).mkdir(parents=True)
         _write_json(temporary / "transformer" / "config.json", config)
-        for done in _written(temporary / "transformer", files, sizes, dtype=dtype):
+        for done in _write(temporary / "transformer", files, sizes, dtype=dtype):
             progress(done, needed)
         for path in copied:
             shutil.copyfile(path, temporary / "vae" / path.name)
@@ -126,7 +126,7 @@ def _vae_files(folder: Path) -> list[Path]:
     return sorted({folder / "config.json", *files.paths, *folder.glob(f"*{INDEX}")})
 
 
-def _written(
+def _write(
     folder: Path, source: TensorFiles, sizes: Mapping[str, int], *, dtype: torch.dtype
 ) -> Iterator[int]:
     """Writes the tensors, part by part, and gives the bytes that are done."""

@@ -127,8 +127,6 @@ def test_autocast_and_half_precision_leave_the_map_in_single():
 
 
 PICTURE = (84, 112)
-
-
 GRID = (3, 4)
 
 

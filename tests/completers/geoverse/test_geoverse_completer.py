@@ -71,8 +71,6 @@ def watched(monkeypatch: pytest.MonkeyPatch) -> list[tuple[ViewBatch, Any, Gener
 
 
 FIELDS = ("rgb", "depth", "valid", "confidence", "generated")
-
-
 SIZES = [(30, 40), (24, 32), (17, 23), (9, 7), (64, 31), (1, 40), (100, 133)]
 
 
@@ -184,7 +182,6 @@ def test_a_photograph_and_a_target_of_one_name_start_from_different_noise(weight
 
 
 TURN = micro.rotation((0.3, 1.0, -0.4), 2.0)
-
 
 WORLDS: dict[str, dict[str, Any]] = {
     "kilometres": {"scale": 1e-3},
@@ -437,14 +434,6 @@ def weights(tmp_path_factory) -> Path:
     return micro.weights_folder(tmp_path_factory.mktemp("weights") / "micro")
 
 
-@pytest.fixture(scope="module")
-def whole(scan, weights, tmp_path_factory) -> Path:
-    """An uninterrupted run of two rounds after the photographs' own."""
-    out = tmp_path_factory.mktemp("runs") / "whole"
-    assert reconstruct(scan, weights, out) == 0
-    return out
-
-
 def reconstruct(scan: Path, weights: Path, out: Path, *words: str) -> int:
     """Exit status of the command."""
     given = ("--completer", "geoverse", "--set", f"completer.weights={weights}", "--quiet")
@@ -453,79 +442,17 @@ def reconstruct(scan: Path, weights: Path, out: Path, *words: str) -> int:
     )
 
 
-def test_a_dry_run_says_what_it_would_do_and_computes_nothing(
-    scan, weights, tmp_path, capsys, monkeypatch
-):
-    def called(*args, **options):
-        raise AssertionError("a dry run completes nothing")
-
-    monkeypatch.setattr(GeoVerseCompleter, "complete", called)
-    given = ("--completer", "geoverse", "--set", f"completer.weights={weights}", "--dry-run")
-    assert (
-        main(
-            [
-                "reconstruct",
-                str(scan),
-                "--refine",
-                "0",
-                "--out",
-                str(tmp_path / "run"),
-                *OPTIONS,
-                *given,
-            ]
-        )
-        == 0
-    )
-    said = capsys.readouterr().out
-    assert "geoverse" in said and "dry run" in said
-    assert not (tmp_path / "run").exists()
-
-
-def test_a_run_ends_with_its_files(whole):
-    assert {"run.json", "rounds.jsonl", "metrics.json", "memory.npz"} <= {
-        path.name for path in whole.iterdir()
-    }
+def test_a_run_names_its_weights_and_resumes_to_the_same_bytes(scan, weights, tmp_path):
+    whole, out = tmp_path / "whole", tmp_path / "run"
+    assert reconstruct(scan, weights, whole) == 0
     rounds = untimed(whole)
     assert [entry["round"] for entry in rounds] == [0, 1, 2]
-    for number in range(3):
-        assert (whole / f"round_{number:03d}" / "report.json").is_file()
     assert len(SpatialMemory.load(whole / "memory.npz")) == rounds[-1]["points"] > 0
     assert len(json.loads((whole / "run.json").read_text(encoding="utf-8"))["weights"]) == 64
-
-
-def lose_the_last_round(scan: Path, weights: Path, out: Path, whole: Path) -> None:
-    """A finished run without its last round's folder."""
     shutil.copytree(whole, out)
     shutil.rmtree(out / "round_002")
-
-
-def stop_in_the_last_round(scan: Path, weights: Path, out: Path, whole: Path) -> None:
-    """A run that is interrupted when its last round is to be completed."""
-    complete = GeoVerseCompleter.complete
-    calls = []
-
-    def stopping(self, *args, **options):
-        calls.append(self)
-        if len(calls) == 2:
-            raise KeyboardInterrupt
-        return complete(self, *args, **options)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(GeoVerseCompleter, "complete", stopping)
-        assert reconstruct(scan, weights, out) == 1
-    assert (out / "round_001").is_dir() and not (out / "round_002").exists()
-
-
-@pytest.mark.parametrize("stop", [lose_the_last_round, stop_in_the_last_round])
-def test_resuming_after_a_stop_between_rounds_gives_the_same_bytes(
-    whole, scan, weights, tmp_path, capsys, stop
-):
-    out = tmp_path / "run"
-    stop(scan, weights, out, whole)
-    capsys.readouterr()
     assert reconstruct(scan, weights, out, "--resume") == 0
-    assert results(out) == results(whole)
-    assert untimed(out) == untimed(whole)
+    assert results(out) == results(whole) and untimed(out) == rounds
 
 
 def test_changed_weights_refuse_to_resume(scan, tmp_path, capsys):

@@ -92,8 +92,6 @@ def test_views_decoded_at_once_change_the_memory_alone(monkeypatch):
 
 
 TABLE = Path(__file__).parents[3] / "docs" / "concepts" / "hyperparameters.md"
-
-
 GLD_GRID = re.compile(r"49 steps of `(gld_time_grid\(50, shift=([\d.]+)\))`")
 
 

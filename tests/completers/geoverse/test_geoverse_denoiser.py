@@ -86,23 +86,6 @@ def test_a_fresh_extension_changes_no_bit(name, autocast):
 
 
 @torch.no_grad()
-def test_extensions_that_are_not_fresh_change_the_result():
-    base = micro.denoiser(BARE)
-    x, t, known = micro.conditions()
-    expected = base(x, t, known)
-    net = extended(base)
-    micro.awake(net.depth_embedder)
-    assert (net(x, t, known) - expected).abs().max() > 0.01
-    net = extended(base)
-    features = micro.video_features(*x.shape[:2]).tensors
-    positions = Positions(net.config, known.camera, micro.GRID)
-    branch = micro.awake(control_branch(net))
-    adapted = branch.adapted(features, micro.GRID)
-    residuals = branch(net, x, t, known, adapted=adapted, positions=positions)
-    assert (net(x, t, known, residuals=residuals) - expected).abs().max() > 0.01
-
-
-@torch.no_grad()
 def test_depth_reaches_every_view_through_its_embedder_alone():
     net = micro.denoiser()
     x, t, known = micro.conditions()

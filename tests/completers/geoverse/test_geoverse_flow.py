@@ -10,17 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gvtools.completers.geoverse.flow import (
-    GLD_END,
     check_bounds,
     clean_from_velocity,
     fast_loss,
-    gld_time_grid,
     guide,
     interpolate,
     interval_bounds,
     interval_ends,
     interval_times,
-    latent_shift,
     reflow_pair,
     sample,
     seeded_noise,
@@ -36,8 +33,6 @@ from gvtools.completers.geoverse.objective import flow_matching_loss
 from gvtools.errors import OptionError
 
 SHAPE = (2, 3, 4, 2, 3)
-
-
 SHIFTS = st.floats(0.05, 100)
 
 
@@ -78,13 +73,6 @@ def test_default_bounds_are_bounds_and_equally_long_before_the_shift(count, shif
     assert bounds[0] == 1 and bounds[-1] == 0
     before = [unshift_time(tau, shift) for tau in bounds]
     np.testing.assert_allclose(np.diff(before), -1 / count, atol=1e-9)
-
-
-def test_glds_grid_ends_with_noise_left():
-    shift = latent_shift(1536 * 18 * 18 * 8)
-    grid = gld_time_grid(50, shift=shift)
-    assert len(grid) == 50
-    assert grid[-1] == shift_time(GLD_END, shift) == pytest.approx(0.0303, abs=1e-4)
 
 
 def test_a_grid_may_cover_a_part_of_time():
@@ -187,8 +175,6 @@ def test_guidance_moves_away_from_the_unconditional_velocity():
 
 
 NAMES = ["a", "b", "c", "d"]
-
-
 GRID = (5, 4, 6)
 
 
@@ -228,8 +214,6 @@ def test_the_device_changes_no_draw():
 
 
 BOUNDS = (1.0, 0.75, 0.25, 0.0)
-
-
 LATENTS = (3, 2, 4, 2, 2)
 
 
@@ -237,22 +221,6 @@ def _latents(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
     generator = torch.Generator().manual_seed(seed)
     clean, noise = torch.randn(2, *LATENTS, generator=generator, dtype=torch.float64)
     return clean, noise
-
-
-@settings(deadline=None)
-@given(
-    st.lists(st.floats(0.01, 0.99), min_size=1, max_size=5, unique_by=lambda x: round(x, 4)),
-    st.integers(0, 2**32),
-)
-def test_drawn_times_lie_in_their_intervals(inner, seed):
-    bounds = (1.0, *sorted(inner, reverse=True), 0.0)
-    generator = torch.Generator().manual_seed(seed)
-    which, share = torch.rand(2, 64, generator=generator)
-    intervals, t = interval_times(which, share, bounds)
-    upper, lower = interval_ends(intervals, bounds)
-    assert bool(((t <= upper.float()) & (t >= lower.float())).all())
-    eta = (t.double() - lower) / (upper - lower)
-    assert bool(((eta >= -1e-4) & (eta <= 1 + 1e-4)).all())
 
 
 def test_intervals_are_drawn_equally_often_and_times_uniformly():

@@ -21,8 +21,6 @@ from gvtools.completers.geoverse.video_injection import (
 from gvtools.errors import OptionError
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-
-
 LAYERS = micro.LAYERS
 
 
@@ -160,8 +158,6 @@ def test_layers_that_the_denoiser_does_not_have_are_refused(injection, layers):
 
 
 HEADS = micro.DENOISER.heads
-
-
 HEAD_DIM = micro.DENOISER.width // HEADS
 
 

@@ -165,22 +165,16 @@ def test_files_are_read_as_the_library_reads_them(tmp_path: Path) -> None:
 
 
 def tensors_changed(file: Path, change: Callable[[dict[str, Tensor]], Any]) -> None:
-    if file.suffix == ".safetensors":
-        tensors = load_file(file)
-        change(tensors)
-        save_file(tensors, file)
-        return
     content = torch.load(file)
-    change(content.get("ema", content))
+    change(content["ema"])
     torch.save(content, file)
 
 
 LAYER = "blocks.1.attn.qkv.weight"
 
-
 DAMAGES: dict[str, tuple[Callable[[dict[str, Tensor]], Any], str]] = {
     "missing": (lambda t: [t.pop(LAYER), t.pop("blocks.1.attn.qkv.bias")], f"missing: {LAYER}"),
-    "extra": (lambda t: t.update(extra=torch.zeros(2)), "unexpected: extra$"),
+    "extra": (lambda t: t.update(extra=torch.zeros(2)), "unexpected: extra"),
     "renamed": (lambda t: t.update(other=t.pop(LAYER)), f"missing: {LAYER}; unexpected: other"),
     "shape": (
         lambda t: t.update({LAYER: t[LAYER][:, 1:].clone()}),
@@ -203,25 +197,9 @@ DAMAGES: dict[str, tuple[Callable[[dict[str, Tensor]], Any], str]] = {
 def test_a_published_file_with_wrong_tensors_is_refused(folder: Path, damage: str) -> None:
     change, message = DAMAGES[damage]
     tensors_changed(folder / LEVEL1, change)
-    said = refused(folder, message.removesuffix("$"))
+    said = refused(folder, message)
     assert "da3_level1.pt" in said
     assert [part.name for part in check_folder(folder) if not part.ok] == ["level1"]
-
-
-@pytest.mark.parametrize("damage", ["missing", "extra", "shape", "nan", "integers"])
-def test_a_folder_of_ones_own_with_wrong_tensors_is_refused(own: Path, damage: str) -> None:
-    change, message = DAMAGES[damage]
-
-    def changed(tensors: dict[str, Tensor]) -> None:
-        inner = {n.removeprefix("level1."): t for n, t in tensors.items() if n.startswith("level1")}
-        others = {n: t for n, t in tensors.items() if not n.startswith("level1")}
-        change(inner)
-        tensors.clear()
-        tensors.update({**others, **{f"level1.{n}": t for n, t in inner.items()}})
-
-    tensors_changed(own / WHOLE_FILE, changed)
-    message = message.removesuffix("$").replace(LAYER, f"level1.{LAYER}")
-    assert WHOLE_FILE in refused(own, message.replace(": extra", ": level1.extra"))
 
 
 def test_a_name_that_is_there_twice_is_refused(folder: Path) -> None:
@@ -311,33 +289,6 @@ def test_other_contents_of_a_pytorch_file_are_refused(folder: Path) -> None:
         refused(folder, message)
     torch.save({"ema": tensors}, folder / LEVEL1, _use_new_zipfile_serialization=False)
     refused(folder, r"since PyTorch 1\.6")
-
-
-@pytest.mark.parametrize("file", [STATISTICS[0], Path("a.safetensors")], ids=lambda f: f.suffix)
-def test_no_damage_ends_in_another_error(folder: Path, file: Path) -> None:
-    """Every ending, and random bytes: either it is read, or the error is our own."""
-    from gvtools.networks.tensors import read_tensors
-
-    path = folder / file
-    if file.suffix == ".safetensors":
-        save_file({"a": torch.randn(5), "b": torch.randn(2, 3).half()}, path)
-    whole = path.read_bytes()
-    generator = torch.Generator().manual_seed(0)
-    variants = [whole[:end] for end in range(0, len(whole), max(1, len(whole) // 60))]
-    for _ in range(150):
-        changed = bytearray(whole)
-        for place in torch.randint(len(whole), (2,), generator=generator).tolist():
-            changed[place] ^= int(torch.randint(1, 256, (1,), generator=generator))
-        variants.append(bytes(changed))
-    refusals = 0
-    for variant in variants:
-        path.write_bytes(variant)
-        try:
-            read_tensors(path)
-        except CheckpointError as error:
-            refusals += 1
-            assert "\n" not in str(error)
-    assert refusals >= 60
 
 
 @pytest.mark.parametrize("file", published.FILES, ids=lambda f: f.name)
