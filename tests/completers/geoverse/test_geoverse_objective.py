@@ -94,7 +94,7 @@ def test_missing_targets_are_counted_and_give_zero_within_the_graph():
     }
     weights = LossWeights(level1=0, level0=0)
     found = objective(predicted, reference, context=CONTEXT, weights=weights)
-    assert float(found.total) == 0 and found.total.requires_grad
+    assert found.total.item() == 0 and found.total.requires_grad
     found.total.backward()
     for name in ("image", "depth"):
         gradient = predicted[name].grad
