@@ -157,7 +157,7 @@ def test_a_resumed_training_is_the_uninterrupted_one(trained, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("before", "stage"), pairwise(COUNTS))
+@pytest.mark.parametrize(("before", "stage"), [*pairwise(COUNTS)])
 def test_a_later_stage_resumes_exactly_as_well(trained, tmp_path, before, stage):
     count = COUNTS[stage]
     shutil.copytree(trained / before, tmp_path / before)
