@@ -31,8 +31,8 @@ GPS_LATITUDE, GPS_LONGITUDE, GPS_ALTITUDE = 2, 4, 6
 # Quality of a JPEG that had to be turned.
 JPEG_QUALITY = 97
 # Pictures that cameras write and Pillow does not read.
-FOREIGN = (".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf",
-           ".rw2")  # fmt: skip
+HEIF = (".heic", ".heif", ".avif")
+RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
 # Pictures are judged at this height, and one whose sharpness is below this share of the median's is
 # called blurred. [pixels]
 JUDGED_HEIGHT, BLURRED = 480, 0.15
@@ -58,7 +58,7 @@ def find_photographs(folder: Path) -> tuple[list[CapturedPhotograph], list[Findi
     """The readable, different pictures below a folder in natural order, and what was met."""
     files = {path.relative_to(folder).as_posix(): path for path in sorted(folder.rglob("*"))
              if not path.name.startswith(".")}  # fmt: skip
-    foreign = [name for name, path in files.items() if path.suffix.lower() in FOREIGN]
+    foreign = [name for name, path in files.items() if path.suffix.lower() in (*HEIF, *RAW)]
     names = [n for n, path in files.items() if path.suffix.lower() in PICTURES and path.is_file()]
     found: list[CapturedPhotograph] = []
     damaged: list[str] = []

@@ -124,16 +124,8 @@ class SceneBuilder:
         turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
         c, s = np.cos(tilt), np.sin(tilt)
         lean = np.array([[1.0, 0.0, 0.0], [0.0, c, s], [0.0, -s, c]])
-        self.solids.append(
-            (
-                kind,
-                lean @ turn,
-                np.asarray(centre, float),
-                np.asarray(half, float),
-                material,
-                shades,
-            )
-        )
+        corners = np.asarray(centre, float), np.asarray(half, float)
+        self.solids.append((kind, lean @ turn, *corners, material, shades))
         boxes = [(np.asarray(a, np.float64), np.asarray(b, np.float64)) for a, b in cuts]
         self.cutters.append(boxes)
         self.cutter_material += [material if cut_material is None else cut_material] * len(boxes)

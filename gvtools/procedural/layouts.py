@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,10 +24,9 @@ Float64 = NDArray[np.float64]
 def add_clutter(
     build: SceneBuilder, low: Float64, high: Float64, count: int, *, scale: float, palette: int
 ) -> None:
-    """Put things on the floor of a room.
+    """Put things on the floor of a room between two corners, (3,) each.
 
-    ``low``: (3,) lowest corner of the room. ``high``: (3,) highest corner. ``scale``: typical size
-    of a thing, metres. ``palette``: how many different materials they share.
+    They are about ``scale`` metres large, and share a palette of so many materials.
     """
     rng = build.rng
     materials = [build.material(scale * np.exp(rng.uniform(-0.7, 0.9))) for _ in range(palette)]
@@ -41,7 +41,8 @@ def add_clutter(
         thing = _THINGS[rng.choice(len(_THINGS), p=_CHANCES)]
         own = materials[rng.integers(palette)]
         other = materials[rng.integers(palette)]
-        thing(build, np.array([*place, low[2]]), size, own, other, high[2] - low[2])
+        foot = np.array([*place, low[2]])
+        thing(_Spot(build, rng, size, high[2] - low[2], own, other, foot))
 
 
 def _free_place(
@@ -59,59 +60,62 @@ def _free_place(
     return None
 
 
-def _above(foot: Float64, height: float, x: float = 0.0, y: float = 0.0) -> Float64:
-    """(3,) a place over a thing's foot, or beside that."""
-    return foot + np.array([x, y, height])
+class _Spot(NamedTuple):
+    """Where a thing stands, and what it is made of."""
+
+    build: SceneBuilder
+    rng: np.random.Generator
+    size: float  # metres
+    room: float  # up to the ceiling, metres
+    own: int  # its materials
+    other: int
+    foot: Float64  # (3,)
+
+    def above(self, height: float, x: float = 0.0, y: float = 0.0) -> Float64:
+        """(3,) a place over the foot, or beside that."""
+        return self.foot + np.array([x, y, height])
 
 
-def _box(
-    build: SceneBuilder, foot: Float64, size: float, own: int, other: int, room: float
-) -> None:
+def _box(at: _Spot) -> None:
     """A yawed box, now and then with a smaller one on it."""
-    rng = build.rng
+    build, rng, size, room, own, other = at[:6]
     half = 0.5 * size * np.exp(rng.uniform(-0.5, 0.4, 3))
     half[2] = min(half[2], 0.45 * room)
     yaw = rng.uniform(0, np.pi)
-    build.solid(BOX, _above(foot, half[2]), half, material=own, yaw=yaw)
+    build.solid(BOX, at.above(half[2]), half, material=own, yaw=yaw)
     if rng.random() < 0.4 and 3 * half[2] < room:
         top = 0.5 * half * rng.uniform(0.5, 1, 3)
-        where = _above(foot, 2 * half[2] + top[2], *rng.uniform(-0.3, 0.3, 2) * half[:2])
+        where = at.above(2 * half[2] + top[2], *rng.uniform(-0.3, 0.3, 2) * half[:2])
         build.solid(BOX, where, top, material=other, yaw=rng.uniform(0, np.pi))
 
 
-def _leaning(
-    build: SceneBuilder, foot: Float64, size: float, own: int, other: int, room: float
-) -> None:
+def _leaning(at: _Spot) -> None:
     """A box turned about two axes, standing in the floor or hanging in the air."""
-    rng = build.rng
+    build, rng, size, room, own, *_ = at
     half = 0.45 * size * np.exp(rng.uniform(-0.6, 0.3, 3))
     lift = rng.uniform(0.5, 1.4) * size if rng.random() < 0.6 else 0.6 * room
     build.solid(
-        BOX, _above(foot, min(lift, 0.8 * room)), half,
+        BOX, at.above(min(lift, 0.8 * room)), half,
         material=own, yaw=rng.uniform(0, np.pi), tilt=rng.uniform(-1, 1),
     )  # fmt: skip
 
 
-def _ball(
-    build: SceneBuilder, foot: Float64, size: float, own: int, other: int, room: float
-) -> None:
+def _ball(at: _Spot) -> None:
     """A ball or an ellipsoid, lying, hanging or standing on a post."""
-    rng = build.rng
+    build, rng, size, room, own, other = at[:6]
     half = 0.4 * size * (np.exp(rng.uniform(-0.3, 0.3, 3)) if rng.random() < 0.4 else np.ones(3))
     lift = half[2]
     if rng.random() < 0.4 and room > 4 * half[2]:
         lift = rng.uniform(2 * half[2], room - 1.5 * half[2])
         if rng.random() < 0.6:
             post = [0.2 * half[0], 0.2 * half[1], lift / 2]
-            build.solid(TUBE, _above(foot, lift / 2), post, material=other)
-    build.solid(BALL, _above(foot, lift), half, material=own, yaw=rng.uniform(0, np.pi))
+            build.solid(TUBE, at.above(lift / 2), post, material=other)
+    build.solid(BALL, at.above(lift), half, material=own, yaw=rng.uniform(0, np.pi))
 
 
-def _bowl(
-    build: SceneBuilder, foot: Float64, size: float, own: int, other: int, room: float
-) -> None:
+def _bowl(at: _Spot) -> None:
     """A ball with a box cut out of it: half of it, a quarter, or a slot through it."""
-    rng = build.rng
+    build, rng, size, _, own, other = at[:6]
     radius = 0.45 * size
     low, high = np.full(3, -2 * radius), np.full(3, 2 * radius)
     for axis in rng.permutation(3)[: rng.integers(1, 3)]:
@@ -120,28 +124,24 @@ def _bowl(
         if rng.random() < 0.3:
             high[axis] = cut + rng.uniform(0.3, 0.7) * radius
     build.solid(
-        BALL, _above(foot, radius), [radius] * 3, material=own, yaw=rng.uniform(0, np.pi),
+        BALL, at.above(radius), [radius] * 3, material=own, yaw=rng.uniform(0, np.pi),
         cuts=[(low, high)], cut_material=other,
     )  # fmt: skip
 
 
-def _post(
-    build: SceneBuilder, foot: Float64, size: float, own: int, other: int, room: float
-) -> None:
+def _post(at: _Spot) -> None:
     """A pillar up to the ceiling, or a drum."""
-    rng = build.rng
+    build, rng, size, room, own, *_ = at
     radius = size * rng.uniform(0.12, 0.3)
     height = room if rng.random() < 0.4 else min(size * rng.uniform(0.4, 1.6), room)
     kind = TUBE if rng.random() < 0.7 else BOX
     half = [radius, radius * rng.uniform(0.7, 1.3), height / 2]
-    build.solid(kind, _above(foot, height / 2), half, material=own, yaw=rng.uniform(0, np.pi))
+    build.solid(kind, at.above(height / 2), half, material=own, yaw=rng.uniform(0, np.pi))
 
 
-def _shelf(
-    build: SceneBuilder, foot: Float64, size: float, own: int, other: int, room: float
-) -> None:
+def _shelf(at: _Spot) -> None:
     """A case with compartments that are open in front, some with a thing in them."""
-    rng = build.rng
+    build, rng, size, room, own, other = at[:6]
     width, depth = size * rng.uniform(0.7, 1.3), size * rng.uniform(0.25, 0.45)
     height = min(size * rng.uniform(0.8, 1.8), 0.95 * room)
     board = 0.04 * size
@@ -161,19 +161,17 @@ def _shelf(
                 half[1] = min(half[1], 0.4 * depth)
                 local = np.array([(low[0] + high[0]) / 2, 0, z + half[2]])
                 c, s = np.cos(yaw), np.sin(yaw)
-                where = _above(foot, local[2] + height / 2, c * local[0], s * local[0])
+                where = at.above(local[2] + height / 2, c * local[0], s * local[0])
                 build.solid(BOX, where, half, material=other, yaw=yaw)
     build.solid(
-        BOX, _above(foot, height / 2), [width / 2, depth / 2, height / 2],
+        BOX, at.above(height / 2), [width / 2, depth / 2, height / 2],
         material=own, yaw=yaw, cuts=cuts,
     )  # fmt: skip
 
 
-def _table(
-    build: SceneBuilder, foot: Float64, size: float, own: int, other: int, room: float
-) -> None:
+def _table(at: _Spot) -> None:
     """A slab on four legs: a box with two tunnels that cross; smaller things stand on it."""
-    rng = build.rng
+    build, rng, size, room, own, other = at[:6]
     half = size * np.array([rng.uniform(0.5, 0.8), rng.uniform(0.35, 0.6), rng.uniform(0.25, 0.45)])
     half[2] = min(half[2], 0.4 * room)
     leg, top = 0.08 * size, 0.08 * size
@@ -183,34 +181,40 @@ def _table(
         ([-inner[0], -2 * half[1], -2 * half[2]], [inner[0], 2 * half[1], inner[2]]),
         ([-2 * half[0], -inner[1], -2 * half[2]], [2 * half[0], inner[1], inner[2]]),
     ]
-    build.solid(BOX, _above(foot, half[2]), half, material=own, yaw=yaw, cuts=cuts)
+    build.solid(BOX, at.above(half[2]), half, material=own, yaw=yaw, cuts=cuts)
     c, s = np.cos(yaw), np.sin(yaw)
     for _ in range(rng.integers(0, 4)):
         x, y = rng.uniform(-0.7, 0.7, 2) * half[:2]
         small = size * rng.uniform(0.06, 0.18, 3)
-        where = _above(foot, 2 * half[2] + small[2], c * x - s * y, s * x + c * y)
+        where = at.above(2 * half[2] + small[2], c * x - s * y, s * x + c * y)
         kind = (BOX, BALL, TUBE)[rng.integers(3)]
         build.solid(kind, where, small, material=other, yaw=rng.uniform(0, np.pi))
 
 
-def _arch(
-    build: SceneBuilder, foot: Float64, size: float, own: int, other: int, room: float
-) -> None:
+def _arch(at: _Spot) -> None:
     """A thick wall with an opening through it, to the ground or as a window."""
-    rng = build.rng
+    build, rng, size, room, own, other = at[:6]
     half = 0.5 * size * np.array([rng.uniform(0.9, 1.6), rng.uniform(0.15, 0.4), 1.5])
     half[2] = min(half[2] * rng.uniform(0.6, 1.2), 0.48 * room)
     width = half[0] * rng.uniform(0.4, 0.75)
     bottom = -2 * half[2] if rng.random() < 0.6 else -half[2] * rng.uniform(0, 0.4)
     cut = ([-width, -2 * half[1], bottom], [width, 2 * half[1], half[2] * rng.uniform(0.3, 0.8)])
     build.solid(
-        BOX, _above(foot, half[2]), half, material=own, yaw=rng.uniform(0, np.pi),
+        BOX, at.above(half[2]), half, material=own, yaw=rng.uniform(0, np.pi),
         cuts=[cut], cut_material=other,
     )  # fmt: skip
 
 
-_Thing = Callable[[SceneBuilder, Float64, float, int, int, float], None]
-_THINGS: tuple[_Thing, ...] = (_box, _leaning, _ball, _bowl, _post, _shelf, _table, _arch)
+_THINGS: tuple[Callable[[_Spot], None], ...] = (
+    _box,
+    _leaning,
+    _ball,
+    _bowl,
+    _post,
+    _shelf,
+    _table,
+    _arch,
+)
 _CHANCES = (0.29, 0.1, 0.14, 0.07, 0.1, 0.1, 0.12, 0.08)
 
 
@@ -372,10 +376,7 @@ STYLES = {
 
 
 def scene(rng: np.random.Generator, split: str) -> ProceduralScene:
-    """A scene.
-
-    ``split``: "train" or "held-out".
-    """
+    """A scene of a split, "train" or "held-out"."""
     build = SceneBuilder(rng, photograph_names(split))
     style = STYLES[split]
     kind = rng.choice(len(_LAYOUTS), p=style.kinds)

@@ -14,7 +14,7 @@ side of the picture.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +27,8 @@ from gvtools.cameras import Cameras, invert_rigid
 from gvtools.procedural.builder import ProceduralScene
 from gvtools.procedural.ray_cast import BOX, cast
 from gvtools.procedural.render import Look, radiance, to_srgb
-from gvtools.procedural.room_sample import RoomSample, check_options, room_views
-from gvtools.procedural.sample_workspace import is_written, written_whole
+from gvtools.procedural.room_sample import check_options, room_views
+from gvtools.procedural.sample_workspace import WrittenSample, is_written, written_whole
 from gvtools.scenes.calibration import INTRINSICS
 from gvtools.similarity import align_poses
 
@@ -139,7 +139,7 @@ MILLIMETRES = 1e-3
 
 def write_noisy_room(
     folder: Path, *, seed: int = 0, views: int = 20, width: int = 480, height: int = 360
-) -> RoomSample:
+) -> WrittenSample:
     """Write the recording of a seed's room; a folder that holds it already is left as it is.
 
     The layout is that of 7-Scenes (``NAME.color.png``, ``NAME.depth.png`` in millimetres,
@@ -148,13 +148,8 @@ def write_noisy_room(
     poses in the files are jittered, then moved together to where they agree with the true ones
     best: no method could know an error that all of them share. Target poses are the true ones, and
     targets' pictures and depth maps are exact, so that what a run predicts is measured against the
-    truth. A run that moves the whole room with its context poses pays for it in the targets.
-
-    Args:
-        folder: absent, empty, or written by the same call before.
-        views: of context and targets together, at least 4.
-        width: of the pictures, pixels.
-        height: of the pictures, pixels.
+    truth. A run that moves the whole room with its context poses pays for it in the targets. There
+    are at least 4 views of both together.
     """
     check_options(seed, views, width=width, height=height)
     folder = Path(folder)
@@ -162,10 +157,8 @@ def write_noisy_room(
     count = sum(name.startswith("context") for name in cameras.names)
     stems = [name.removesuffix(".png") for name in cameras.names]
     names = tuple(f"{stem}.color.png" for stem in stems)
-    sample = RoomSample(folder, names[:count], names[count:], names[count:], seed)
-    record: dict[str, Any] = {"sample": "noisy-room", "version": 2, "width": width}
-    record |= {"height": height}
-    record |= {key: value for key, value in asdict(sample).items() if key != "folder"}
+    sample = WrittenSample(folder, names[:count], names[count:], names[count:], seed)
+    record = sample.record("noisy-room", version=2, width=width, height=height)
     if is_written(folder, record):
         return sample
     rng = np.random.default_rng([seed, 22])

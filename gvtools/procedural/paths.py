@@ -42,12 +42,9 @@ def camera_path(
         kind = int(rng.choice(len(_KINDS), p=_CHANCES))
         # Later attempts are more modest.
         modesty = 1 - 0.8 * attempt / ATTEMPTS
-        move = _Move(
-            rng,
-            depth,
-            modesty * rng.uniform(*TRAVEL) * depth,
-            modesty * np.radians(rng.uniform(*TURN)) * rng.choice([-1, 1]),
-        )
+        travel = modesty * rng.uniform(*TRAVEL) * depth
+        turn = modesty * np.radians(rng.uniform(*TURN)) * rng.choice([-1, 1])
+        move = _Move(rng, depth, travel, turn)
         poses = _leaning(rng, *_KINDS[kind](move, start, forward, views))
         cameras = _cameras(K, poses, size)
         if _is_free(geometry, cameras, depth):
@@ -71,9 +68,8 @@ def _intrinsics(rng: np.random.Generator, size: tuple[int, int]) -> Float64:
     height, width = size
     focal = max(size) / (2 * np.tan(np.radians(rng.uniform(*FOV)) / 2))
     offset = rng.normal(0, 0.01, 2) * (rng.random() < 0.5) * max(size)
-    return np.array(
-        [[focal, 0, width / 2 + offset[0]], [0, focal, height / 2 + offset[1]], [0, 0, 1]]
-    )
+    x, y = width / 2 + offset[0], height / 2 + offset[1]
+    return np.array([[focal, 0, x], [0, focal, y], [0, 0, 1]])
 
 
 def _start(
@@ -158,13 +154,8 @@ def _walk(move: _Move, start: Float64, forward: Float64, views: int) -> _Poses:
     return place, direction
 
 
-_KINDS: tuple[Callable[[_Move, Float64, Float64, int], _Poses], ...] = (
-    _forward,
-    _pull_back,
-    _orbit,
-    _pan,
-    _walk,
-)
+_Path = Callable[[_Move, Float64, Float64, int], _Poses]
+_KINDS: tuple[_Path, ...] = (_forward, _pull_back, _orbit, _pan, _walk)
 _CHANCES = (0.22, 0.16, 0.26, 0.12, 0.24)
 
 
@@ -199,11 +190,6 @@ def _looking(place: Float64, forward: Float64) -> Float64:
 
 
 def _cameras(K: Float64, poses: Float64, size: tuple[int, int]) -> Cameras:
-    count = len(poses)
-    return Cameras(
-        np.repeat(K[None], count, axis=0),
-        poses,
-        np.full(count, size[1]),
-        np.full(count, size[0]),
-        tuple(f"{i:02d}" for i in range(count)),
-    )
+    height, width = (np.array(side) for side in size)
+    names = tuple(f"{i:02d}" for i in range(len(poses)))
+    return Cameras(np.repeat(K[None], len(poses), axis=0), poses, width, height, names)

@@ -6,9 +6,7 @@ what a run makes of the room can be measured. No file is downloaded.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +17,12 @@ from gvtools.kernels import KernelSet
 from gvtools.procedural.builder import ProceduralScene
 from gvtools.procedural.furnished_room import furnished_room
 from gvtools.procedural.render import develop, radiance, to_srgb
-from gvtools.procedural.sample_workspace import SampleContent, is_written, write_sample
+from gvtools.procedural.sample_workspace import (
+    SampleContent,
+    WrittenSample,
+    is_written,
+    write_sample,
+)
 from gvtools.trajectories import look_at
 
 Float32 = NDArray[np.float32]
@@ -33,41 +36,21 @@ DETECTION_NOISE = 0.3  # standard deviation, pixels
 SAME_SURFACE = 0.005  # relative z-depth by which a point may differ from the pixel it falls in
 
 
-@dataclass(frozen=True)
-class RoomSample:
-    """A written room."""
-
-    folder: Path  # the COLMAP workspace
-    # names of the views to reconstruct from; they leave parts of the room unseen
-    context: tuple[str, ...]
-    # names of the views to predict, along a path that leads away from the context. Their own images
-    # and depth maps are the truth.
-    targets: tuple[str, ...]
-    depth_truth: tuple[str, ...]  # names of the views with a true depth map: all of them
-    seed: int  # which room
-
-
 def write_room(
     folder: Path, *, seed: int = 0, views: int = 20, width: int = 480, height: int = 360
-) -> RoomSample:
+) -> WrittenSample:
     """Write the room of a seed; a folder that holds it already is left as it is.
 
     The world's z axis points up, the floor is z = 0, the unit is the metre. Cameras are pinholes
     with one K. ``images``, ``sparse/0`` (binary) and ``stereo/depth_maps`` (geometric, exact
-    z-depth at pixel centres) are those of a COLMAP dense workspace.
-
-    Args:
-        folder: the workspace; absent, empty, or written by the same call before.
-        views: of context and targets together, at least 4.
-        width: of the images, pixels.
-        height: of the images, pixels.
+    z-depth at pixel centres) are those of a COLMAP dense workspace. Targets follow a path that
+    leads away from the context. There are at least 4 views of both together.
     """
     folder = Path(folder)
     check_options(seed, views, width=width, height=height)
     context, targets = _names(views)
-    sample = RoomSample(folder, context, targets, context + targets, seed)
-    record: dict[str, Any] = {"sample": "room", "version": 2, "width": width, "height": height}
-    record |= {key: value for key, value in asdict(sample).items() if key != "folder"}
+    sample = WrittenSample(folder, context, targets, context + targets, seed)
+    record = sample.record("room", version=2, width=width, height=height)
     if is_written(folder, record):
         return sample
     room, cameras, rng = room_views(seed, views, width=width, height=height)
@@ -103,10 +86,7 @@ def _names(views: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
 
 def compile_kernels() -> None:
     """Compile, or load from numba's cache, what photographing a room needs."""
-    room = furnished_room(0)
-    cameras = _path(
-        room.geometry.rooms[0, 1], ("a",), ("b",), width=16, height=16, rng=np.random.default_rng(0)
-    )
+    room, cameras, _ = room_views(0, 4, width=16, height=16)
     light, _ = radiance(room.geometry, room.look, cameras)
     to_srgb(light, 1.0)
 
@@ -141,14 +121,8 @@ def _path(
     eye = np.column_stack([size[:2] / 2 + axis, up])
     aim = np.column_stack([size[:2] / 2 - 0.5 * axis, np.full(len(angle), 0.95)])
     poses = invert_rigid(look_at(eye, aim, up=[0.0, 0.0, 1.0]))
-    count = len(poses)
-    return Cameras(
-        np.repeat(K[None], count, axis=0),
-        poses,
-        np.full(count, width),
-        np.full(count, height),
-        context + targets,
-    )
+    K = np.repeat(K[None], len(poses), axis=0)
+    return Cameras(K, poses, np.array(width), np.array(height), context + targets)
 
 
 def photograph_room(
@@ -165,14 +139,8 @@ def photograph_room(
     point_index, view_index, xy = _tracks(cameras, depth, points)
     xy += rng.normal(0, DETECTION_NOISE, xy.shape)
     kept, point_index = np.unique(point_index, return_inverse=True)
-    return SampleContent(
-        cameras=cameras,
-        images=list(images),
-        depths=list(depth),
-        points=points[kept],
-        colors=colors[kept],
-        tracks=(point_index, view_index, xy),
-    )
+    tracks = point_index, view_index, xy
+    return SampleContent(cameras, list(images), list(depth), points[kept], colors[kept], tracks)
 
 
 def _detected(

@@ -8,7 +8,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,22 @@ from gvtools.scenes.colmap_model import write_colmap
 from gvtools.scenes.images import write_depth_map
 
 RECORD = "sample.json"
+
+
+@dataclass(frozen=True)
+class WrittenSample:
+    """A sample in a folder, and the names of its views."""
+
+    folder: Path
+    context: tuple[str, ...]  # to reconstruct from; they leave parts unseen
+    targets: tuple[str, ...]  # to predict; their own pictures, and depth if any, are the truth
+    depth_truth: tuple[str, ...]  # those with a true depth map
+    seed: int | None = None
+
+    def record(self, name: str, **options: Any) -> dict[str, Any]:
+        """What its folder says of it, so that it is known again."""
+        facts = {key: value for key, value in asdict(self).items() if value is not None}
+        return {"sample": name, **options, **{k: v for k, v in facts.items() if k != "folder"}}
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,15 +7,18 @@ ground truth, GCPR 2014). It is written as a COLMAP workspace in metres.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
-from gvtools.procedural.sample_workspace import SampleContent, is_written, write_sample
+from gvtools.procedural.sample_workspace import (
+    SampleContent,
+    WrittenSample,
+    is_written,
+    write_sample,
+)
 
 Float64 = NDArray[np.float64]
 
@@ -32,26 +35,16 @@ LEFT, RIGHT = "left.png", "right.png"
 POINTS = 1500
 
 
-@dataclass(frozen=True)
-class StereoSample:
-    """A written stereo pair: a COLMAP workspace in metres, its world the left camera's frame."""
-
-    folder: Path
-    context: tuple[str, ...] = (LEFT,)
-    targets: tuple[str, ...] = (RIGHT,)  # to be predicted; its own image is the truth
-    depth_truth: tuple[str, ...] = (LEFT,)  # measured for this view alone
-
-
-def write_motorcycle(folder: Path) -> StereoSample:
+def write_motorcycle(folder: Path) -> WrittenSample:
     """Write the pair; a folder that holds it already is left as it is.
 
-    Pixels without measured disparity have depth 0. Sparse points lie on the measured surface, each
-    with a track of both views.
+    A COLMAP workspace in metres, its world the left camera's frame. Pixels without measured
+    disparity have depth 0. Sparse points lie on the measured surface, each with a track of both
+    views.
     """
     folder = Path(folder)
-    sample = StereoSample(folder)
-    record: dict[str, Any] = {"sample": "motorcycle", "version": 1}
-    record |= {key: value for key, value in asdict(sample).items() if key != "folder"}
+    sample = WrittenSample(folder, context=(LEFT,), targets=(RIGHT,), depth_truth=(LEFT,))
+    record = sample.record("motorcycle", version=1)
     if is_written(folder, record):
         return sample
     import skimage.data
@@ -59,16 +52,9 @@ def write_motorcycle(folder: Path) -> StereoSample:
     left, right, disparity = skimage.data.stereo_motorcycle()
     depth = depth_from_disparity(disparity)
     cameras = motorcycle_cameras(left.shape[1], left.shape[0])
-    points, colors, tracks = _surface_points(cameras, left, depth)
-    content = SampleContent(
-        cameras=cameras,
-        images=[left, right],
-        depths=[depth.astype(np.float32), None],
-        points=points,
-        colors=colors,
-        tracks=tracks,
-    )
-    write_sample(folder, content, record=record)
+    depths = [depth.astype(np.float32), None]
+    surface = _surface_points(cameras, left, depth)
+    write_sample(folder, SampleContent(cameras, [left, right], depths, *surface), record=record)
     return sample
 
 

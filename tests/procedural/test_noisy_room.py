@@ -15,7 +15,8 @@ from gvtools.procedural.noisy_room import (
     range_noise,
     write_noisy_room,
 )
-from gvtools.procedural.room_sample import RoomSample, write_room
+from gvtools.procedural.room_sample import write_room
+from gvtools.procedural.sample_workspace import WrittenSample
 from gvtools.scenes.inspection import inspect
 from gvtools.scenes.project import open_project
 from gvtools.scenes.scene import Scene
@@ -27,12 +28,12 @@ CONTEXT = 4
 
 
 @pytest.fixture(scope="module")
-def sample(tmp_path_factory: pytest.TempPathFactory) -> RoomSample:
+def sample(tmp_path_factory: pytest.TempPathFactory) -> WrittenSample:
     return write_noisy_room(tmp_path_factory.mktemp("noisy") / "seed0", seed=0, **SIZE)
 
 
 @pytest.fixture(scope="module")
-def scene(sample: RoomSample) -> Scene:
+def scene(sample: WrittenSample) -> Scene:
     return open_project(sample.folder)
 
 
@@ -171,18 +172,28 @@ def test_reader_has_nothing_to_complain(scene: Scene) -> None:
     assert [finding.message for finding in report.findings if finding.level != "info"] == []
 
 
-def test_same_seed_same_bytes_and_another_is_refused(sample: RoomSample, tmp_path: Path) -> None:
-    again = write_noisy_room(tmp_path / "again", seed=0, **SIZE)
-    files = sorted(path.name for path in sample.folder.iterdir())
-    assert len(files) == 3 * SIZE["views"] + 2
-    assert files == sorted(path.name for path in again.folder.iterdir())
-    for name in files:
-        assert (sample.folder / name).read_bytes() == (again.folder / name).read_bytes(), name
-    assert write_noisy_room(sample.folder, seed=0, **SIZE) == sample
+@pytest.mark.parametrize(("write", "files"), [(write_room, 2), (write_noisy_room, 3)])
+def test_same_seed_same_bytes_and_others_are_refused(tmp_path, write, files):
+    small = {"views": 4, "width": 64, "height": 48}
+    first, again = (write(tmp_path / name, seed=0, **small).folder for name in ("first", "again"))
+    mine, theirs = (
+        {path.relative_to(root): path.read_bytes() for path in root.rglob("*") if path.is_file()}
+        for root in (first, again)
+    )
+    assert mine == theirs and len(mine) >= files * 4 + 2
+    times = [path.stat().st_mtime_ns for path in sorted(first.rglob("*"))]
+    assert write(first, seed=0, **small).folder == first
+    assert times == [path.stat().st_mtime_ns for path in sorted(first.rglob("*"))]
     with pytest.raises(ProjectError, match="another sample"):
-        write_noisy_room(sample.folder, seed=1, **SIZE)
-    with pytest.raises(OptionError, match="expected a seed of 0 or more"):
-        write_noisy_room(tmp_path / "bad", seed=-1)
+        write(first, seed=1, **small)
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "note.txt").touch()
+    with pytest.raises(ProjectError, match="something other than a sample"):
+        write(tmp_path / "mine", seed=0, **small)
+    for bad in ({"seed": -1}, {"views": 3}, {"width": 8}):
+        with pytest.raises(OptionError, match="expected a seed of 0 or more"):
+            write(tmp_path / "none", **{**small, **bad})
+    assert not (tmp_path / "none").exists()
 
 
 @pytest.mark.slow

@@ -9,8 +9,8 @@ import skimage.data
 from PIL import Image
 from scipy.ndimage import map_coordinates
 
+from gvtools.procedural.sample_workspace import WrittenSample
 from gvtools.procedural.stereo_sample import (
-    StereoSample,
     depth_from_disparity,
     motorcycle_cameras,
     write_motorcycle,
@@ -20,12 +20,12 @@ from gvtools.scenes.scene import Scene
 
 
 @pytest.fixture(scope="module")
-def sample(tmp_path_factory: pytest.TempPathFactory) -> StereoSample:
+def sample(tmp_path_factory: pytest.TempPathFactory) -> WrittenSample:
     return write_motorcycle(tmp_path_factory.mktemp("stereo") / "motorcycle")
 
 
 @pytest.fixture(scope="module")
-def scene(sample: StereoSample) -> Scene:
+def scene(sample: WrittenSample) -> Scene:
     return read_colmap(sample.folder)
 
 
@@ -33,7 +33,7 @@ def _difference(scene: Scene, *, dx: float = 0, dy: float = 0) -> float:
     """Mean colour difference between left pixels and where depth puts them in the right image."""
     left, right = (view.load() for view in scene)
     assert left.depth is not None
-    rows, columns = np.nonzero(left.depth)
+    rows, columns = (place[::9] for place in np.nonzero(left.depth))
     points = scene.cameras.rays(0)[rows, columns] * left.depth[rows, columns, None]
     x, y = scene.cameras.project(points)[0][1].T - 0.5
     inside = (x >= 4) & (x <= right.rgb.shape[1] - 5)
@@ -79,7 +79,7 @@ def test_depth_without_measurement_is_zero() -> None:
     assert depth[0, 3] == pytest.approx(millimetres / 1000, rel=1e-5)
 
 
-def test_workspace_reads_back(sample: StereoSample, scene: Scene) -> None:
+def test_workspace_reads_back(sample: WrittenSample, scene: Scene) -> None:
     assert scene.names == sample.context + sample.targets
     assert [view.has_depth for view in scene] == [True, False]
     left, right, _ = skimage.data.stereo_motorcycle()
@@ -92,7 +92,7 @@ def test_workspace_reads_back(sample: StereoSample, scene: Scene) -> None:
     assert depth[depth > 0].min() > 1.5 and depth.max() < 6
 
 
-def test_sparse_points_lie_on_the_measured_surface(sample: StereoSample, scene: Scene) -> None:
+def test_sparse_points_lie_on_the_measured_surface(sample: WrittenSample, scene: Scene) -> None:
     model = pycolmap.Reconstruction(sample.folder / "sparse" / "0")
     assert model.num_points3D() == 1500
     assert model.compute_mean_reprojection_error() < 1e-6
@@ -111,7 +111,7 @@ def test_sparse_points_lie_on_the_measured_surface(sample: StereoSample, scene: 
     assert np.median(differences) < 20
 
 
-def test_written_sample_is_kept(sample: StereoSample) -> None:
+def test_written_sample_is_kept(sample: WrittenSample) -> None:
     picture = sample.folder / "images" / "left.png"
     before = picture.stat().st_mtime_ns
     assert write_motorcycle(Path(sample.folder)) == sample
