@@ -27,17 +27,22 @@ class Interval:
     n: int  # how many values; those that are None are left out
 
 
+def mean_known(values: Iterable[float | None]) -> float | None:
+    """The mean of the values that are neither None nor NaN; None without any, or of ±∞."""
+    known = np.array([value for value in values if value is not None and value == value])
+    if not len(known) or {np.inf, -np.inf} <= set(known.tolist()):
+        return None
+    return float(known.mean())
+
+
 def mean_interval(values: Iterable[float | None], *, seed: int = 0) -> Interval:
     """The mean of the values that are neither None nor NaN, with its bootstrap interval.
 
     The same values and seed give the same interval.
     """
     known = np.array([value for value in values if value is not None and value == value])
-    count = len(known)
-    if not count or {np.inf, -np.inf} <= set(known.tolist()):
-        return Interval(None, None, None, count)
-    mean = float(known.mean())
-    if count < 2 or not np.isfinite(known).all():
+    mean, count = mean_known(known), len(known)
+    if mean is None or count < 2 or not np.isfinite(known).all():
         return Interval(mean, None, None, count)
     if np.ptp(known) == 0:
         return Interval(mean, mean, mean, count)

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import torch
+from torch import nn
 from torch.utils.flop_counter import FlopCounterMode, sdpa_flop_count
 
 from gvtools.completers.geoverse.conditioning import ViewBatch
@@ -34,14 +35,11 @@ INSIDE = f"{DECODE}: "
 
 
 class StageClock:
-    """Given to a model as its clock, it notes by how much ``total`` grows within each stage.
-
-    Attributes:
-        entries: (stage, growth) in the order in which stages began.
-    """
+    """Given to a model as its clock, it notes by how much ``total`` grows within each stage."""
 
     def __init__(self, total: Callable[[], float]) -> None:
         self.total = total
+        # Stage and growth, in the order in which stages began.
         self.entries: list[tuple[str, float]] = []
 
     @contextmanager
@@ -69,14 +67,9 @@ class StageClock:
         return rows
 
 
-def within(name: str) -> bool:
-    """A row is a part of another one."""
-    return name.startswith(INSIDE)
-
-
 def total(rows: Mapping[str, float]) -> float:
     """Of all rows; what is within another row is not counted twice."""
-    return sum(value for name, value in rows.items() if not within(name))
+    return sum(value for name, value in rows.items() if not name.startswith(INSIDE))
 
 
 def seconds(device: torch.device) -> Callable[[], float]:
@@ -216,7 +209,7 @@ def complete_figures(options: CompleteOptions) -> dict[str, Any]:
         **_conditions(options, config),
         "parameters": parameters(model),
         "first_pass_s": first_pass,
-        "weights_bytes": weight_bytes(model),
+        "weights_bytes": module_bytes(model, *prior_networks(model)),
         "peak_bytes": peak_bytes(options.place),
         "peak": PEAK[options.place.type],
         "results": stage_rows(counts, timed.times(options.repeat)),
@@ -272,7 +265,7 @@ def stage_rows(counts: dict[str, float], times: Times) -> list[dict[str, Any]]:
         rows.append(
             {
                 "name": name,
-                "within": DECODE if within(name) else None,
+                "within": DECODE if name.startswith(INSIDE) else None,
                 "ours_s": spent,
                 "ours_min_s": times.least[name],
                 "share": None if name == PASS else spent / stages,
@@ -307,16 +300,17 @@ def parameters(model: GeoVerse) -> dict[str, int]:
     return counts | {"total": sum(counts.values())}
 
 
-def weight_bytes(model: GeoVerse) -> int:
-    """Of the model and its video prior, buffers included."""
-    modules: list[Any] = [model]
-    if model.video is not None:
-        modules += [model.video.networks.transformer, model.video.networks.vae]
-    return sum(
-        tensor.numel() * tensor.element_size()
-        for module in modules
-        for tensor in (*module.parameters(), *module.buffers())
-    )
+def prior_networks(model: GeoVerse) -> list[nn.Module]:
+    """The networks of its video prior; none without one."""
+    if model.video is None:
+        return []
+    return [model.video.networks.transformer, model.video.networks.vae]
+
+
+def module_bytes(*modules: nn.Module) -> int:
+    """Of weights and buffers."""
+    tensors = [t for module in modules for t in (*module.parameters(), *module.buffers())]
+    return sum(tensor.numel() * tensor.element_size() for tensor in tensors)
 
 
 def show(figures: dict[str, Any], console: Console) -> None:

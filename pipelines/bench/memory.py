@@ -32,14 +32,13 @@ from gvtools.completers.geoverse.conditioning import ViewBatch
 from gvtools.completers.geoverse.config import GeoVerseConfig
 from gvtools.completers.geoverse.flow import interval_bounds
 from gvtools.completers.geoverse.model import DECODE, DECODING, VIDEO, GeoVerse
-from gvtools.completers.geoverse.video_prior import VideoPrior
 from gvtools.networks.compute import autocast, name_of
 from gvtools.training.distributed import Processes, Replicated
 from gvtools.training.loop import Trainer
 from gvtools.training.options import DenoiserStageOptions, OptimizerOptions, ReflowStageOptions
 from gvtools.training.samples import TrainingBatch
 from gvtools.training.stages import DenoiserStage, ReflowStage, Stage
-from pipelines.bench.complete import INSIDE
+from pipelines.bench.complete import INSIDE, module_bytes, prior_networks
 from pipelines.bench.options import CompleteOptions
 from pipelines.bench.random_model import random_video, random_views
 
@@ -186,14 +185,11 @@ STAGES: dict[str, tuple[type[Stage], Any]] = {
 
 
 class StagePeaks:
-    """Given to a model as its clock, it notes the most bytes that were live within each stage.
-
-    Attributes:
-        rows: bytes by stage; of several runs of a stage the most.
-    """
+    """Given to a model as its clock, it notes the most bytes that were live within each stage."""
 
     def __init__(self, live: LiveBytes) -> None:
         self.live = live
+        # Bytes by stage; of several runs of a stage the most.
         self.rows: dict[str, int] = {}
 
     @contextmanager
@@ -217,8 +213,7 @@ def pass_peaks(
     ``steps``: of level 1 and of the cascade.
     """
     shift = model.config.flow.shift
-    networks = [] if model.video is None else _networks(model.video)
-    with LiveBytes([model, *networks]) as live, autocast(CPU, dtype):
+    with LiveBytes([model, *prior_networks(model)]) as live, autocast(CPU, dtype):
         peaks = model.clock = StagePeaks(live)
         model.generate(
             batch,
@@ -238,8 +233,7 @@ def step_peaks(
 
     ``stage``: "denoiser" or "reflow".
     """
-    networks = [] if model.video is None else _networks(model.video)
-    with LiveBytes([model, *networks]) as live:
+    with LiveBytes([model, *prior_networks(model)]) as live:
         kind, options = STAGES[stage]
         trained = kind(model, options(optimizer=optimizer))
         trainer = Trainer(
@@ -312,7 +306,7 @@ def _inference(options: CompleteOptions, config: GeoVerseConfig) -> list[dict[st
         model.hold_in(dtype)
         steps = (options.steps, options.cascade_steps)
         peaks = pass_peaks(model, _views(options, config), steps=steps, dtype=dtype)
-        weights, prior = _bytes(model), _prior_bytes(model)
+        weights, prior = module_bytes(model), module_bytes(*prior_networks(model))
     return [
         {
             "stage": stage,
@@ -339,7 +333,7 @@ def _training(
         batch = TrainingBatch(views, torch.rand_like(views.images), 1 + views.depth)
         optimizer = OptimizerOptions(batch=1, precision=name_of(dtype), recompute=recompute)
         peaks = step_peaks(model, batch, optimizer, stage=stage)
-        weights = _bytes(model) + _prior_bytes(model)
+        weights = module_bytes(model, *prior_networks(model))
     held = weights + peaks.pop("held")
     return {
         "stage": stage,
@@ -367,20 +361,6 @@ def _model(config: GeoVerseConfig) -> GeoVerse:
     if config.video is not None:
         model.attach_video(random_video(config.video))
     return model
-
-
-def _networks(prior: VideoPrior) -> list[Any]:
-    return [prior.networks.transformer, prior.networks.vae]
-
-
-def _bytes(*modules: Any) -> int:
-    """Of weights and buffers."""
-    tensors = [t for module in modules for t in (*module.parameters(), *module.buffers())]
-    return sum(tensor.numel() * tensor.element_size() for tensor in tensors)
-
-
-def _prior_bytes(model: GeoVerse) -> int:
-    return 0 if model.video is None else _bytes(*_networks(model.video))
 
 
 GB = 1e9

@@ -195,8 +195,9 @@ def reconstruct(
     Returns:
         The run's folder.
     """
-    compile_kernels(config, console)
     directory = RunDirectory(out)
+    directory.refuse_foreign()
+    compile_kernels(config, console)
     begun = directory.round_path(0) if resume and directory.reports() else None
     plan = make_plan(scene, config, say=console.line, round_0=begun)
     describe(plan, console)

@@ -240,7 +240,7 @@ def measure_cell(cell: BenchmarkCell) -> dict[str, Any]:
 def _of_run(opened: _OpenCell) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Run gvtools; its figures and cost, and its pictures (H, W, 3) uint8 by target."""
     from gvtools.runs.run import load_run
-    from pipelines.scoring.evaluation import evaluate_run, with_run
+    from pipelines.scoring.evaluation import evaluate_run
 
     seconds = _reconstruct(opened)
     peak = peak_bytes()
@@ -248,7 +248,7 @@ def _of_run(opened: _OpenCell) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     figures = evaluate_run(run, opened.options, console=Silent())
     pictures = {target.name: files.picture for target, files, _ in run.targets()}
     return {
-        **_summary(with_run(figures, run)),
+        **_summary(figures),
         "seconds": seconds,
         "peak_bytes": peak,
         "gpu_bytes": _gpu_bytes(),

@@ -9,7 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gvtools.errors import OptionError, ProjectError
+from gvtools.errors import OptionError
 from gvtools.evaluation.images import FIGURES
 from gvtools.evaluation.published import (
     Benchmark,
@@ -20,19 +20,19 @@ from gvtools.evaluation.published import (
     side_by_side,
 )
 from gvtools.evaluation.splits import protocol_split
-from gvtools.evaluation.statistics import LEVEL, RESAMPLES, mean_interval
+from gvtools.evaluation.statistics import LEVEL, RESAMPLES, mean_interval, mean_known
 from gvtools.files import write_json
 from gvtools.runs.digests import versions
 from gvtools.runs.layout import RECORD
-from gvtools.runs.run import Run, load_memory, load_run
+from gvtools.runs.run import Run, load_memory
 from pipelines.console import Console
 from pipelines.report import nested
 from pipelines.scoring.measurement import (
     Measurement,
     MeasureOptions,
     context_pictures,
+    load_measured,
     matcher_called,
-    mean,
     run_targets,
     true_pictures,
 )
@@ -66,13 +66,7 @@ def load_runs(paths: Sequence[Path], *, project: Path | None) -> list[Run]:
     """Runs with at least one completed target each."""
     if len({path.resolve() for path in paths}) < len(paths):
         raise OptionError("a run is given twice; expected each once")
-    runs = [load_run(path, project=project) for path in paths]
-    for run in runs:
-        if len(run.rounds) < 2:
-            raise ProjectError(
-                f"{run.path}: no round of targets is done; expected one; add --resume to it"
-            )
-    return runs
+    return [load_measured(path, project=project) for path in paths]
 
 
 def run_protocol(
@@ -93,7 +87,6 @@ def run_protocol(
     Defaults: the widest stride, and the settings' completer and profile. Changes are settings as
     KEY=VALUE.
     """
-    from gvtools.runs.folder import RunDirectory
     from gvtools.settings import with_texts, with_values
     from pipelines.reconstruction.run import reconstruct
     from pipelines.reconstruction.settings import RunSettings
@@ -118,7 +111,6 @@ def run_protocol(
     config = with_texts(with_values(start, decided), changes)
     folder = out / "run"
     resume = (folder / RECORD).is_file()
-    RunDirectory(folder).refuse_foreign()
     done = reconstruct(
         scene, config, folder, console=console, resume=resume, reading=reading, draw=draw_run
     )
@@ -133,12 +125,12 @@ def evaluate_run(
     matcher: FeatureMatcher | None = None,
     console: Console,
 ) -> dict[str, Any]:
-    """Measure one run with at least one round of targets.
+    """Measure one run with at least one round of targets, and say what was measured.
 
     The figures are JSON-ready, by part; what could not be measured is None, with the reason under
     ``notes``.
     """
-    targets, reports = run_targets(run), run.rounds[1:]
+    record, targets = run.record, run_targets(run)
     measurement = Measurement(
         options=options,
         context=lambda: context_pictures(run, load_memory(run.path, up_to=0)),
@@ -146,12 +138,24 @@ def evaluate_run(
         console=console,
         matcher=matcher,
     )
+    reports = run.rounds[1:]
+    seconds = sum(report["seconds"]["total"] for report in reports)
     views = sum(len(report["views"]) for report in reports)
+    schedule = [[record["targets"][row] for row in rows] for rows in record["schedule"]]
     return {
+        "name": run.path.resolve().name,
+        "run": str(run.path),
+        "project": record["project"],
+        "split": {"context": record["context"], "rounds": schedule},
+        "seed": record["settings"]["seed"],
+        "settings": record["settings"],
+        "derived": record["derived"],
+        "versions": record["versions"],
+        "seconds_of_rounds": seconds,
         "rounds": len(reports),
         "views": len(targets),
-        "coverage": mean([target.coverage for target in targets]),
-        "seconds_per_view": _seconds(run) / views if views else None,
+        "coverage": mean_known([target.coverage for target in targets]),
+        "seconds_per_view": seconds / views if views else None,
         **measurement.of(targets),
     }
 
@@ -166,7 +170,7 @@ def evaluate_runs(
         console.line(f"{run.path}: {len(run.rounds) - 1} rounds")
         if not run.complete:
             console.warn(f"{run.path}: not every round is done; measured are those that are")
-        return with_run(evaluate_run(run, options, matcher=matcher, console=console), run)
+        return evaluate_run(run, options, matcher=matcher, console=console)
 
     evaluations = records_of(runs, measure)
     # Runs of one name are told apart by the folders that they lie in.
@@ -176,30 +180,6 @@ def evaluate_runs(
             folder = Path(evaluation["run"]).resolve()
             evaluation["name"] = f"{folder.parent.name}/{folder.name}"
     return evaluations
-
-
-def with_run(figures: dict[str, Any], run: Run) -> dict[str, Any]:
-    """The figures with the run that they were measured on: its split, settings and versions."""
-    record = run.record
-    schedule = [[record["targets"][row] for row in rows] for rows in record["schedule"]]
-    return {
-        "name": run.path.resolve().name,
-        "run": str(run.path),
-        "project": record["project"],
-        "split": {"context": record["context"], "rounds": schedule},
-        "seed": record["settings"]["seed"],
-        "settings": record["settings"],
-        "derived": record["derived"],
-        "versions": record["versions"],
-        "seconds_of_rounds": _seconds(run),
-        **figures,
-    }
-
-
-def _seconds(run: Run) -> float:
-    """Of all rounds of targets."""
-    seconds: float = sum(report["seconds"]["total"] for report in run.rounds[1:])
-    return seconds
 
 
 def write_evaluation(
@@ -267,13 +247,17 @@ def _setting(
     masked = max(
         (e["images"]["settings"]["masked_share"] for e in evaluations if "images" in e), default=0
     )
+
+    def common(numbers: Sequence[int]) -> int | None:
+        return numbers[0] if len(set(numbers)) == 1 else None
+
     return Setting(
         data_set=data_set,
         # Mixed sizes and numbers are none of the published ones.
         resolution=sizes.pop() if len(sizes) == 1 else None,
-        context=_common([len(run.record["context"]) for run in runs]),
-        targets=_common([len(report["views"]) for report in reports]),
-        rounds=_common([len(run.rounds) - 1 for run in runs]),
+        context=common([len(run.record["context"]) for run in runs]),
+        targets=common([len(report["views"]) for report in reports]),
+        rounds=common([len(run.rounds) - 1 for run in runs]),
         scenes=len({run.record["project"] for run in runs}),
         pixels="inside masks" if masked > 0 else "all",
         lpips_net=options.lpips_net if options.lpips else None,
@@ -283,10 +267,6 @@ def _setting(
         met3r="original" if set(met3r) == {"measured"} else None,
         hardware=f"{os.cpu_count()} CPU cores",
     )
-
-
-def _common(numbers: Sequence[int]) -> int | None:
-    return numbers[0] if len(set(numbers)) == 1 else None
 
 
 def _over_runs(
@@ -305,9 +285,9 @@ def _over_runs(
         notes |= nested(evaluation, "images", "notes") or {}
     return {
         **{name: interval.mean for name, interval in over.items()},
-        "coverage": mean([e["coverage"] for e in evaluations]),
+        "coverage": mean_known([e["coverage"] for e in evaluations]),
         "views": sum(e["views"] for e in evaluations),
-        "seconds_per_view": mean([e["seconds_per_view"] for e in evaluations]),
+        "seconds_per_view": mean_known([e["seconds_per_view"] for e in evaluations]),
         "scenes": len(evaluations),
         "over_scenes": {name: asdict(interval) for name, interval in over.items()},
         "protocol_row": {

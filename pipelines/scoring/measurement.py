@@ -10,15 +10,16 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from itertools import pairwise
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.errors import DegenerateError
+from gvtools.errors import DegenerateError, ProjectError
 from gvtools.evaluation.images import FIGURES, view_figures
 from gvtools.evaluation.posed_picture import PosedPicture
-from gvtools.evaluation.statistics import mean_interval
+from gvtools.evaluation.statistics import mean_interval, mean_known
 
 if TYPE_CHECKING:
     from gvtools.evaluation.lpips_distance import Lpips
@@ -64,6 +65,18 @@ class MeasuredTarget:
     def key(self) -> tuple[str, int]:
         """Name and round, by which a run has it once."""
         return self.picture.name, self.number
+
+
+def load_measured(path: Path, *, project: Path | None = None) -> Run:
+    """A run with at least one completed target; ``project`` is where its project lies now."""
+    from gvtools.runs.run import load_run
+
+    run = load_run(path, project=project)
+    if len(run.rounds) < 2:
+        raise ProjectError(
+            f"{path}: no round of targets is done; expected one; add --resume to reconstruct"
+        )
+    return run
 
 
 def run_targets(run: Run) -> list[MeasuredTarget]:
@@ -152,16 +165,13 @@ class Measurement:
             out["poses"] = self._poses([target.picture for target in targets])
         return out
 
+    def _means(self, views: Sequence[dict[str, Any]]) -> dict[str, Any]:
+        seed = self.options.seed
+        return {name: interval([view[name] for view in views], seed) for name in self.names}
+
     def _images(self, targets: Sequence[MeasuredTarget]) -> dict[str, Any]:
         """A row a view, means over all views and over each round."""
         views = [self._view(target) for target in self.console.track(targets, "images")]
-
-        def means(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-            return {
-                name: interval([row[name] for row in rows], self.options.seed)
-                for name in self.names
-            }
-
         notes = {}
         if self.options.no_lpips and not self.options.lpips:
             notes["lpips"] = self.options.no_lpips
@@ -171,9 +181,9 @@ class Measurement:
             notes["psnr"] = "infinite, and null in JSON, where pictures are equal"
         masks = [t.truth.mask for t in targets if t.truth and t.truth.mask is not None]
         return {
-            "mean": means(views),
+            "mean": self._means(views),
             "rounds": [
-                {"round": number, **means([view for view in views if view["round"] == number])}
+                {"round": number, **self._means([v for v in views if v["round"] == number])}
                 for number in sorted({view["round"] for view in views})
             ],
             "views": views,
@@ -251,8 +261,8 @@ class Measurement:
             "feature_consistency": {
                 "network": features[0].network if features else None,
                 "score": interval([pair.score for pair in features], self.options.seed),
-                "unrelated": mean([pair.unrelated for pair in features]),
-                "overlap": mean([pair.overlap for pair in features]),
+                "unrelated": mean_known([pair.unrelated for pair in features]),
+                "overlap": mean_known([pair.overlap for pair in features]),
                 "pairs": [asdict(pair) for pair in features],
             },
             "met3r": _met3r(pictures, self.options.seed),
@@ -301,11 +311,6 @@ class Measurement:
 def interval(values: Iterable[float | None], seed: int) -> dict[str, Any]:
     """Mean, ends of its bootstrap interval, and number of the values that are there, for JSON."""
     return asdict(mean_interval(values, seed=seed))
-
-
-def mean(values: Iterable[float | None]) -> float | None:
-    """The mean of the values that are there."""
-    return mean_interval(values).mean
 
 
 def evenly(count: int, most: int) -> list[int]:

@@ -30,7 +30,12 @@ from gvtools.runs.run import Run, RunTarget, load_memory, load_run
 from gvtools.runs.target_files import to_bytes
 from gvtools.scenes.scene import Frame
 from pipelines.console import Console
-from pipelines.scoring.measurement import MeasuredTarget, context_pictures, run_targets
+from pipelines.scoring.measurement import (
+    MeasuredTarget,
+    context_pictures,
+    load_measured,
+    run_targets,
+)
 
 if TYPE_CHECKING:
     from gvtools.cameras import Cameras
@@ -99,12 +104,7 @@ class JudgeReference:
 
 def open_reference(path: Path, *, cameras: Path | None) -> JudgeReference:
     """The run at ``path``; ``cameras`` as of JudgeReference."""
-    run = load_run(path)
-    if cameras is None and len(run.rounds) < 2:
-        raise ProjectError(
-            f"{path}: no round of targets is done; expected one; add --resume to reconstruct"
-        )
-    return JudgeReference(run, cameras)
+    return JudgeReference(load_measured(path) if cameras is None else load_run(path), cameras)
 
 
 def reference_from_context(
@@ -122,7 +122,6 @@ def reference_from_context(
     Context and targets select views: those given, and those that the pictures stand for, unless a
     trajectory file has the cameras of the pictures.
     """
-    from gvtools.runs.folder import RunDirectory
     from gvtools.settings import with_values
     from pipelines.reconstruction.run import reconstruct
     from pipelines.reconstruction.settings import RunSettings
@@ -142,12 +141,10 @@ def reference_from_context(
         # Where other methods were told that the cameras stand.
         "refine.poses": False,
     }
-    resume = (out / RECORD).is_file()
-    RunDirectory(out).refuse_foreign()
-    config = with_values(RunSettings(), values)
     console.line(f"fusing the context into {out}")
     # What a run says of the memory's own pictures would be mistaken for a judgement.
-    quiet = Console(quiet=True)
+    config, quiet = with_values(RunSettings(), values), Console(quiet=True)
+    resume = (out / RECORD).is_file()
     reconstruct(scene, config, out, console=quiet, resume=resume, reading=reading)
     return JudgeReference(load_run(out))
 

@@ -15,7 +15,7 @@ from gvtools.completers.geoverse.model import LEVEL0, LEVEL1
 from gvtools.errors import OptionError
 from gvtools.networks.compute import attend
 from pipelines.bench import side_by_side
-from pipelines.bench.complete import StageClock, TimedPass, parameters, total, weight_bytes
+from pipelines.bench.complete import StageClock, TimedPass, module_bytes, parameters, total
 from pipelines.bench.options import CompleteOptions
 from pipelines.bench.random_model import random_features, random_model, random_video, random_views
 
@@ -148,7 +148,7 @@ def test_json_of_a_run(tmp_path, weights):
     assert whole["tflop_per_s"] == pytest.approx(whole["flops"] / whole["ours_s"] / TERA)
     assert data["config"] == "micro" and data["weights"] == str(weights)
     assert data["size"] == [24, 32] and data["precision"] == "float32" and data["video"] is False
-    assert data["weights_bytes"] == weight_bytes(micro.model())
+    assert data["weights_bytes"] == module_bytes(micro.model())
     assert data["first_pass_s"] > 0
 
 
