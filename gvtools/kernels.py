@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 import pickle
+import shutil
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache, partial
@@ -13,12 +16,32 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numba
 from numba import get_num_threads, njit, threading_layer
 
 # error_model="numpy": division by zero gives infinity instead of raising; the check that raising
 # needs keeps loops from being vectorised (measured: projection ten times slower with it).
 # nogil=True: other Python threads (file I/O, kernels on other memories) run during a kernel.
 compiled = partial(njit, cache=True, error_model="numpy", nogil=True)
+
+# What is compiled stays for this process and its children alone.
+cached_here_alone = False
+
+
+def _cache_somewhere() -> None:
+    """Cache in a folder that goes at exit where neither the package nor the home can be written."""
+    global cached_here_alone
+    try:
+        njit(cache=True)(_cache_somewhere)
+    except RuntimeError:  # numba has no place for its cache
+        folder = tempfile.mkdtemp(prefix="gvtools-kernels-")
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+        os.environ["NUMBA_CACHE_DIR"] = folder
+        numba.config.CACHE_DIR = folder  # type: ignore[attr-defined]
+        cached_here_alone = True
+
+
+_cache_somewhere()
 
 # LLVM's fast-math flags but "nnan" and "ninf": rounding may differ, NaN and infinity still hold.
 FAST = {"nsz", "arcp", "contract", "reassoc"}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import io
 import os
 import sys
 from collections.abc import Mapping, Sequence
@@ -87,6 +88,10 @@ def main(argv: Sequence[str] | None = None, *, modules: Mapping[str, str] = COMM
     """
     # Waiting threads that spin would take the cores that other programs need, and with them ours.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            # What a console's encoding lacks is escaped: no work is lost for a name's sake.
+            stream.reconfigure(errors="backslashreplace")
     words = sys.argv[1:] if argv is None else argv
     parser = build_parser(modules, only=words[0] if words and words[0][:1] != "-" else "")
     args = argparse.Namespace(debug=False)

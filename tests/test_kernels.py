@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib
 import os
+import subprocess
+import sys
 
 import numba
 import numpy as np
@@ -57,3 +59,15 @@ def test_other_processes_leave_kernels_in_the_cache(tmp_path, monkeypatch, capfd
     for kernels in sets:
         assert kernels.last(3) == 6
         assert kernels.last.stats.cache_hits.total() == 1
+
+
+def test_where_nothing_can_be_written_the_cache_is_a_folder_that_goes(tmp_path):
+    code = (
+        "from gvtools import kernels; import os; from pathlib import Path;"
+        "from gvtools.memory.store import voxel_index;"
+        "assert kernels.cached_here_alone and Path(os.environ['NUMBA_CACHE_DIR']).is_dir()"
+    )
+    # As numba finds no place beside the sources and none in the home.
+    alone = {"NUMBA_CACHE_LOCATOR_CLASSES": "UserProvidedCacheLocator", "TMPDIR": str(tmp_path)}
+    subprocess.run([sys.executable, "-c", code], env={**os.environ, **alone}, check=True)
+    assert not list(tmp_path.iterdir())

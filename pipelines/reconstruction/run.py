@@ -66,9 +66,9 @@ def compile_kernels(
     Args:
         config: of the run; its completer and the back end of projection tell which kernels.
     """
+    from gvtools import kernels as compiler
     from gvtools.completers.base import completer_type
     from gvtools.depth import source as depth_source
-    from gvtools.kernels import compile_side_by_side
     from gvtools.memory import compile_kernels as memory
 
     completer = completer_type(config.completer)
@@ -80,11 +80,17 @@ def compile_kernels(
 
         sets += kernel_sets()
     missing = [kernels for kernels in sets if not kernels.cached]
+    often = "once per installation"
+    if compiler.cached_here_alone:
+        often = (
+            "for this command alone: neither the installation nor the home folder can be written; "
+            "set NUMBA_CACHE_DIR to a folder that can"
+        )
     began = perf_counter()
     if missing:
         names = ", ".join(kernels.name for kernels in missing)
-        console.line(f"compiling kernels ({names}), once per installation")
-        compile_side_by_side(missing)
+        console.line(f"compiling kernels ({names}), {often}")
+        compiler.compile_side_by_side(missing)
     memory.compile_kernels(config.splat.backend)
     if missing:
         console.line(f"kernels compiled in {perf_counter() - began:.0f} s")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import resource
 import shutil
 import subprocess
@@ -210,3 +211,14 @@ def test_a_debug_run_shows_where(scan, tmp_path):
 def test_an_option_takes_the_word_for_no_value_of_its_setting(scan, tmp_path, option):
     out = tmp_path / "run"
     assert main([str(a) for a in reconstruct(scan, "--out", out, "--dry-run", option)]) == 0
+
+
+def test_names_that_a_console_cannot_show_are_escaped(scan, tmp_path):
+    place = tmp_path / "Küche"
+    shutil.copytree(scan, place)
+    words = [sys.executable, "-m", "gvtools", "check", str(place)]
+    run = subprocess.run(
+        words, env={**os.environ, "PYTHONIOENCODING": "ascii"}, capture_output=True, text=True,
+        check=False,
+    )  # fmt: skip
+    assert run.returncode == 0 and "K\\xfcche" in run.stdout and not run.stderr

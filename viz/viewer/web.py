@@ -277,6 +277,17 @@ def is_loopback(host: str) -> bool:
         return host == "localhost"
 
 
+def _own_address() -> str:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        try:
+            sender.connect(("192.0.2.1", 9))  # of documentation; nothing is sent
+        except OSError:
+            return "localhost"
+        return str(sender.getsockname()[0])
+
+
 def address_of(host: str, port: int) -> str:
     """The address of a page, to type into a browser."""
+    if host in ("0.0.0.0", "::"):  # every address of this machine: the one it reaches others by
+        host = _own_address()
     return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
