@@ -312,11 +312,10 @@ class TrainingSamples:
         most = min(model.context, config.data.views - 1)
         self._context = ContextChoice(most=most)
         self._fill = model.hints.fill
-        self._train = self._data_set("train")
-        data, cache = config.data, config.data.cache
-        self._data = self._train
-        if data.pool:
-            self._data = PooledViews(self._train, data.pool, None if cache is None else Path(cache))
+        self._train = self._data = self._data_set("train")
+        if pool := config.data.pool:
+            cache = config.data.cache
+            self._data = PooledViews(self._train, pool, None if cache is None else Path(cache))
 
     @property
     def group(self) -> int:
@@ -361,32 +360,26 @@ class TrainingSamples:
         return batch if self.config.data.projections else batch.unprojected
 
     def _data_set(self, split: str) -> Samples:
-        data = self.config.data
-        rooms = ProceduralViews(
-            seed=self.config.seed,
-            split=split,
-            views=data.views,
-            size=data.size,
-            context=self._context,
-            faults=data.faults,
-            fill=self._fill,
-        )
+        data, seed, share = self.config.data, self.config.seed, self.config.data.scene_share
+        common: dict[str, Any] = {
+            "seed": seed,
+            "views": data.views,
+            "size": data.size,
+            "context": self._context,
+            "fill": self._fill,
+        }
+        rooms = ProceduralViews(split=split, faults=data.faults, **common)
         if not data.scenes or split != "train":
             return rooms
-        seed, share = self.config.seed, data.scene_share
-        recorded = recorded_sources(data.scenes, self._recorded, share=share, seed=seed)
-        return Mixture((SampleSource(ROOMS, 1 - share, rooms), *recorded), seed)
 
-    def _recorded(self, scenes: SceneCollection) -> SceneViews:
-        data = self.config.data
-        return SceneViews(
-            scenes=scenes,
-            select=data.scene_select,
-            overlap=data.scene_overlap,
-            seed=self.config.seed,
-            views=data.views,
-            size=data.size,
-            context=self._context,
-            faults=data.scene_faults,
-            fill=self._fill,
-        )
+        def windows(scenes: SceneCollection) -> SceneViews:
+            return SceneViews(
+                scenes=scenes,
+                select=data.scene_select,
+                overlap=data.scene_overlap,
+                faults=data.scene_faults,
+                **common,
+            )
+
+        recorded = recorded_sources(data.scenes, windows, share=share, seed=seed)
+        return Mixture((SampleSource(ROOMS, 1 - share, rooms), *recorded), seed)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
@@ -120,9 +121,9 @@ class SampleInputs:
     rng: np.random.Generator  # draws the faults; used up by one sample
 
 
-@dataclass(frozen=True, kw_only=True)
-class ProceduralViews:
-    """Views of procedural scenes; every number has a scene of its own."""
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ClipSamples(ABC):
+    """Samples of clips: some views of each are given, with faults, the others are targets."""
 
     seed: int = 0  # 0 or more
     split: str = "train"  # "train" or "held-out": other photographs, layouts and numbers
@@ -134,15 +135,20 @@ class ProceduralViews:
     faults: CorruptionOptions | None = field(default_factory=CorruptionOptions)
     fill: str = "none"  # of the model's configuration, ``hints.fill``
 
-    def __post_init__(self) -> None:
-        check_split(self.split)
+    @abstractmethod
+    def clips(self, index: int, attempt: int = 0) -> tuple[Clip, Clip]:
+        """The views of a sample: as they are observed, and at the model's size."""
+
+    @abstractmethod
+    def rng(self, index: int, stream: int, attempt: int = 0) -> np.random.Generator:
+        """A stream of random numbers of a sample."""
 
     def sample(self, index: int, attempt: int = 0) -> TrainingSample:
-        """The sample of a number, the same at every attempt."""
-        inputs = self.inputs(index)
+        """The sample of a number, 0 or more."""
+        inputs, truth = self._inputs(index, attempt)
         return make_sample(
             inputs.clip,
-            inputs.clip,
+            truth,
             inputs.context,
             rng=inputs.rng,
             strength=inputs.strength,
@@ -151,18 +157,44 @@ class ProceduralViews:
 
     def inputs(self, index: int) -> SampleInputs:
         """What the sample of a number is made of."""
-        clip = self.clip(index)
-        rng = self._rng(index, FAULTS)
+        return self._inputs(index, 0)[0]
+
+    def _inputs(self, index: int, attempt: int) -> tuple[SampleInputs, Clip]:
+        clip, truth = self.clips(index, attempt)
+        rng = self.rng(index, FAULTS, attempt)
         strength = draw_strengths(rng, self.faults or CorruptionOptions(clean=1.0))
         count = self.context.count(context_seed(self.seed, self.split), index)
         context = self.context.choose(rng, self.views, count)
-        return SampleInputs(clip, context, strength, rng)
+        return SampleInputs(clip, context, strength, rng), truth
+
+    def describe(self) -> dict[str, Any]:
+        """Everything that decides the samples, as plain data."""
+        plain = {name: getattr(self, name) for name in ("seed", "views", "size", "fill")}
+        faults = None if self.faults is None else self.faults.to_dict()
+        return {**plain, "context": asdict(self.context), "faults": faults}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ProceduralViews(ClipSamples):
+    """Views of procedural scenes; every number has a scene of its own, the same at any attempt."""
+
+    def __post_init__(self) -> None:
+        check_split(self.split)
+
+    def rng(self, index: int, stream: int, attempt: int = 0) -> np.random.Generator:
+        """A stream of random numbers of a sample."""
+        return np.random.default_rng([*context_seed(self.seed, self.split), index, stream])
+
+    def clips(self, index: int, attempt: int = 0) -> tuple[Clip, Clip]:
+        """The views of a sample, observed at the model's size."""
+        clip = self.clip(index)
+        return clip, clip
 
     def clip(self, index: int) -> Clip:
         """The true views of a sample in order."""
-        place = scene(self._rng(index, SCENE), self.split)
+        place = scene(self.rng(index, SCENE), self.split)
         cameras = camera_path(
-            self._rng(index, PATH), place.geometry, views=self.views, size=self.size
+            self.rng(index, PATH), place.geometry, views=self.views, size=self.size
         )
         light, depth = radiance(place.geometry, place.look, cameras)
         exposure = place.key / max(float(light.mean()), 1e-6)
@@ -170,26 +202,13 @@ class ProceduralViews:
 
     def describe(self) -> dict[str, Any]:
         """Everything that decides the samples, as plain data."""
-        return {
-            "source": "procedural",
-            **shared_settings(self),
-            "photographs": photograph_names(self.split),
-        }
-
-    def _rng(self, index: int, stream: int) -> np.random.Generator:
-        return np.random.default_rng([*context_seed(self.seed, self.split), index, stream])
+        photographs = photograph_names(self.split)
+        return {"source": "procedural", **super().describe(), "photographs": photographs}
 
 
 def context_seed(seed: int, split: str = "train") -> list[int]:
     """What numbers of context views are drawn with: one for all sources that batches mix."""
     return [seed, PROCEDURAL, check_split(split)]
-
-
-def shared_settings(views: Any) -> dict[str, Any]:
-    """The settings that procedural and recorded views share, as plain data."""
-    plain = {name: getattr(views, name) for name in ("seed", "views", "size", "fill")}
-    faults = None if views.faults is None else views.faults.to_dict()
-    return {**plain, "context": asdict(views.context), "faults": faults}
 
 
 ATTEMPTS = 40
@@ -218,8 +237,8 @@ class SampleView:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class SceneViews:
-    """Windows of recorded scenes.
+class SceneViews(ClipSamples):
+    """Windows of recorded scenes, cropped about their centre; of each attempt another one.
 
     A scene is drawn in proportion to the root of its number of views with depth; where that is not
     known before a scene is opened, all are equally likely. What depth a view has counts as true.
@@ -230,16 +249,9 @@ class SceneViews:
     # when they are drawn.
     scenes: SceneCollection
     select: str = "all"  # which of a scene's views are used, see ``selection.select``
-    seed: int = 0  # 0 or more
-    views: int = 8  # of a sample
-    # (H, W) of the pictures; views are cropped about their centre to this aspect
-    size: tuple[int, int] = (96, 96)
     # least share of a view's depth that the next view of the window shows, too
     overlap: float = 0.4
-    # how many views are given, and which
-    context: ContextChoice = field(default_factory=ContextChoice)
-    faults: CorruptionOptions | None = GENTLE  # see CorruptionOptions; None for none
-    fill: str = "none"  # of the model's configuration, ``hints.fill``
+    faults: CorruptionOptions | None = GENTLE
     _shares: NDArray[np.float64] = field(init=False, repr=False, default_factory=lambda: np.ones(0))
 
     def __post_init__(self) -> None:
@@ -257,18 +269,13 @@ class SceneViews:
             )
         object.__setattr__(self, "_shares", shares / shares.sum())
 
-    def sample(self, index: int, attempt: int = 0) -> TrainingSample:
-        """The sample of a number, 0 or more; of each attempt another one."""
-        clip, truth = self.clips(index, attempt)
-        rng = np.random.default_rng([self.seed, RECORDED, index, FAULTS, attempt])
-        strength = draw_strengths(rng, self.faults or CorruptionOptions(clean=1.0))
-        count = self.context.count(context_seed(self.seed), index)
-        context = self.context.choose(rng, self.views, count)
-        return make_sample(clip, truth, context, rng=rng, strength=strength, fill=self.fill)
+    def rng(self, index: int, stream: int, attempt: int = 0) -> np.random.Generator:
+        """A stream of random numbers of a sample."""
+        return np.random.default_rng([self.seed, RECORDED, index, stream, attempt])
 
     def clips(self, index: int, attempt: int = 0) -> tuple[Clip, Clip]:
         """The window of a sample: as it is observed, and at the model's size."""
-        rng = np.random.default_rng([self.seed, RECORDED, index, PATH, attempt])
+        rng = self.rng(index, PATH, attempt)
         number = int(rng.choice(len(self._shares), p=self._shares))
         try:
             views = _usable(self, number)
@@ -312,13 +319,9 @@ class SceneViews:
 
     def describe(self) -> dict[str, Any]:
         """Everything that decides the samples, as plain data."""
-        return {
-            "source": "recorded",
-            "scenes": {"title": self.scenes.title, "digest": self.scenes.digest},
-            "select": self.select,
-            "overlap": self.overlap,
-            **shared_settings(self),
-        }
+        scenes = {"title": self.scenes.title, "digest": self.scenes.digest}
+        own = {"scenes": scenes, "select": self.select, "overlap": self.overlap}
+        return {"source": "recorded", **own, **super().describe()}
 
 
 @lru_cache(KEPT_SCENES)

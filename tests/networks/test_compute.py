@@ -230,16 +230,6 @@ def conditions() -> Any:
         return model, model.prepare(batch, video=micro.video_features(1, VIEWS, grid=GRID))
 
 
-def test_a_matrix_of_scores_would_be_seen():
-    q = torch.randn(1, 2, 512, 16)
-    with Largest() as largest:
-        (q @ q.mT).softmax(-1) @ q
-    assert largest.count == 2 * 512 * 512
-    with Largest() as largest, torch.nn.attention.sdpa_kernel(torch.nn.attention.SDPBackend.MATH):
-        attend(q, q, q)
-    assert largest.count == 2 * 512 * 512
-
-
 @pytest.mark.slow
 def test_the_denoiser_with_video_keys_and_with_the_control_branch():
     model, prepared = conditions()

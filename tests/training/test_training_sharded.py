@@ -67,9 +67,8 @@ def same_weights(found: Path, wanted: Path) -> None:
 def same_gradients(found: Path, wanted: Path, most: float) -> None:
     """Of the one step that was made, as Adam's averages have them; of every parameter.
 
-    Args:
-        most: by which a parameter's gradients may differ, of its gradient's norm; and besides by a
-            millionth of the greatest one, which is what rounding leaves of a gradient that is 0.
+    They differ by a share of the norm, and by a millionth of the greatest one, which is what
+    rounding leaves of a gradient that is 0.
     """
     one, two = (
         torch.load(stage / "state.pt", weights_only=True)["optimizer"]["state"]
