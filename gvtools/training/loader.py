@@ -32,6 +32,10 @@ from gvtools.training.samples import TENSORS, TrainingBatch, TrainingSample, col
 from gvtools.training.views import Samples
 from gvtools.untrusted import load_arrays
 
+Arrays = dict[str, NDArray[Any]]
+# A sample on its way to the training, or why there is none.
+Parcel = Arrays | GvError
+
 COLORS, DEPTHS = ("images", "hint"), ("depth", "hint_depth", "evidence")
 GREATEST = float(np.finfo(np.float16).max)
 
@@ -50,15 +54,15 @@ class PooledViews:
         """The sample of a number; numbers ``count`` apart have the same."""
         number = index % self.count
         if self.folder is None:
-            return _dequantise(_quantise(self.data.sample(number)))
+            return _sample(_dequantise(_quantise(_arrays(self.data.sample(number)))))
         path = self._place / f"{number:06d}.npz"
         packed = _read(path) if path.exists() else None
         if packed is None:
-            packed = _quantise(self.data.sample(number))
+            packed = _quantise(_arrays(self.data.sample(number)))
             # Without compression: reading is to cost nothing.
             with replaced_when_written(path) as temporary, temporary.open("wb") as file:
                 np.savez(file, **packed)  # type: ignore[arg-type]
-        return _dequantise(packed)
+        return _sample(_dequantise(packed))
 
     def describe(self) -> dict[str, Any]:
         """Everything that decides the samples, as plain data."""
@@ -80,45 +84,34 @@ def _code() -> bytes:
     return digest.digest()
 
 
-def _quantise(sample: TrainingSample) -> dict[str, NDArray[Any]]:
-    packed: dict[str, NDArray[Any]] = {
-        "context": np.array(sample.context),
-        "notes": np.array(sample.notes, str),
-    }
-    for name in TENSORS:
-        values = getattr(sample, name).numpy()
-        if name in COLORS:
-            values = np.rint(values * 255).astype(np.uint8)
-        elif name in DEPTHS:
-            values = np.clip(values, 0, GREATEST).astype(np.float16)
-        packed[name] = values
-    return packed
+def _arrays(sample: TrainingSample) -> Arrays:
+    tensors = {name: getattr(sample, name).numpy() for name in TENSORS}
+    return {"context": np.array(sample.context), "notes": np.array(sample.notes, str), **tensors}
 
 
-def _dequantise(packed: dict[str, NDArray[Any]]) -> TrainingSample:
-    tensors: dict[str, Any] = {}
-    for name in TENSORS:
-        values = packed[name]
-        if name in COLORS:
-            tensors[name] = torch.from_numpy(values).float() / 255
-        elif name in DEPTHS:
-            tensors[name] = torch.from_numpy(values.astype(np.float32))
-        else:
-            tensors[name] = torch.from_numpy(values)
-    notes = tuple(packed["notes"].tolist())
-    return TrainingSample(**tensors, context=int(packed["context"]), notes=notes)
+def _sample(arrays: Arrays) -> TrainingSample:
+    tensors: dict[str, Any] = {name: torch.from_numpy(arrays[name]) for name in TENSORS}
+    notes = tuple(arrays["notes"].tolist())
+    return TrainingSample(**tensors, context=int(arrays["context"]), notes=notes)
 
 
-def _read(path: Path) -> dict[str, NDArray[Any]] | None:
+def _quantise(arrays: Arrays) -> Arrays:
+    colors = {name: np.rint(arrays[name] * 255).astype(np.uint8) for name in COLORS}
+    depths = {name: np.clip(arrays[name], 0, GREATEST).astype(np.float16) for name in DEPTHS}
+    return {**arrays, **colors, **depths}
+
+
+def _dequantise(arrays: Arrays) -> Arrays:
+    colors = {name: arrays[name].astype(np.float32) / np.float32(255) for name in COLORS}
+    return {**arrays, **colors, **{name: arrays[name].astype(np.float32) for name in DEPTHS}}
+
+
+def _read(path: Path) -> Arrays | None:
     """None where the file is damaged: it is made again."""
     try:
         return load_arrays(path)
     except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile):
         return None
-
-
-# A sample on its way to the training, or why there is none.
-_Parcel = tuple[int, tuple[str, ...], dict[str, NDArray[Any]]] | GvError
 
 
 def batches(
@@ -132,8 +125,8 @@ def batches(
         for part in parts:
             yield collate([data.sample(number) for number in part])
         return
-    loader: torch.utils.data.DataLoader[list[_Parcel]] = torch.utils.data.DataLoader(
-        _Arrays(data),  # type: ignore[arg-type]
+    loader: torch.utils.data.DataLoader[list[Parcel]] = torch.utils.data.DataLoader(
+        _ArraySamples(data),  # type: ignore[arg-type]
         batch_sampler=parts,  # type: ignore[arg-type]
         num_workers=workers,
         collate_fn=_identity,
@@ -145,10 +138,15 @@ def batches(
     )
     stream = iter(loader)
     while (parcels := _next(stream)) is not None:
-        yield collate([_unpack(parcel) for parcel in parcels])
+        samples = []
+        for parcel in parcels:
+            if isinstance(parcel, GvError):
+                raise parcel
+            samples.append(_sample(parcel))
+        yield collate(samples)
 
 
-def _next(stream: Iterator[list[_Parcel]]) -> list[_Parcel] | None:
+def _next(stream: Iterator[list[Parcel]]) -> list[Parcel] | None:
     try:
         return next(stream, None)
     except RuntimeError as error:
@@ -160,7 +158,7 @@ def _next(stream: Iterator[list[_Parcel]]) -> list[_Parcel] | None:
         ) from error
 
 
-class _Arrays:
+class _ArraySamples:
     """A data set's samples as arrays.
 
     Arrays travel through a pipe; tensors would take shared memory, of which containers have little.
@@ -169,22 +167,12 @@ class _Arrays:
     def __init__(self, data: Samples) -> None:
         self.data = data
 
-    def __getitem__(self, number: int) -> _Parcel:
+    def __getitem__(self, number: int) -> Parcel:
         try:
-            sample = self.data.sample(number)
+            return _arrays(self.data.sample(number))
         except GvError as error:
             # Raised in this process it would reach the user as a traceback.
             return error
-        arrays = {name: getattr(sample, name).numpy() for name in TENSORS}
-        return sample.context, sample.notes, arrays
-
-
-def _unpack(parcel: _Parcel) -> TrainingSample:
-    if isinstance(parcel, GvError):
-        raise parcel
-    context, notes, arrays = parcel
-    tensors: dict[str, Any] = {name: torch.from_numpy(value) for name, value in arrays.items()}
-    return TrainingSample(**tensors, context=context, notes=notes)
 
 
 def _identity(item: Any) -> Any:

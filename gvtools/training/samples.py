@@ -114,7 +114,7 @@ class TrainingSample:
     K: Tensor  # (V, 3, 3), pixels, pixel centres at + 0.5
     place: Tensor  # (V,) int64, where each view stands along the path
     context: int  # number of context views
-    notes: tuple[str, ...] = ()  # what happened when it was drawn, to be counted, see ``mixture``
+    notes: tuple[str, ...] = ()  # what happened when it was drawn, to be counted, see ``data``
 
 
 # The parts of a sample that are tensors.

@@ -11,13 +11,6 @@ from geoverse_folders import PLAIN, write_source
 
 
 @pytest.fixture(scope="session")
-def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Encodes with known cameras and fills holes, as ``tiny`` does."""
-    hints = {"cameras": True, "fill": "push-pull", "mask": 0.0}
-    return micro.weights_folder(tmp_path_factory.mktemp("micro"), micro.config(hints=hints))
-
-
-@pytest.fixture(scope="session")
 def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder of published files."""
     return write_source(tmp_path_factory.mktemp("published"))
