@@ -2,19 +2,16 @@
 
 A settings class is a pydantic model. The text below a field is its documentation, which may end in
 its unit ("[px]"), and ``Field(ge=, gt=, le=, lt=)`` its range. Wrong values end in an OptionError
-of one line. A section may also be a plain dataclass, where the code that it configures needs torch
-alone; its documentation is the ``Attributes`` of its docstring.
+of one line.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import difflib
-import inspect
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, TypeVar, get_args, get_type_hints
+from typing import Any, ClassVar, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -90,11 +87,10 @@ class Entry:
     unit: str = ""  # "" where it has none, or where the documentation says it in words
 
     @property
-    def section(self) -> type[Any] | None:
+    def section(self) -> type[Settings] | None:
         """The class of a nested section, which may be optional; None for a plain field."""
-        choices = [kind for kind in (self.kind, *get_args(self.kind)) if isinstance(kind, type)]
-        nested = (kind for kind in choices if is_section(kind))
-        return next(nested, None)
+        choices = (kind for kind in (self.kind, *get_args(self.kind)) if isinstance(kind, type))
+        return next((kind for kind in choices if issubclass(kind, Settings)), None)
 
     @property
     def optional(self) -> bool:
@@ -102,19 +98,8 @@ class Entry:
         return type(None) in get_args(self.kind)
 
 
-def is_section(kind: Any) -> bool:
-    """Whether a type is a class of settings: a model or a dataclass."""
-    return isinstance(kind, type) and (issubclass(kind, Settings) or dataclasses.is_dataclass(kind))
-
-
-def entries(kind: type[Any]) -> dict[str, Entry]:
+def entries(kind: type[Settings]) -> dict[str, Entry]:
     """The fields of a class of settings, by name."""
-    if not issubclass(kind, Settings):
-        text = inspect.cleandoc(kind.__doc__ or "").partition("Attributes:")[2]
-        docs = dict(re.findall(r"^ {4}(\w+): (.*(?:\n {8}.*)*)", text, re.MULTILINE))
-        hints = get_type_hints(kind)
-        names = [field.name for field in dataclasses.fields(kind) if field.init]
-        return {name: _entry(hints[name], (), docs.get(name, "")) for name in names}
     return {
         name: _entry(field.annotation, field.metadata, field.description or "")
         for name, field in kind.model_fields.items()
@@ -156,7 +141,7 @@ def unknown(key: str, known: list[str]) -> str:
     return f"no setting {key!r}; {hint}"
 
 
-def keys(kind: type[Any], prefix: str | None = None) -> list[str]:
+def keys(kind: type[Settings], prefix: str | None = None) -> list[str]:
     """Every dotted key of a class of settings."""
     if prefix is None:
         prefix = f"{kind.section}." if kind.section else ""
@@ -169,12 +154,12 @@ def keys(kind: type[Any], prefix: str | None = None) -> list[str]:
     return names
 
 
-def hidden(kind: type[Any]) -> frozenset[str]:
+def hidden(kind: type[Settings]) -> frozenset[str]:
     """Fields that are set by the options of another one, see ``Settings.options_of``."""
-    return frozenset(kind.options_of.values()) if issubclass(kind, Settings) else frozenset()
+    return frozenset(kind.options_of.values())
 
 
-def _entry_at(kind: type[Any], path: Sequence[str]) -> Entry | None:
+def _entry_at(kind: type[Settings], path: Sequence[str]) -> Entry | None:
     """The field at a path; None where there is none."""
     entry = entries(kind).get(path[0])
     if entry is None or len(path) == 1:

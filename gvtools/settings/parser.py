@@ -105,7 +105,7 @@ def _path(kind: type[Settings], key: str) -> list[str]:
 
 def _put(tree: dict[str, Any], path: list[str], value: Any, *, kind: type[Settings]) -> None:
     """Enter a value into the tree of changes, converted as far as its text needs."""
-    inner: type[Any]
+    inner: type[Settings]
     key, inner, place = ".".join([kind.section, *path] if kind.section else path), kind, tree
     for at, name in enumerate(path):
         entry = entries(inner).get(name)
@@ -147,7 +147,7 @@ def _converted(key: str, entry: Entry, value: Any) -> Any:
     return value
 
 
-def _merged(kind: type[Any], current: Any, tree: Mapping[str, Any]) -> dict[str, Any]:
+def _merged(kind: type[Settings], current: Any, tree: Mapping[str, Any]) -> dict[str, Any]:
     """The fields of ``current`` with the changes of a tree, sections as dictionaries.
 
     A section that is absent so far begins with its defaults.

@@ -10,7 +10,6 @@ from pydantic import Field, model_validator
 
 from gvtools.completers.geoverse.config import GeoVerseConfig, named, read
 from gvtools.completers.geoverse.flow import check_bounds
-from gvtools.completers.geoverse.objective import LossWeights
 from gvtools.errors import OptionError
 from gvtools.networks import TrainingPrecision
 from gvtools.settings import Settings, with_file
@@ -118,6 +117,23 @@ class EncoderStageOptions(FeatureOptions):
     """Weight of the camera decoder's error."""
     statistics: int = Field(32, ge=1)
     """Batches over which the latents' statistics are measured at the end."""
+
+
+class LossWeights(Settings):
+    """Coefficients of the terms; the paper gives none."""
+
+    section = "denoiser.weights"
+
+    level1: float = Field(1.0, ge=0)
+    """Of L_FM^1."""
+    level0: float = Field(1.0, ge=0)
+    """Of L_FM^0."""
+    rgb: float = Field(1.0, ge=0)
+    """Of L_rgb."""
+    hf: float = Field(1.0, ge=0)
+    """Of L_hf."""
+    depth: float = Field(1.0, ge=0)
+    """Of L_depth."""
 
 
 class DenoiserStageOptions(Settings):

@@ -142,7 +142,7 @@ class DenoiserStage(Stage):
             predicted,
             truth,
             context=batch.views.context,
-            weights=options.weights,
+            weights=dict(options.weights),
             context_weight=options.context_weight,
         )
         return result.total, {**result.terms, **result.counts}

@@ -16,17 +16,14 @@ are NaN.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import partial
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
-
-from gvtools.networks.config_json import check_range
 
 DELTA = 1e-6
 # ITU-R BT.601; the paper says "grayscale" only.
@@ -232,29 +229,6 @@ def _wide(x: Tensor) -> Tensor:
     return x.to(torch.promote_types(x.dtype, torch.float32))
 
 
-@dataclass(frozen=True)
-class LossWeights:
-    """Coefficients of the terms; the paper gives none.
-
-    Attributes:
-        level1: of L_FM^1.
-        level0: of L_FM^0.
-        rgb: of L_rgb.
-        hf: of L_hf.
-        depth: of L_depth.
-    """
-
-    level1: float = 1.0
-    level0: float = 1.0
-    rgb: float = 1.0
-    hf: float = 1.0
-    depth: float = 1.0
-
-    def __post_init__(self) -> None:
-        for item in fields(self):
-            check_range(f"loss weight {item.name}", getattr(self, item.name), ge=0, lt=math.inf)
-
-
 @dataclass(frozen=True, eq=False)
 class Objective:
     """The objective of one mini-batch."""
@@ -279,7 +253,7 @@ def objective(
     reference: Mapping[str, Tensor],
     *,
     context: int,  # number of context views
-    weights: LossWeights,
+    weights: Mapping[str, float],  # coefficients of the terms by name; 1 where there is none
     context_weight: float = 0.25,  # see ``flow_matching_loss``
 ) -> Objective:
     """Every term that has a prediction, their weighted sum, and their counts."""
@@ -307,7 +281,7 @@ def objective(
         counts["depth_without_scale"] = (~similarity.ok).sum()
     terms, total = {}, None
     for name, loss in losses.items():
-        weight = getattr(weights, name)
+        weight = weights.get(name, 1.0)
         with nullcontext() if weight > 0 else torch.no_grad():
             terms[name] = loss().mean()
         if weight > 0:
