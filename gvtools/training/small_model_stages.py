@@ -30,7 +30,7 @@ from gvtools.completers.geoverse.composition import compose, correct_depth, remo
 from gvtools.completers.geoverse.conditioning import ViewBatch, encode_views, fill_holes
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.completers.geoverse.objective import high_gradient_loss, rgb_loss
-from gvtools.completers.geoverse.refiner import CompletedViews, completed_views, crop_views
+from gvtools.completers.geoverse.refiner import CompletedViews, completed_views
 from gvtools.errors import OptionError
 from gvtools.networks.depth_anything.encoder import encode_cameras, patch_rays
 from gvtools.networks.depth_anything.geometry_head import ViewGeometry
@@ -426,26 +426,25 @@ def augment(
         flat = (flat ** exponent[..., None] * gain[..., None]).clamp(0, 1)
         return flat.reshape(values.shape)
 
-    def turned(values: Tensor) -> Tensor:
-        return torch.where(mirrored[:, None, None, None], values.flip(-1), values)
-
-    views = replace(
-        views,
-        filled=colored(turned(views.filled)),
-        depth=turned(views.depth),
-        valid=turned(views.valid),
-        evidence=turned(views.evidence),
-        made=colored(turned(views.made)),
-        mean=colored(views.mean),
-    )
     share, *places = draws.numbers("window", 3).tolist()
     rows, columns = (
         _part(side, CUT + (1 - CUT) * share, place)
         for side, place in zip(truth.shape[-2:], places, strict=True)
     )
-    truth = colored(turned(truth))[..., rows, columns]
-    cut = [turned(values)[..., rows, columns] for values in maps]
-    return crop_views(views, (rows, columns)), truth, cut
+
+    def cut(values: Tensor) -> Tensor:
+        turned = torch.where(mirrored[:, None, None, None], values.flip(-1), values)
+        return turned[..., rows, columns]
+
+    views = CompletedViews(
+        filled=colored(cut(views.filled)),
+        depth=cut(views.depth),
+        valid=cut(views.valid),
+        evidence=cut(views.evidence),
+        made=colored(cut(views.made)),
+        mean=colored(views.mean),
+    )
+    return views, colored(cut(truth)), [cut(values) for values in maps]
 
 
 def _part(side: int, share: float, place: float) -> slice:

@@ -10,7 +10,7 @@ the paper, which has nothing of the kind.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 
 import torch
@@ -263,10 +263,3 @@ def _blur(values: Tensor, share: float) -> Tensor:
         )
     )
     return down @ values @ right.T
-
-
-def crop_views(views: CompletedViews, window: tuple[slice, slice]) -> CompletedViews:
-    """The same window of all views; its sides are even."""
-    rows, columns = window
-    names = ("filled", "depth", "valid", "evidence", "made")
-    return replace(views, **{name: getattr(views, name)[..., rows, columns] for name in names})
