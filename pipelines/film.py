@@ -133,10 +133,12 @@ class FilmRenderer:
         # Seconds spent on projecting the memory and drawing the Gaussians.
         self.projecting = 0.0
 
-    def frame(self, index: int, panels: Sequence[str]) -> Picture:
-        """(H, W, 3) one frame, its panels side by side."""
+    def frame(self, index: int, panels: Sequence[str], *, captions: bool = False) -> Picture:
+        """(H, W, 3) one frame, its panels side by side, each with its name or without."""
         pictures = [self._panel(index, panel) for panel in panels]
-        return pictures[0] if len(pictures) == 1 else np.concatenate(pictures, axis=1)
+        if captions:
+            pictures = [captioned(*pair) for pair in zip(pictures, panels, strict=True)]
+        return np.concatenate(pictures, axis=1)
 
     def _panel(self, index: int, panel: str) -> Picture:
         camera = self.cameras[index]

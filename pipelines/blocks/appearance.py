@@ -84,8 +84,7 @@ def join_appearances(parts: Sequence[BlockAppearance], frame: LocalFrame) -> App
 def brightness(parts: Sequence[dict[str, Float64]]) -> Float64:
     """(B, 3) logarithms that each block's exposures lack to one scale, with mean zero.
 
-    Args:
-        parts: of each block the logarithmic gains (3,) of its photographs, by name.
+    ``parts`` are of each block the logarithmic gains (3,) of its photographs, by name.
 
     >>> one, two = {"a": np.zeros(3), "b": np.ones(3)}, {"b": np.full(3, 0.5), "c": np.zeros(3)}
     >>> brightness([one, two]).round(2)[:, 0].tolist()
@@ -220,16 +219,9 @@ def fit_across(
     log_gains, found = given.copy(), ended[0].appearance.exposures
     assert found is not None
     log_gains[rows] = found.log_gains + level
-    return replace(
-        joined,
-        appearance=replace(
-            whole,
-            gaussians=fits[0],
-            others=tuple(fits[1:]),
-            exposures=replace(whole.exposures, log_gains=log_gains),
-        ),
-        steps=joined.steps + ended[0].steps,
-    )
+    exposures = replace(whole.exposures, log_gains=log_gains)
+    appearance = replace(whole, gaussians=fits[0], others=tuple(fits[1:]), exposures=exposures)
+    return replace(joined, appearance=appearance, steps=joined.steps + ended[0].steps)
 
 
 def _options(refine: FitOptions, *, fits: int) -> FitOptions:

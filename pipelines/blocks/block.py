@@ -9,12 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer
 
 from gvtools.errors import OptionError, ProjectError
 from gvtools.files import write_json
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
 
 
 FILE = "block.json"
-FORMAT, VERSION = "gvtools block", 1
 Float64 = NDArray[np.float64]
 
 
@@ -58,21 +58,48 @@ class BlockCell:
         return ((points >= self.low) & (points < self.high)).all(axis=1)
 
 
-@dataclass(frozen=True, eq=False)
-class SceneBlock:
-    """One block of a split project."""
+def _corner(value: Any, *, open_at: float) -> Float64:
+    """(3,) of what JSON has, which knows no infinity."""
+    return np.array([open_at if each is None else each for each in value], np.float64)
 
+
+def _pose(value: Any) -> Float64:
+    pose = np.array(value, np.float64)
+    if pose.shape != (4, 4) or not np.isfinite(pose).all():
+        raise ValueError("a pose is no 4x4 matrix of numbers")
+    return pose
+
+
+_AS_LISTS = PlainSerializer(lambda array: array.tolist())
+_Low = Annotated[Float64, BeforeValidator(partial(_corner, open_at=-np.inf)), _AS_LISTS]
+_High = Annotated[Float64, BeforeValidator(partial(_corner, open_at=np.inf)), _AS_LISTS]
+_Pose = Annotated[Float64, BeforeValidator(_pose), _AS_LISTS]
+
+
+class SceneBlock(BaseModel):
+    """One block of a split project, as ``block.json`` has it."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
+
+    format: Literal["gvtools block"] = "gvtools block"
+    version: Literal[1] = 1
     name: str  # also of its folder
     names: tuple[str, ...]  # of all blocks of the split
     project: str  # what opens the whole project
-    reading: Mapping[str, Any]  # how that is read, JSON-ready
-    cell: BlockCell
+    reading: dict[str, Any]  # how that is read, JSON-ready
+    low: _Low  # corners of its cell
+    high: _High
     owners: tuple[str, ...]  # context views in the cell, in order of their names
     helpers: tuple[str, ...]  # context views of other cells
     targets: tuple[str, ...]  # held-out views in the cell
     # (4, 4) cam_from_world of each owner and target, exactly as the blocks have them.
-    poses: Mapping[str, Float64]
+    poses: dict[str, _Pose]
     refined: bool  # whether these poses are other ones than the project's
+
+    @property
+    def cell(self) -> BlockCell:
+        """The part of space that it owns."""
+        return BlockCell(self.low, self.high)
 
     @property
     def context(self) -> tuple[str, ...]:
@@ -81,73 +108,27 @@ class SceneBlock:
 
     def save(self, folder: Path) -> None:
         """Write ``block.json`` into the block's folder."""
-        # JSON has no infinity; ``write_json`` makes it null.
-        write_json(
-            folder / FILE,
-            {
-                "format": FORMAT,
-                "version": VERSION,
-                "name": self.name,
-                "names": list(self.names),
-                "project": self.project,
-                "reading": dict(self.reading),
-                "low": self.cell.low.tolist(),
-                "high": self.cell.high.tolist(),
-                "owners": list(self.owners),
-                "helpers": list(self.helpers),
-                "targets": list(self.targets),
-                "poses": {name: pose.tolist() for name, pose in self.poses.items()},
-                "refined": self.refined,
-            },
-        )
+        write_json(folder / FILE, self.model_dump())
 
     @classmethod
     def load(cls, folder: Path) -> SceneBlock:
         """Read what ``save`` wrote."""
         path = folder / FILE
         try:
-            kept = _File.model_validate(read_json(path))
-            poses = {name: np.array(pose, np.float64) for name, pose in kept.poses.items()}
-            if any(pose.shape != (4, 4) or not np.isfinite(pose).all() for pose in poses.values()):
-                raise ValueError("a pose is no 4x4 matrix of numbers")
-            missing = {*kept.owners, *kept.targets} - poses.keys()
+            block = cls.model_validate(read_json(path))
+            missing = {*block.owners, *block.targets} - block.poses.keys()
             if missing:
                 raise ValueError(f"no pose of {min(missing)}")
         except FileNotFoundError:
             raise ProjectError(
                 f"{folder}: no {FILE}; expected a block that gvtools split wrote"
             ) from None
-        except (OSError, ValueError, ValidationError) as error:
+        except (OSError, TypeError, ValueError) as error:
             reason = " ".join(str(error).split())
             raise ProjectError(
                 f"{path}: no block of this version ({reason[:200]}); split the project again"
             ) from None
-        low = np.array([-np.inf if value is None else value for value in kept.low])
-        high = np.array([np.inf if value is None else value for value in kept.high])
-        return cls(
-            kept.name, tuple(kept.names), kept.project, kept.reading, BlockCell(low, high),
-            tuple(kept.owners), tuple(kept.helpers), tuple(kept.targets), poses, kept.refined,
-        )  # fmt: skip
-
-
-class _File(BaseModel):
-    """``block.json``."""
-
-    model_config = ConfigDict(extra="forbid")
-
-    format: Literal["gvtools block"]
-    version: Literal[1]
-    name: str
-    names: list[str]
-    project: str
-    reading: dict[str, Any]
-    low: tuple[float | None, float | None, float | None]
-    high: tuple[float | None, float | None, float | None]
-    owners: list[str]
-    helpers: list[str]
-    targets: list[str]
-    poses: dict[str, list[list[float]]]
-    refined: bool
+        return block
 
 
 # Context views for each block if the number of blocks is not given.
@@ -164,9 +145,6 @@ def cut_cells(centers: Float64, count: int) -> dict[str, BlockCell]:
     An axis-parallel plane across the longest side of the centres' box divides them in two, then
     each part is divided in the same way, as in Hierarchical-3DGS. A name such as "0_1" encodes the
     path to the cell in this binary tree: the first half of its bits as a number, and the second.
-
-    Args:
-        centers: (V, 3), world frame, scene units.
 
     >>> places = np.array([[0, 0, 0], [1, 0, 0], [5, 0, 0], [5, 1, 0]], float)
     >>> {name: cell.holds(places).tolist() for name, cell in cut_cells(places, 2).items()}

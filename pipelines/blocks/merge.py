@@ -17,11 +17,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gvtools.cameras import Cameras, concatenate
+from gvtools.cameras import concatenate
 from gvtools.completers.base import Completer, Completion, ContextView, ScaleAlignment, ScaleStatus
 from gvtools.errors import OptionError, ProjectError
 from gvtools.files import link_or_copy
@@ -79,17 +79,12 @@ class BlockRun:
 
     def targets(self, *, held_out: bool) -> list[RunTarget]:
         """The run's targets that are the block's own."""
-        held = set(self.block.targets)
         if held_out != self.held_out:
             return []
-        return [
-            target
-            for target in self.run.views
-            if (target.name in held if held_out else self._inside(target))
-        ]
-
-    def _inside(self, target: RunTarget) -> bool:
-        return bool(self.block.cell.holds(target.camera.centers).all())
+        if held_out:
+            return [target for target in self.run.views if target.name in self.block.targets]
+        inside = self.block.cell.holds
+        return [target for target in self.run.views if inside(target.camera.centers).all()]
 
     @property
     def held_out(self) -> bool:
@@ -138,10 +133,11 @@ def read_runs(paths: Sequence[Path], *, blocks: Path | None = None) -> list[Bloc
 
 
 def _check_alike(runs: Sequence[BlockRun]) -> None:
-    first = _shared(runs[0].run.record["settings"])
+    first = runs[0].run.record["settings"]
     for item in runs[1:]:
-        other = _shared(item.run.record["settings"])
-        different = sorted(key for key in {*first, *other} if first.get(key) != other.get(key))
+        other = item.run.record["settings"]
+        keys = {*first, *other} - set(OF_A_BLOCK)
+        different = sorted(key for key in keys if first.get(key) != other.get(key))
         if different:
             raise OptionError(
                 f"{item.run.path} and {runs[0].run.path} differ in {', '.join(different)}; "
@@ -152,10 +148,6 @@ def _check_alike(runs: Sequence[BlockRun]) -> None:
             f"{runs[0].run.path}: its generated points count as observed ones (protocol paper); "
             "expected them apart, since a merge observes again; reconstruct without"
         )
-
-
-def _shared(settings: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in settings.items() if key not in OF_A_BLOCK}
 
 
 # Confidence of what a block generated, where its run did not keep it.
@@ -210,11 +202,7 @@ def merge(
     console: Console,
     draw: Draw | None = None,  # see ``pipelines.reconstruction.run.reconstruct``
 ) -> Path:
-    """Merge the runs of all blocks of a split project.
-
-    Returns:
-        ``out``.
-    """
+    """Merge the runs of all blocks of a split project; returns ``out``."""
     runs = read_runs(paths, blocks=blocks)
     first = runs[0].block
     scene = open_recorded(first.project, first.reading, moved=project)
@@ -248,10 +236,15 @@ def _plan(
     context = tuple(sorted(name for item in runs for name in item.block.owners))
     # A block without held-out views has some path for its targets.
     held_out = any(item.held_out for item in runs)
-    targets = _named_targets(runs, held_out=held_out)
+    # Block by block; a block's name before those that are no views.
+    targets = {
+        target.name if held_out else f"{item.block.name}/{target.name}": target
+        for item in runs
+        for target in item.targets(held_out=held_out)
+    }
     names = tuple(sorted(targets)) if held_out else tuple(targets)
     settings = with_values(RunSettings(), dotted(runs[0].run.record["settings"])).replaced(
-        context=_selection(context), targets=_selection(names) if held_out else "interpolate:2"
+        context=",".join(context), targets=",".join(names) if held_out else "interpolate:2"
     )
     # What completes, and what is tuned for it, did so in the blocks.
     asked = with_values(settings, {"completer": "none", "tune.minutes": 0.0})
@@ -264,55 +257,31 @@ def _plan(
     if not held_out and names:
         kind = str(runs[0].run.record["targets_kind"])
         moved = concatenate([targets[name].camera for name in names])
-        named = Cameras(moved.K, moved.cam_from_world, moved.width, moved.height, names)
-        cameras = Targets(named, (None,) * len(names), kind)
+        cameras = Targets(replace(moved, names=names), (None,) * len(names), kind)
         if plan.poses is not None:
             plan = replace(plan, poses=replace(plan.poses, targets=moved.cam_from_world))
-    schedule = _schedule(targets, names)
+    # Rows of the targets by the rounds that their blocks had them in.
+    schedule = tuple(
+        tuple(row for row, name in enumerate(names) if targets[name].round == number)
+        for number in sorted({target.round for target in targets.values()})
+    )
     config = plan.config.replaced(completer=settings.completer, rounds=len(schedule))
     return replace(
         plan, settings=settings, config=config, targets=cameras, schedule=schedule
     ), targets
 
 
-def _selection(names: Sequence[str]) -> str:
-    return ",".join(names)
-
-
-def _named_targets(runs: Sequence[BlockRun], *, held_out: bool) -> dict[str, RunTarget]:
-    """The targets that stay, block by block; a block's name before those that are no views."""
-    return {
-        target.name if held_out else f"{item.block.name}/{target.name}": target
-        for item in runs
-        for target in item.targets(held_out=held_out)
-    }
-
-
-def _schedule(targets: dict[str, RunTarget], names: Sequence[str]) -> tuple[tuple[int, ...], ...]:
-    """Rows of the targets by the rounds that their blocks had them in."""
-    row = {name: number for number, name in enumerate(names)}
-    rounds = sorted({target.round for target in targets.values()})
-    return tuple(
-        tuple(row[name] for name in names if targets[name].round == number) for number in rounds
-    )
-
-
 def _poses(
-    runs: Sequence[BlockRun],
-    context: Sequence[str],
-    names: Sequence[str],
-    *,
+    runs: Sequence[BlockRun], context: Sequence[str], names: Sequence[str], *,
     targets: Mapping[str, RunTarget],
-) -> RunPoses | None:
+) -> RunPoses | None:  # fmt: skip
     """The poses of context and targets of the merged run; None where they are the project's."""
     if not (runs[0].block.refined or any(item.moved for item in runs)):
         return None
     found = {name: pose for item in runs for name, pose in item.poses.items()}
     found |= {name: pose for item in runs if not item.moved for name, pose in item.held.items()}
-    for name in names:
-        if name not in found:
-            camera = targets[name].camera.cam_from_world[0] if name in targets else np.eye(4)
-            found[name] = camera
+    for name in set(names) - found.keys():
+        found[name] = targets[name].camera.cam_from_world[0] if name in targets else np.eye(4)
     return RunPoses(
         np.array([found[name] for name in context]),
         np.array([found[name] for name in names]).reshape(-1, 4, 4),
@@ -362,9 +331,7 @@ def _fitted(plan: Plan, runs: Sequence[BlockRun], console: Console) -> Fitted | 
     ]
     appearance = join_appearances(parts, grid_frame(plan.scene, plan.context))
     fitted = Fitted(
-        appearance,
-        plan.poses,
-        spread=any(fitted.spread for fitted in found),
+        appearance, plan.poses, spread=any(fitted.spread for fitted in found),
         steps=min(fitted.steps for fitted in found),
-    )
+    )  # fmt: skip
     return fit_across(plan, fitted, [item.block for item in runs], console=console)

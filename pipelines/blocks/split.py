@@ -15,12 +15,12 @@ cannot be; so is a block's of another block's. Symbolic links would break on ano
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from gvtools.cameras import Cameras
 from gvtools.capture.project import replaced_folder
 from gvtools.errors import OptionError, ProjectError
 from gvtools.files import link_or_copy, write_text
@@ -38,7 +38,6 @@ from gvtools.view_selection import nearest_views
 from pipelines.blocks.block import (
     NEAREST,
     VIEWS_PER_BLOCK,
-    BlockCell,
     SceneBlock,
     cut_cells,
     helpers_of,
@@ -46,12 +45,7 @@ from pipelines.blocks.block import (
 )
 from pipelines.reconstruction.prepare import refined_poses_of
 
-if TYPE_CHECKING:
-    pass
-
-
 PROJECTS, CHUNKS = "projects", "chunks"
-LAYOUTS = (PROJECTS, CHUNKS)
 CONTEXT, TARGETS = "context.txt", "targets.txt"
 
 
@@ -71,7 +65,10 @@ def write_blocks(out: Path, scene: Scene, blocks: Sequence[SceneBlock], *, layou
     views = [scene[name] for name, places in holders.items() if places]
     for view, frame in zip(views, prefetch(lambda view: view.load(), views), strict=True):
         _write_view(view, frame, holders[view.name])
-    box = _box(scene.cameras)
+    # Of all cameras, wider by its longest side: chunks' boxes are finite.
+    centers = scene.cameras.centers
+    side = max(float(np.ptp(centers, axis=0).max()), 1e-9)
+    lowest, highest = centers.min(axis=0) - side, centers.max(axis=0) + side
     for block in blocks:
         folder = block_folder(out, block.name, layout)
         folder.mkdir(parents=True, exist_ok=True)
@@ -80,7 +77,7 @@ def write_blocks(out: Path, scene: Scene, blocks: Sequence[SceneBlock], *, layou
         write_text(folder / CONTEXT, "".join(f"{name}\n" for name in block.context))
         write_text(folder / TARGETS, "".join(f"{name}\n" for name in block.targets))
         if layout == CHUNKS:
-            low, high = np.maximum(block.cell.low, box.low), np.minimum(block.cell.high, box.high)
+            low, high = np.maximum(block.low, lowest), np.minimum(block.high, highest)
             for file, values in zip(CHUNK_BOX, ((low + high) / 2, high - low), strict=True):
                 write_text(folder / file, " ".join(str(value) for value in values.tolist()))
     if layout == CHUNKS:
@@ -92,60 +89,42 @@ def _held(block: SceneBlock) -> tuple[str, ...]:
     return tuple(sorted({*block.context, *block.targets}))
 
 
-def _box(cameras: Cameras) -> BlockCell:
-    """The box of all cameras, wider by its longest side: chunks' boxes are finite."""
-    centers = cameras.centers
-    side = max(float(np.ptp(centers, axis=0).max()), 1e-9)
-    return BlockCell(centers.min(axis=0) - side, centers.max(axis=0) + side)
-
-
 def _write_view(view: View, frame: Frame, places: Sequence[Path]) -> None:
     """A view's picture, mask and depth, below each of some folders."""
     file_stems((view.name,))  # refuses a name that leads out of a folder
     picture, mask, depth = (f"images/{view.name}", f"masks/{view.name}.png",
                             f"stereo/depth_maps/{view.name}.npz")  # fmt: skip
     own = _own_picture(view, frame)
-    first, *others = _made(places, picture)
+    first = _parent_made(places[0] / picture)
     if own is None:
         # By content, not by its name, is it known to be a PNG.
         write_png(first, frame.rgb)
     else:
         link_or_copy(own, first)
-    _repeat(first, others)
     if frame.mask is not None:
-        first, *others = _made(places, mask)
-        write_png(first, np.where(frame.mask, np.uint8(255), np.uint8(0)))
-        _repeat(first, others)
+        white = np.where(frame.mask, np.uint8(255), np.uint8(0))
+        write_png(_parent_made(places[0] / mask), white)
     if frame.depth is not None:
-        first, *others = _made(places, depth)
-        with first.open("wb") as file:
+        with _parent_made(places[0] / depth).open("wb") as file:
             np.savez_compressed(file, depth=frame.depth)
-        _repeat(first, others)
+    for place in places[1:]:
+        for name in (picture, mask, depth):
+            if (places[0] / name).exists():
+                link_or_copy(places[0] / name, _parent_made(place / name))
 
 
 def _own_picture(view: View, frame: Frame) -> Path | None:
     """The project's file that holds just the view's pixels; None where they were resampled."""
-    for path in view.files[:1]:
-        try:
-            found = read_image(path)
-        except ProjectError:
-            return None
+    with suppress(ProjectError):
         # What an alpha channel leaves out stands in the mask, too.
-        if found.rgb.shape == frame.rgb.shape and np.array_equal(found.rgb, frame.rgb):
-            return path
+        if view.files and np.array_equal(read_image(view.files[0]).rgb, frame.rgb):
+            return view.files[0]
     return None
 
 
-def _made(places: Sequence[Path], name: str) -> list[Path]:
-    paths = [place / name for place in places]
-    for path in paths:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    return paths
-
-
-def _repeat(path: Path, others: Sequence[Path]) -> None:
-    for other in others:
-        link_or_copy(path, other)
+def _parent_made(path: Path) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return path
 
 
 def _write_model(folder: Path, scene: Scene, names: Sequence[str]) -> None:
@@ -207,10 +186,7 @@ def split(
 
     ``overlap``: 0 to 1; a view is a helper of another block if at least the share ``1 - overlap``
     of what it sees lies in that block's cell. ``max_side``: longer side of pictures for that,
-    pixels; that of the runs. None: as they are.
-
-    Returns:
-        The blocks in order of their names.
+    pixels; that of the runs. None: as they are. Returns the blocks in order of their names.
     """
     if not 0 <= overlap <= 1:
         raise OptionError(f"overlap {overlap:g}; expected 0 to 1")
@@ -229,9 +205,10 @@ def split(
             owners = _inside(scene, names, cell.holds)
             held = (*owners, *(targets := _inside(scene, others, cell.holds)))
             block = SceneBlock(
-                name, tuple(cells), scene.address, reading or {}, cell, owners,
-                helpers_of(cell, owners, seen, near=near, overlap=overlap), targets,
-                {view: (posed or scene)[view].camera.cam_from_world[0] for view in held},
+                name=name, names=tuple(cells), project=scene.address, reading=dict(reading or {}),
+                low=cell.low, high=cell.high, owners=owners, targets=targets,
+                helpers=helpers_of(cell, owners, seen, near=near, overlap=overlap),
+                poses={view: (posed or scene)[view].camera.cam_from_world[0] for view in held},
                 refined=posed is not None,
             )  # fmt: skip
             found.append(block)
@@ -251,13 +228,9 @@ def _inside(scene: Scene, names: Sequence[str], holds: Callable[[Any], Any]) -> 
 
 
 def _posed(
-    scene: Scene,
-    names: tuple[str, ...],
-    others: tuple[str, ...],
-    *,
-    say: Callable[[str], None],
-    max_side: int | None,
-) -> Scene | None:
+    scene: Scene, names: tuple[str, ...], others: tuple[str, ...], *,
+    say: Callable[[str], None], max_side: int | None,
+) -> Scene | None:  # fmt: skip
     """The project with refined poses; None if the given ones are kept."""
     # ``refined`` needs a target; without any, the first view stands in, and its result is not used.
     targets = scene.subset(others or names[:1]).cameras

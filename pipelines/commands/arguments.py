@@ -57,8 +57,10 @@ class RecordingArguments(Arguments):
         """What was given of how a project is read, JSON-ready; of RGB-D alone with ``rgbd``."""
         from gvtools.scenes.project import READING
 
-        names = [name for name, option in READING.items() if option or not rgbd]
-        values = {name: getattr(self, name, None) for name in names}
+        # A command's own arguments may have these names and mean something else.
+        whole = isinstance(self, SceneArguments) and not rgbd
+        known = (SceneArguments if whole else RecordingArguments).model_fields
+        values = {name: getattr(self, name) for name in READING if name in known}
         return {
             name: str(value.resolve()) if isinstance(value, Path) else value
             for name, value in values.items()

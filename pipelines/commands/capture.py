@@ -217,13 +217,12 @@ def _capture_rgbd(
         )
     report = capture_rgbd(
         source, out, options=rgbd_options(reading), say=console.line,
-        draw=partial(_draw_rgbd, title=out.name),
+        draw=partial(_draw, title=out.name),
     )  # fmt: skip
     _print_rgbd(report, console)
 
 
 def _print(report: CaptureReport, console: Console) -> None:
-    _print_findings(report, console)
     unit = "metres" if report.metric else "no known unit"
     rows = [
         ("registered pictures", f"{len(report.registered)} of {report.pictures}"),
@@ -238,11 +237,10 @@ def _print(report: CaptureReport, console: Console) -> None:
         ("cameras", ", ".join(str(camera["model"]) for camera in report.cameras)),
         ("unit", f"{unit}; placed by {report.placed_by}, z is up"),
     ]
-    console.table(("what", "found"), rows)
+    _print_table(report, rows, console)
 
 
 def _print_rgbd(report: RgbdCaptureReport, console: Console) -> None:
-    _print_findings(report, console)
     rows: list[tuple[str, object]] = [
         ("frames with a pose", f"{len(report.registered)} of {report.pictures}"),
         ("path, m", f"{report.path_m:.3f}"),
@@ -255,44 +253,37 @@ def _print_rgbd(report: RgbdCaptureReport, console: Console) -> None:
             text = "{median_mm:.1f} mm, {median_deg:.2f} degrees; at most {max_mm:.1f} mm"
             rows.append((f"loops miss by, {what}, median", text.format(**figures)))
     rows.append(("unit", "metres; the world is the first frame's camera"))
-    console.table(("what", "found"), rows)
+    _print_table(report, rows, console)
 
 
-def _print_findings(report: CaptureReport | RgbdCaptureReport, console: Console) -> None:
+def _print_table(
+    report: CaptureReport | RgbdCaptureReport, rows: Sequence[tuple[str, object]], console: Console
+) -> None:
     for finding in report.findings:
         (console.warn if finding.level == "warning" else console.line)(finding.message)
     for name, reason in list(report.left_out.items())[:10]:
         console.line(f"  {name}: {reason}")
+    console.table(("what", "found"), rows)
 
 
-def _draw(out: Path, report: CaptureReport, *, title: str) -> None:
-    """``capture.png``: the cameras from above, and which of them overlap."""
+def _draw(out: Path, report: CaptureReport | RgbdCaptureReport, *, title: str) -> None:
+    """``capture.png``: the cameras from above, and which of them overlap.
+
+    Behind them the sparse points, or the depth of some keyframes.
+    """
+    from gvtools.capture.rgbd_project import RgbdCaptureReport, points_from_above
     from gvtools.files import replaced_when_written
     from gvtools.scenes.project import open_project
     from viz.plots.trajectories import draw_capture
 
     scene = open_project(out)
-    assert scene.points is not None
-    figure = draw_capture(
-        scene.cameras, scene.points.positions, report.overlap,
-        title=f"{title}: {len(report.registered)} of {report.pictures} pictures",
-    )  # fmt: skip
-    with replaced_when_written(out / PICTURE) as temporary:
-        figure.savefig(temporary, format="png")
-
-
-def _draw_rgbd(out: Path, report: RgbdCaptureReport, *, title: str) -> None:
-    """``capture.png``: the cameras from above, among the depth of some keyframes."""
-    from gvtools.capture.rgbd_project import points_from_above
-    from gvtools.files import replaced_when_written
-    from gvtools.scenes.project import open_project
-    from viz.plots.trajectories import draw_capture
-
-    scene = open_project(out)
-    cameras, points = points_from_above(scene, report.keyframes)
-    figure = draw_capture(
-        cameras, points, report.overlap,
-        title=f"{title}: {len(report.registered)} of {report.pictures} frames",
-    )  # fmt: skip
+    if isinstance(report, RgbdCaptureReport):
+        pictures = "frames"
+        cameras, points = points_from_above(scene, report.keyframes)
+    else:
+        assert scene.points is not None
+        pictures, cameras, points = "pictures", scene.cameras, scene.points.positions
+    title = f"{title}: {len(report.registered)} of {report.pictures} {pictures}"
+    figure = draw_capture(cameras, points, report.overlap, title=title)
     with replaced_when_written(out / PICTURE) as temporary:
         figure.savefig(temporary, format="png")

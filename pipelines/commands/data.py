@@ -5,16 +5,19 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from gvtools.errors import GvError, ProjectError
+from gvtools.errors import GvError, OptionError, ProjectError
 from pipelines.commands.arguments import SceneArguments
 from pipelines.options import Arguments
 
 if TYPE_CHECKING:
     from gvtools.scenes.inspection import SceneReport
+    from gvtools.scenes.shard_writer import WrittenShard
     from pipelines.console import Console
 
 
 LEVELS = ("error", "warning", "info")
+# Of what could not be converted, so many are named; all are in index.json.
+NAMED = 5
 
 
 class CheckCommand(SceneArguments):
@@ -178,9 +181,43 @@ class WriteShards(Arguments):
     """Reduce pictures to this length of their longer side (as they are). [px]"""
 
     def run(self, console: Console) -> None:
-        from pipelines.data_sets.shards import shards
+        from gvtools.scenes.data_sets.catalogue import spec_names
+        from gvtools.scenes.layout import SPEC
+        from gvtools.scenes.project import open_collection
+        from gvtools.scenes.shard_writer import MEGABYTE, ShardOptions, write_shards
+        from gvtools.specs import name_key
 
-        shards(self, console)
+        address = self.scenes_of
+        if self.root is not None and not address.startswith(SPEC):
+            address = SPEC + address
+        if self.root is None and not Path(address).exists() and name_key(address) in spec_names():
+            raise OptionError(
+                f"{address}: a data set; give the folder of its download by --root DIR"
+            )
+        collection = open_collection(address, self.root)
+        if self.scenes:
+            collection = collection.subset(self.scenes)
+
+        def report(done: WrittenShard) -> None:
+            shard = done.shard
+            at = shard.views[-1].scene + 1
+            console.line(
+                f"{shard.file}: {len(shard.views)} views, {shard.bytes / MEGABYTE:.1f} MB, up to "
+                f"scene {at} of {done.scenes}{' (complete before)' if done.before else ''}"
+            )
+
+        options = ShardOptions(self.size, self.max_side)
+        index = write_shards(collection, self.out, options=options, progress=report)
+        views = sum(scene.views for scene in index.scenes)
+        depth = sum(scene.with_depth for scene in index.scenes)
+        for item in index.skipped[:NAMED]:
+            console.warn(f"left out: {item.reason}")
+        if len(index.skipped) > NAMED:
+            console.warn(f"left out: {len(index.skipped) - NAMED} more, listed in index.json")
+        console.line(
+            f"{self.out}: {len(index.shards)} shards of {len(index.scenes)} scenes, {views} views, "
+            f"{depth} with depth; train from them with data.scenes"
+        )
 
 
 class VerifyShards(Arguments):
@@ -194,9 +231,18 @@ class VerifyShards(Arguments):
     """A folder of shards. [DIR]"""
 
     def run(self, console: Console) -> None:
-        from pipelines.data_sets.shards import verify
+        from gvtools.scenes.shards import read_index
+        from gvtools.scenes.shards import verify as problems_of
 
-        verify(self, console)
+        problems = problems_of(self.folder)
+        count = len(read_index(self.folder).shards)
+        if len(problems) > 1:
+            for problem in problems:
+                console.warn(problem)
+        if problems:
+            several = f"{len(problems)} of {count} shards are damaged, first {problems[0]}"
+            raise ProjectError(problems[0] if len(problems) == 1 else several)
+        console.line(f"{self.folder}: {count} shards, all as their checksums say")
 
 
 class DataCommand(Arguments):

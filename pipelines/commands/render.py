@@ -170,7 +170,7 @@ class FilmCommand(Arguments):
 
     def run(self, console: Console) -> None:
         from gvtools.runs.run import load_memory
-        from pipelines.film import check_suffix, film_cameras, write_film
+        from pipelines.film import FilmRenderer, captioned, check_suffix, film_cameras, write_film
 
         check_suffix(self.out)
         if self.growth and self.round is not None:
@@ -184,16 +184,27 @@ class FilmCommand(Arguments):
         cameras = film_cameras(memory, self.path, width=self.width)
         rounds = memory.rounds if self.growth else (self.round,)
         del memory
-        start = time.perf_counter()
-        spent = [0.0]
-        frames = _frames(self, cameras, rounds, panels=panels, console=console, spent=spent)
-        write_film(self.out, frames, fps=self.fps)
+        start, projecting = time.perf_counter(), 0.0
+
+        def frames() -> Iterator[NDArray[np.uint8]]:
+            nonlocal projecting
+            for number in rounds:
+                renderer = FilmRenderer(self.memory, cameras, up_to=number)
+                of_round = f" of round {number}" if self.growth else ""
+                for index in console.track(range(len(cameras)), f"drawing frames{of_round}"):
+                    frame = renderer.frame(index, panels, captions=len(panels) > 1)
+                    if self.growth and len(panels) == 1:
+                        frame = captioned(frame, f"round {number}")
+                    yield frame
+                projecting += renderer.projecting
+
+        write_film(self.out, frames(), fps=self.fps)
         count = len(cameras) * len(rounds)
         each = (time.perf_counter() - start) / count
         console.line(
             f"{self.out}: {count} frames of {len(panels) * int(cameras.width[0])}x"
             f"{int(cameras.height[0])}, {count / self.fps:.1f} s; {each:.3f} s a frame, of which "
-            f"projecting {spent[0] / count:.3f}"
+            f"projecting {projecting / count:.3f}"
         )
 
 
@@ -213,32 +224,3 @@ def _panels(args: FilmCommand) -> tuple[str, ...]:
             f"--compare {args.compare!r}; expected two or more of {', '.join(PANELS)}, by commas"
         )
     return panels
-
-
-def _frames(
-    args: FilmCommand,
-    cameras: Cameras,
-    rounds: tuple[int | None, ...],
-    *,
-    panels: tuple[str, ...],
-    console: Console,
-    spent: list[float],
-) -> Iterator[NDArray[np.uint8]]:
-    """All frames in order; ``spent`` receives the seconds of projecting."""
-    import numpy as np
-
-    from pipelines.film import FilmRenderer, captioned
-
-    for number in rounds:
-        renderer = FilmRenderer(args.memory, cameras, up_to=number)
-        label = "drawing frames" if not args.growth else f"drawing frames of round {number}"
-        for index in console.track(range(len(cameras)), label):
-            frame = renderer.frame(index, panels)
-            if len(panels) > 1:
-                parts = np.split(frame, len(panels), axis=1)
-                pairs = zip(parts, panels, strict=True)
-                frame = np.concatenate([captioned(part, panel) for part, panel in pairs], axis=1)
-            if args.growth:
-                frame = captioned(frame, f"round {number}") if len(panels) == 1 else frame
-            yield frame
-        spent[0] += renderer.projecting

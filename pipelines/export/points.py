@@ -198,10 +198,8 @@ def write_glb_scene(
 ) -> None:
     """Write a scene of one node.
 
-    Args:
-        geometry: makes trimesh's geometry of positions (N, 3) around the node's origin.
-        positions: (N, 3) world frame, scene units.
-        extras: what the node says beside its origin and frame.
+    ``geometry`` makes trimesh's of positions (N, 3) around the node's origin; ``extras`` are what
+    the node says beside that and its frame.
     """
     import trimesh
 

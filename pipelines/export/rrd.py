@@ -74,13 +74,10 @@ def write_rrd(source: ExportSource, path: Path, options: ExportOptions) -> str:
             for kind, of_kind in sources.items():
                 rows = np.flatnonzero((rounds == number) & of_kind)
                 if len(rows):
+                    positions = points.positions[rows] - origin
                     recording.log(
                         f"memory/{kind}/round_{number:03d}",
-                        rerun.Points3D(
-                            points.positions[rows] - origin,
-                            colors=points.colors[rows],
-                            radii=radii[rows],
-                        ),
+                        rerun.Points3D(positions, colors=points.colors[rows], radii=radii[rows]),
                     )
         for shot in _shots(source):
             _log(recording, shot, origin=origin, distance=DISTANCE * extent)
@@ -91,12 +88,9 @@ def write_rrd(source: ExportSource, path: Path, options: ExportOptions) -> str:
 
 
 def _log(
-    recording: rerun.RecordingStream,
-    shot: RecordedCamera,
-    *,
-    origin: NDArray[np.float64],
+    recording: rerun.RecordingStream, shot: RecordedCamera, *, origin: NDArray[np.float64],
     distance: float,
-) -> None:
+) -> None:  # fmt: skip
     import rerun
     from PIL import Image
 

@@ -8,7 +8,7 @@ a fit all points are exported. Each point becomes a spherical Gaussian.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import count
 from pathlib import Path
@@ -147,10 +147,7 @@ class ExportSource:
     ) -> ExportPoints:
         """The most confident observation of each voxel.
 
-        Args:
-            options: ``max_points`` and ``observed`` count.
-            most: points at most where the user gave no number.
-            among: (N,) the observations that count; None for all.
+        ``most`` counts where the user gave no number; ``among`` (N,) are the observations to take.
         """
         memory = self.memory
         chosen = np.ones(len(memory), np.bool_) if among is None else among
@@ -184,9 +181,8 @@ class ExportSource:
 
             photographs = concatenate([view.camera for view in memory.views.photographed])
             first = exposed(first, appearance.exposures, photographs)
-        fitted = turned(first.values, first.frame.axes)
-        parts, rest = [fitted], None
-        rounds_of_parts = [np.zeros(len(fitted), np.int32)]
+        fitted, rest = turned(first.values, first.frame.axes), None
+        parts = [(fitted, np.zeros(len(fitted), np.int32))]
         if options.max_points is not None:
             rest = options.max_points - len(fitted)
             if rest < 0:
@@ -201,10 +197,9 @@ class ExportSource:
         if further.any() and rest != 0:
             points, rounds = self._point_gaussians(ExportOptions(max_points=rest), among=further)
             points[:, :LOG_SCALE] += (memory.frame.origin - first.frame.origin).astype(np.float32)
-            parts.append(points)
-            rounds_of_parts.append(rounds)
-        values, origin = _relative_to_middle(np.concatenate(parts), first.frame.origin)
-        rounds = np.concatenate(rounds_of_parts)
+            parts.append((points, rounds))
+        values, rounds = (np.concatenate(each) for each in zip(*parts, strict=True))
+        values, origin = _relative_to_middle(values, first.frame.origin)
         return Splats(values, origin, len(fitted), len(appearance.others), rounds)
 
     def _point_gaussians(
@@ -267,8 +262,7 @@ class ExportSource:
             first.append(i)
             names.append(name)
             used.add(name.lower())
-        kept = cameras[first]
-        kept = Cameras(kept.K, kept.cam_from_world, kept.width, kept.height, tuple(names))
+        kept = replace(cameras[first], names=tuple(names))
         pictures: dict[str, Path | None] = {}
         for i, row in enumerate(row_of_view.tolist()):
             if row >= 0 and made[first[row]]:

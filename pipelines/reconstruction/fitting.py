@@ -160,10 +160,7 @@ def known_surface(start: Gaussians, views: Sequence[FitView]) -> NDArray[np.floa
 class Sweep:
     """Plane-sweep depth of a run's photographs, at a size that its fit has time for.
 
-    Each view is swept once, when it is asked for.
-
-    Attributes:
-        scene: the project at that size.
+    Each view is swept once, when it is asked for; ``scene`` is the project at that size.
     """
 
     def __init__(self, plan: Plan, side: int, names: Sequence[str]) -> None:
@@ -199,8 +196,8 @@ class Sweep:
 
     def depth(self, view: View) -> NDArray[np.float32] | None:
         """(H, W) z-depth, scene units, of ``scene``'s view; None if no other shows what it does."""
-        found = self.map_of(view)
-        return None if found is None else found.depth
+        depth_map = self.map_of(view)
+        return None if depth_map is None else depth_map.depth
 
     def map_of(self, view: View) -> DepthMap | None:
         """The depth with its confidence."""
@@ -272,32 +269,20 @@ def validate_fit(
         frame = view.load()
         guidance = project(memory, view.camera, options=plan.config.splat)
         where = guidance.valid[0] if frame.mask is None else guidance.valid[0] & frame.mask
-        height, width = where.shape
-        shown = _averaged(picture.rgb, width, height)
+        whole = torch.from_numpy(picture.rgb).permute(2, 0, 1)[None]
+        small = torch.nn.functional.interpolate(whole, where.shape, mode="area")
+        shown = small[0].permute(1, 2, 0).numpy()
         own = np.where(where[..., None], guidance.rgb[0], shown)
-        used = np.ones((height, width), np.bool_) if frame.mask is None else frame.mask
-        squares += [_square(rgb, frame.rgb, used) for rgb in (shown, own)]
+        used = np.ones(where.shape, np.bool_) if frame.mask is None else frame.mask
+        for row, rgb in enumerate((shown, own)):
+            off = rgb[used] - frame.rgb[used] / np.float32(255)
+            squares[row] += float(np.square(off).mean(axis=1).sum())
         pixels, known = pixels + int(used.sum()), known + int(where.sum())
     memory.close()
     if not known:
         return None
     gaussians, own_colors = -10 * np.log10(np.maximum(squares / pixels, 1e-10))
     return FitValidation(float(gaussians), float(own_colors), len(predicted))
-
-
-def _averaged(rgb: NDArray[np.float32], width: int, height: int) -> NDArray[np.float32]:
-    """(height, width, 3) of a larger picture (H, W, 3)."""
-    whole = torch.from_numpy(rgb).permute(2, 0, 1)[None]
-    small = torch.nn.functional.interpolate(whole, (height, width), mode="area")
-    return small[0].permute(1, 2, 0).numpy()
-
-
-def _square(
-    shown: NDArray[np.float32], photograph: NDArray[np.uint8], where: NDArray[np.bool_]
-) -> float:
-    """Sum of squared differences over the pixels ``where``, of the mean of the colours."""
-    off = shown[where] - photograph[where] / np.float32(255)
-    return float(np.square(off).mean(axis=1).sum())
 
 
 @dataclass(frozen=True, eq=False)
@@ -396,7 +381,9 @@ def fit_appearance(plan: Plan, console: Console, *, earlier: Fitted | None = Non
     if earlier is not None and earlier.poses is not None:
         plan = plan.at(earlier.poses)
     sweep = Sweep.of(plan, begins=earlier is None)
-    if earlier is None or _converged(plan, earlier):
+    # Of an earlier fit that has converged, further steps would gain less than another fit.
+    needed = converged_steps(len(plan.context), recorded=_recorded(plan))
+    if earlier is None or earlier.steps >= SKIPPED * needed:
         fit = _new_fit(plan, console, earlier, sweep=sweep)
     else:
         fit = _continued_fit(plan, earlier, console, sweep=sweep)
@@ -419,31 +406,25 @@ def fit_appearance(plan: Plan, console: Console, *, earlier: Fitted | None = Non
         console.line(f"fitting: the mean of {len(fits)} fits")
     if earlier is not None and not fit.begin:
         fits = _worth_adding(fits, earlier)
-    found = replace(_fitted(fits, plan, earlier), sweep=sweep)
-    if earlier is None:
-        validation = (
-            validate_fit(found.predicted, plan, sweep) if found.predicted and sweep else None
-        )
-        if validation is not None:
-            console.line(f"colours: {validation}")
-            if not validation.fit_is_used:
-                console.warn("the fit is not used: give it more time by --refine")
-                return None
-            found = replace(found, validation=validation)
-        else:
-            _warn_of_few_steps(found, plan, console)
-    return found
-
-
-def _warn_of_few_steps(fitted: Fitted, plan: Plan, console: Console) -> None:
-    """Say where a fit is so short that a run without shows more; recorded depth keeps surfaces."""
-    needed = round(SHORT * len(plan.context))
-    if not _recorded(plan) and fitted.steps < needed:
+    fitted = replace(_fitted(fits, plan, earlier), sweep=sweep)
+    if earlier is not None:
+        return fitted
+    validation = validate_fit(fitted.predicted, plan, sweep) if fitted.predicted and sweep else None
+    if validation is not None:
+        console.line(f"colours: {validation}")
+        if not validation.fit_is_used:
+            console.warn("the fit is not used: give it more time by --refine")
+            return None
+        return replace(fitted, validation=validation)
+    enough = round(SHORT * len(plan.context))
+    # Recorded depth keeps surfaces.
+    if not _recorded(plan) and fitted.steps < enough:
         console.warn(
             f"{fitted.steps} steps of a fit to {len(plan.context)} photographs; expected at least "
-            f"{needed}; pictures may be worse than without a fit; give more --refine seconds, or "
+            f"{enough}; pictures may be worse than without a fit; give more --refine seconds, or "
             "--refine 0 for none"
         )
+    return fitted
 
 
 def _worth_adding(fits: Sequence[Fit], earlier: Fitted) -> Sequence[Fit]:
@@ -490,12 +471,6 @@ def _options(plan: Plan) -> FitOptions:
     by_features = plan.poses is not None and plan.poses.by_features
     options = plan.config.refine
     return options.replaced(poses=options.poses and not by_features)
-
-
-def _converged(plan: Plan, earlier: Fitted) -> bool:
-    """Whether an earlier fit has converged: further steps would gain less than another fit."""
-    needed = converged_steps(len(plan.context), recorded=_recorded(plan))
-    return earlier.steps >= SKIPPED * needed
 
 
 def _continued_fit(plan: Plan, earlier: Fitted, console: Console, *, sweep: Sweep | None) -> Fit:
@@ -575,7 +550,7 @@ def _fitted(fits: Sequence[Fit], plan: Plan, earlier: Fitted | None) -> Fitted:
         blend = earlier.appearance.blend
     log_gains = cameras.log_gains - cameras.log_gains.mean(axis=0)
     exposures = Exposures(cameras.poses(), log_gains, cameras.depth)
-    found = Fitted(
+    fitted = Fitted(
         Appearance(
             sets[0], first.near, blend, first.splatter, tuple(sets[1:]), exposures, first.surface
         ),
@@ -586,10 +561,10 @@ def _fitted(fits: Sequence[Fit], plan: Plan, earlier: Fitted | None) -> Fitted:
         steps=steps,
     )
     if not cameras.with_poses:
-        return (
-            found if earlier is None else replace(found, poses=earlier.poses, spread=earlier.spread)
-        )
+        if earlier is None:
+            return fitted
+        return replace(fitted, poses=earlier.poses, spread=earlier.spread)
     given = frame.cam_from_local(plan.targets.cameras.cam_from_world)
     targets = np.array([cameras.corrected(pose) for pose in given]).reshape(-1, 4, 4)
     poses = RunPoses(frame.cam_from_world(cameras.poses()), frame.cam_from_world(targets))
-    return replace(found, poses=poses, spread=cameras.spread)
+    return replace(fitted, poses=poses, spread=cameras.spread)

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
 from gvtools.completers.base import Completer
@@ -129,13 +128,7 @@ def resolve_targets(
     allow_overlap: bool = False,
     max_side: int | None = None,
 ) -> Targets:
-    """The target cameras that ``spec`` means.
-
-    Args:
-        scene: the project, already of the size that the run works in.
-        max_side: another project's pictures are reduced to it, pixels.
-    """
-    context_cameras = scene.subset(context).cameras
+    """The target cameras that ``spec`` means; another project's are reduced to ``max_side`` px."""
     name, _, count = spec.partition(":")
     if name in PATHS and spec not in scene.names:
         if not count.isdecimal() or int(count) < 1:
@@ -148,7 +141,10 @@ def resolve_targets(
             if not allow_overlap:
                 _check_pictures(scene, context, targets)
             return targets
-        return _file(Path(path), context_cameras)
+        from gvtools.trajectory_files import read_trajectory
+
+        cameras = read_trajectory(Path(path), scene.subset(context).cameras[0])
+        return Targets(cameras, (None,) * len(cameras), "trajectory", (Path(path),))
     try:
         # By name, as the context: what one target adds, the next ones are completed on.
         chosen = natural(select(scene.names, spec))
@@ -176,21 +172,8 @@ def _path(scene: Scene, context: tuple[str, ...], name: str, *, count: int) -> T
         return view.camera, float(np.median(seen[seen > 0]))
 
     cameras = named_path(name, scene.subset(context).cameras, count=count, depth=depth)
-    named = Cameras(
-        cameras.K,
-        cameras.cam_from_world,
-        cameras.width,
-        cameras.height,
-        tuple(f"{name}_{i:04d}" for i in range(count)),
-    )
-    return Targets(named, (None,) * count, name)
-
-
-def _file(path: Path, context_cameras: Cameras) -> Targets:
-    from gvtools.trajectory_files import read_trajectory
-
-    cameras = read_trajectory(path, context_cameras[0])
-    return Targets(cameras, (None,) * len(cameras), "trajectory", (path,))
+    names = tuple(f"{name}_{i:04d}" for i in range(count))
+    return Targets(replace(cameras, names=names), (None,) * count, name)
 
 
 def _project(path: str, selection: str, scene: Scene, *, max_side: int | None) -> Targets:
@@ -225,7 +208,11 @@ def _check_pictures(scene: Scene, context: tuple[str, ...], targets: Targets) ->
         if view is None:
             continue
         same = bool(view.files) and view.files[0].resolve() in files
-        if same or _at_one_place(view.camera, context_cameras, near).any():
+        apart = np.linalg.norm(context_cameras.centers - view.camera.centers[0], axis=1)
+        turned = context_cameras.cam_from_world[:, :3, :3] @ view.camera.cam_from_world[0, :3, :3].T
+        cosine = (np.trace(turned, axis1=1, axis2=2) - 1) / 2
+        alike = (apart <= near) & (cosine >= np.cos(np.radians(SAME_DIRECTION)))
+        if same or alike.any():
             both.append(view.name)
     if both:
         raise OptionError(
@@ -233,14 +220,6 @@ def _check_pictures(scene: Scene, context: tuple[str, ...], targets: Targets) ->
             f"{both[0]!r}: same file, or same place and direction); expected none; change one, or "
             "pass --allow-overlap"
         )
-
-
-def _at_one_place(camera: Cameras, context_cameras: Cameras, near: float) -> NDArray[np.bool_]:
-    """Which of the context cameras stand where ``camera`` does and look where it looks."""
-    apart = np.linalg.norm(context_cameras.centers - camera.centers[0], axis=1)
-    rotations = context_cameras.cam_from_world[:, :3, :3] @ camera.cam_from_world[0, :3, :3].T
-    cosine = (np.trace(rotations, axis1=1, axis2=2) - 1) / 2
-    return (apart <= near) & (cosine >= np.cos(np.radians(SAME_DIRECTION)))
 
 
 def make_schedule(
@@ -262,11 +241,7 @@ def make_schedule(
 
 
 def run_identity(plan: Plan, reading: Mapping[str, Any]) -> dict[str, Any]:
-    """What decides a run's result, JSON-ready; a resumed run must have the same.
-
-    Args:
-        reading: how the user said the project is to be read, JSON-ready.
-    """
+    """What decides a run's result, JSON-ready; a resumed run must have the same."""
     scene, targets = plan.scene, plan.targets
     files = [file for name in plan.context for file in scene[name].files]
     files += [file for view in targets.truth if view for file in view.files]
@@ -283,7 +258,12 @@ def run_identity(plan: Plan, reading: Mapping[str, Any]) -> dict[str, Any]:
         "points": None
         if points is None
         else array_digest((points.positions, points.point_index, points.view_index, points.xy)),
-        "pixels": array_digest(_sample_pixels(plan)),
+        # As they are read: units, registration and masks show in them.
+        "pixels": array_digest(
+            pixels
+            for frame in (scene[name].load() for name in evenly_spread(plan.context))
+            for pixels in (frame.rgb, frame.depth, frame.mask)
+        ),
         "weights": fingerprint(plan.weights),
         "settings": plan.settings.to_dict(),
         "derived": plan.derived,
@@ -293,13 +273,6 @@ def run_identity(plan: Plan, reading: Mapping[str, Any]) -> dict[str, Any]:
         "targets_project": targets.project,
         "schedule": [list(rows) for rows in plan.schedule],
     }
-
-
-def _sample_pixels(plan: Plan) -> Iterator[NDArray[np.generic] | None]:
-    """Some context views as they are read: units, registration and masks show in the pixels."""
-    for name in evenly_spread(plan.context):
-        frame = plan.scene[name].load()
-        yield from (frame.rgb, frame.depth, frame.mask)
 
 
 def expected_seconds(plan: Plan) -> float:
@@ -325,11 +298,6 @@ def expected_seconds(plan: Plan) -> float:
     )
 
 
-def _told(seconds: float) -> str:
-    """A rough time in words."""
-    return f"{seconds / 60:.0f} min" if seconds >= 100 else f"{max(round(seconds, -1), 10):.0f} s"
-
-
 def describe(plan: Plan, console: Console) -> None:
     """Say what the run reads and will do."""
     config, targets = plan.config, plan.targets
@@ -348,7 +316,9 @@ def describe(plan: Plan, console: Console) -> None:
         f"{len(plan.schedule)} rounds of at most {config.views_per_round} targets, seed "
         f"{config.seed}"
     )
-    console.line(f"it takes at most about {_told(expected_seconds(plan))}")
+    seconds = expected_seconds(plan)
+    rough = f"{seconds / 60:.0f} min" if seconds >= 100 else f"{max(round(seconds, -1), 10):.0f} s"
+    console.line(f"it takes at most about {rough}")
     if scheduled < len(targets.cameras):
         console.warn(
             f"{len(targets.cameras) - scheduled} of {len(targets.cameras)} targets are in no "

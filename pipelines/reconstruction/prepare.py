@@ -172,7 +172,6 @@ def _on_device(config: RunSettings) -> RunSettings:
     "auto" is CUDA where the torch back end was chosen, may choose, and finds such a device.
     """
     from gvtools.appearance.splat.gsplat_splatter import gsplat_installed
-    from gvtools.errors import OptionError
     from gvtools.settings import with_values
 
     splat, device = config.splat, str(config.device)
@@ -209,12 +208,6 @@ def _cuda() -> bool:
     return torch.cuda.is_available()
 
 
-# Two pictures are one shot when their centres are this near (a share of the context's extent) and
-# their rotations differ by no more than this many degrees, whatever their sizes and lenses.
-SAME_PLACE = 1e-4
-SAME_DIRECTION = 0.05
-
-
 def refined_poses_of(
     scene: Scene,
     context: Sequence[str],
@@ -225,9 +218,8 @@ def refined_poses_of(
 ) -> RunPoses | None:
     """Poses on which the context agrees; None where the given ones stay.
 
-    Args:
-        targets: move like the context near them, if that errs alike.
-        recorded: whether depth is recorded: it tells the scale, and poses where features do not.
+    Targets move like the context near them, if that errs alike. Depth that is recorded tells the
+    scale, and poses where features do not.
     """
     from gvtools.poses.bundle_adjustment import SIDE, adjusted_poses, can_adjust, tracks_of
     from gvtools.poses.refinement import refined_poses
@@ -300,18 +292,22 @@ def check_scan(options: ScanOptions) -> None:
 def placed_scan(plan: Plan, console: Console) -> PlacedScan | None:
     """The run's scan, placed with the plan's cameras; None where there is none."""
     from gvtools.scans.read import read_scan
-    from gvtools.scans.registration import given_placement, register
+    from gvtools.scans.registration import Surface, given_placement, register
 
     options = plan.config.scan
     if options.file is None:
         return None
     scan = read_scan(Path(options.file))
-    console.line(_told(scan))
+    console.line(_scan_summary(scan))
     placement = given_placement(options.placement)
     if placement is None:
+        centers = [station.center for station in scan.stations]
+        known = None if any(center is None for center in centers) else np.array(centers)
+        seen_from = None if known is None else known[scan.station]
+        surface = Surface(scan.positions + scan.origin, seen_from)
         try:
             placement = register(
-                _surface(scan), photographed(plan), least=options.min_fitness,
+                surface, photographed(plan), least=options.min_fitness,
                 metric=plan.scene.metric, seed=plan.config.seed,
             )  # fmt: skip
         except DegenerateError as error:
@@ -337,7 +333,7 @@ def _check_reach(scan: Scan, placement: Placement, plan: Plan) -> None:
         )
 
 
-def _told(scan: Scan) -> str:
+def _scan_summary(scan: Scan) -> str:
     text = f"{scan.name}: {len(scan):,} of {scan.count:,} scanned points"
     if len(scan.stations) > 1:
         text += f" from {len(scan.stations)} stations"
@@ -345,15 +341,6 @@ def _told(scan: Scan) -> str:
         text += f", grey by {scan.colored_by}"
     dropped = ", ".join(f"{count:,} {reason}" for reason, count in scan.dropped.items())
     return f"{text} ({dropped})" if dropped else text
-
-
-def _surface(scan: Scan) -> Surface:
-    from gvtools.scans.registration import Surface
-
-    centers = [station.center for station in scan.stations]
-    if any(center is None for center in centers):
-        return Surface(scan.positions + scan.origin)
-    return Surface(scan.positions + scan.origin, np.array(centers)[scan.station])
 
 
 def photographed(plan: Plan) -> Surface:
@@ -410,12 +397,7 @@ def check_tuning(completer: Completer, context: Sequence[str]) -> None:
 
 
 def tuned(plan: Plan, cache: DepthCache, directory: RunDirectory, *, console: Console) -> Plan:
-    """The plan with weights tuned to its context, now or by the attempt that is resumed.
-
-    Args:
-        plan: of the run, with its poses; its completer has weights.
-        directory: of the run; the weights are kept in it.
-    """
+    """The plan with weights tuned to its context, now or by the attempt that is resumed."""
     from pipelines.tuning.tune import previous_tuning, tune
 
     weights, config = plan.completer.weights, plan.config
@@ -426,20 +408,15 @@ def tuned(plan: Plan, cache: DepthCache, directory: RunDirectory, *, console: Co
     record = previous_tuning(scene, weights, out, options=config.tune, seed=config.seed)
     if record is None:
         console.line(f"tuning {weights} to the context, {config.tune.length}")
-        tuning = tune(
-            scene,
-            weights,
-            out,
-            options=config.tune,
-            completer=options,
-            seed=config.seed,
+        record = tune(
+            scene, weights, out, options=config.tune, completer=options, seed=config.seed,
             say=console.line,
-        )
-        record = tuning.to_dict()
+        ).to_dict()  # fmt: skip
     else:
         console.line(f"weights tuned before: {out}")
     directory.add_to_record(TUNING, {name: record[name] for name in record if name != "inputs"})
-    return replace(plan, completer=_with_weights(plan, options, out))
+    completer = create(config.completer, **options, weights=str(out))
+    return replace(plan, completer=config.effort.wrap(completer))
 
 
 def with_depth(scene: Scene, names: Sequence[str], cache: DepthCache) -> Scene:
@@ -457,8 +434,3 @@ def with_depth(scene: Scene, names: Sequence[str], cache: DepthCache) -> Scene:
         for name in names
     ]
     return replace(scene, views=tuple(views), points=None)
-
-
-def _with_weights(plan: Plan, options: dict[str, Any], folder: Path) -> Completer:
-    completer = create(plan.config.completer, **options, weights=str(folder))
-    return plan.config.effort.wrap(completer)

@@ -9,7 +9,6 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -33,11 +32,7 @@ from gvtools.memory.projection import Observed, Projection
 from gvtools.memory.spatial_memory import FuseReport, SpatialMemory
 from gvtools.memory.splat.api import ONE_PIXEL, SplatOptions
 from gvtools.prefetch import prefetch
-from gvtools.runs.context_depth import (
-    DepthCache,
-    depth_report,
-    disagreeing,
-)
+from gvtools.runs.context_depth import DepthCache, depth_report, disagreeing
 from gvtools.runs.layout import target_stems
 from gvtools.runs.target_files import camera_entry, write_after, write_target
 from gvtools.scenes.scene import Frame, View
@@ -54,11 +49,8 @@ class CachedProjection:
     the observed ones show is kept, and a projection after a completion was fused splats the
     generated ones alone. The result is that of ``SpatialMemory.project`` to the bit.
 
-    Args:
-        memory: is looked at whenever a guidance is asked for.
-        camera: a batch of one.
-        reuse: False splats everything each time that the memory has changed.
-        appearance: gives colours of what was observed; None leaves them the memory's.
+    Without ``reuse``, everything is splatted each time that the memory has changed. ``appearance``
+    gives colours of what was observed.
     """
 
     def __init__(
@@ -82,8 +74,7 @@ class CachedProjection:
     def prefetch(self, snapshot: SpatialMemory) -> None:
         """Project what observed views show ahead of ``guidance``, where that is reused.
 
-        Args:
-            snapshot: of the memory; so this may run beside fusions of generated content.
+        Of a snapshot of the memory; so this may run beside fusions of generated content.
         """
         if self.reuse and self.options.backend == "cpu":
             self._observed = Projection(snapshot, self.camera, self.options).observed()
@@ -113,10 +104,6 @@ class CachedProjection:
 
         Some photograph did see most of it, though not well enough to tell its depth. It remains
         generated: nothing observed supports it. Its depth remains the completer's.
-
-        Args:
-            guidance: that was completed; the Gaussians' colours come where it is not valid.
-            rgb: of the completion, 0 to 1.
         """
         if self._picture is None:
             return rgb
@@ -125,11 +112,7 @@ class CachedProjection:
 
 
 def warn_of_depth(reports: Sequence[Mapping[str, Any]], console: Console) -> None:
-    """Say of how many views there is no depth, or depth of another scale.
-
-    Args:
-        reports: see depth_report, with ``failed``.
-    """
+    """Say of how many views there is no depth, or depth of another scale."""
     failed = [report for report in reports if report["failed"]]
     if failed:
         console.warn(
@@ -151,9 +134,6 @@ class RoundTargets:
 
     While the targets of a round are completed, what observed views show of the next round's is
     projected in another thread, where projections are reused at all: completions do not change it.
-
-    Args:
-        appearance: shows what was observed; None leaves it to the memory.
     """
 
     def __init__(
@@ -166,12 +146,7 @@ class RoundTargets:
     def __enter__(self) -> RoundTargets:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._pool.shutdown(cancel_futures=True)
 
     def of(self, number: int) -> list[CachedProjection]:
@@ -239,13 +214,10 @@ class TargetResult:
     # What the completer was given, a batch of one: one that takes a target at a time is given what
     # earlier targets of the round added, too.
     guidance: Guidance
-    # A batch of one.
-    completion: Completion
-    # (H, W) bool, the pixels that went to fusion.
-    fused: NDArray[np.bool_]
+    completion: Completion  # a batch of one
+    fused: NDArray[np.bool_]  # (H, W) pixels that went to fusion
     fusion: FuseReport
-    # Figures of the view for the round's report.
-    figures: dict[str, Any]
+    figures: dict[str, Any]  # of the view, for the round's report
 
 
 def fuse_context(
@@ -476,14 +448,7 @@ def complete_targets(
 
     A completer that takes several targets in a call (``batches_targets``) gets all of one size
     together; for any other, each view is completed on what the views before it added, so that they
-    agree with each other.
-
-    Args:
-        targets: projections of ``memory``; each updates when it changes.
-        number: of the round, from 1.
-        memory: generated points are fused into it.
-        completer: see ``Completer``.
-        context: the observed views that the completer may use.
+    agree with each other. ``targets`` project ``memory``, and follow what is fused into it.
     """
     seed, together = config.seed + number, None
     if completer.batches_targets:
@@ -524,14 +489,9 @@ def _completed_together(
 
 
 def _align_and_fuse(
-    guidance: Guidance,
-    completion: Completion,
-    number: int,
-    *,
-    memory: SpatialMemory,
-    config: RunSettings,
-    clock: Clock,
-) -> TargetResult:
+    guidance: Guidance, completion: Completion, number: int, *, memory: SpatialMemory,
+    config: RunSettings, clock: Clock,
+) -> TargetResult:  # fmt: skip
     valid, depth = guidance.valid[0], completion.depth[0]
     confidence = completion.confidence[0]
     with clock.stage("align"):
@@ -586,11 +546,7 @@ def _scale_alignment(
     if by_completer:
         return by_completer
     depth = completion.depth[0]
-    fit = align_depth_scale(
-        depth,
-        guidance.depth[0],
-        valid=guidance.valid[0] & (depth > 0),
-        confidence=guidance.confidence[0],
-        max_residual=config.fusion.max_scale_residual,
-    )
-    return ScaleAlignment.of_fit(fit)
+    return ScaleAlignment.of_fit(align_depth_scale(
+        depth, guidance.depth[0], valid=guidance.valid[0] & (depth > 0),
+        confidence=guidance.confidence[0], max_residual=config.fusion.max_scale_residual,
+    ))  # fmt: skip

@@ -61,11 +61,7 @@ Draw = Callable[[Plan, RunDirectory], Sequence[str]]
 def compile_kernels(
     config: RunSettings, console: Console, *, more: Sequence[KernelSet] = ()
 ) -> None:
-    """Compile what numba's cache does not hold, side by side, so that no round is charged with it.
-
-    Args:
-        config: of the run; its completer and the back end of projection tell which kernels.
-    """
+    """Compile what numba's cache lacks, side by side, so that no round is charged with it."""
     from gvtools import kernels as compiler
     from gvtools.completers.base import completer_type
     from gvtools.depth import source as depth_source
@@ -121,16 +117,11 @@ def measure_run(
         "notes": notes,
     }
     if views:
-        _print(views, summary, console)
+        keys = ["name", "round", "coverage", "coverage_after", *TABLE]
+        body = [[view.get(key) for key in keys] for view in views]
+        mean = ["mean", None, *(summary[key] for key in keys[2:])]
+        console.table(["target", "round", "coverage", "after", *TABLE], [*body, mean])
     return summary
-
-
-def _print(views: list[dict[str, Any]], summary: dict[str, Any], console: Console) -> None:
-    columns = ["target", "round", "coverage", "after", *TABLE]
-    keys = ["name", "round", "coverage", "coverage_after", *TABLE]
-    body = [[view.get(key) for key in keys] for view in views]
-    mean = ["mean", None, *(summary[key] for key in keys[2:])]
-    console.table(columns, [*body, mean])
 
 
 def _figures_of_targets(plan: Plan, directory: RunDirectory) -> list[dict[str, Any]]:
@@ -153,21 +144,14 @@ def _figures_of_targets(plan: Plan, directory: RunDirectory) -> list[dict[str, A
         return read_target(directory.round_path(number), entry), truth.load()
 
     for (number, entry, _), files in zip(shown, prefetch(read, shown), strict=True):
-        figures = {
-            "name": entry["name"],
-            "round": number,
-            "coverage": entry["coverage"],
-            "coverage_after": entry["coverage_after"],
-        }
+        figures = {key: entry[key] for key in ("name", "coverage", "coverage_after")}
+        figures["round"] = number
         if files is not None:
             target, truth = files
             figures |= view_figures(
-                target.picture,
-                truth,
-                observed=target.observed,
-                generated=target.generated,
+                target.picture, truth, observed=target.observed, generated=target.generated,
                 depth=target.depth,
-            )
+            )  # fmt: skip
         views.append(figures)
     return views
 
@@ -196,7 +180,6 @@ def reconstruct(
         dry_run: say what would be done, and write nothing.
         reading: how the user said the project is to be read, JSON-ready; part of what a resumed
             run must share with its beginning.
-        draw: writes pictures and pages of the finished run; None writes none.
 
     Returns:
         The run's folder.
@@ -239,13 +222,8 @@ def complete_run(
 ) -> Sequence[str]:
     """The rounds from number ``done`` on, and the end products.
 
-    Args:
-        plan: with the cameras that were fitted to.
-        fitted: Gaussians of the run; None leaves the memory's own colours.
-        draw: see ``reconstruct``.
-
-    Returns:
-        The names of the files that ``draw`` wrote.
+    ``plan`` has the cameras that were fitted to; without a fit, colours are the memory's own.
+    Returns the names of the files that ``draw`` wrote.
     """
     if fitted is not None:
         plan = fitted.apply(plan)
@@ -368,17 +346,8 @@ def refine(
 ) -> Path:
     """Fit a run's Gaussians further, and make all of its rounds again with them.
 
-    The new run is written beside the earlier one, which it replaces when it is complete.
-
-    Args:
-        path: the run's folder; the run need not be finished.
-        seconds: how long to fit; None counts steps.
-        steps: how many steps, where no time is given.
-        project: where the run's project lies now; None: where it lay.
-        draw: see ``reconstruct``.
-
-    Returns:
-        The run's folder.
+    The new run is written beside the earlier one, which need not be finished, and which it replaces
+    when it is complete. ``project`` is where the run's project lies now, if it was moved.
     """
     # A link stays one: what it leads to is replaced.
     place = path.resolve()
@@ -390,7 +359,10 @@ def refine(
     plan = replace(plan, config=plan.config.replaced(refine=options))
     compile_kernels(plan.config, console)
     describe(plan, console)
-    earlier = _earlier(run, console)
+    saved = round_folder(run.path, 0) / APPEARANCE
+    earlier = Fitted.load(saved) if run.rounds and saved.exists() else None
+    if earlier is None:
+        console.line(f"{run.path}: holds no fitted Gaussians; the fit begins anew")
     with folder_lock(place), folder_replaced_when_written(place) as folder:
         plan = plan.posed
         plan = replace(plan, scan=placed_scan(plan, console))
@@ -424,10 +396,14 @@ def _reopened(run: Run, console: Console) -> tuple[Plan, Mapping[str, Any]]:
         raise ProjectError(
             f"{run.path}: settings of another version ({error}); run reconstruct again"
         ) from None
+    project, reading = record["project"], record["reading"]
+    place = run.project or Path(reading["root"] if is_address(project) else project)
+    if not place.exists():
+        raise ProjectError(f"{run.path}: its project {place} is gone; say by --project where it is")
+    scene = open_recorded(project, reading, moved=run.project)
     begun = round_folder(run.path, 0) if run.rounds else None
-    scene = _project_of(run)
     plan = make_plan(scene, settings, say=console.line, round_0=begun)
-    identity = run_identity(plan, record["reading"])
+    identity = run_identity(plan, reading)
     changed = changed_keys(identity, record)
     if run.project is not None and "project" in changed:
         changed.remove("project")
@@ -437,26 +413,6 @@ def _reopened(run: Run, console: Console) -> tuple[Plan, Mapping[str, Any]]:
             f"({', '.join(changed)} differ); expected it unchanged; run reconstruct again"
         )
     return plan, identity
-
-
-def _project_of(run: Run) -> Scene:
-    """The project of a run."""
-    project, reading = run.record["project"], run.record["reading"]
-    place = Path(reading["root"] if is_address(project) else project)
-    if not (run.project or place).exists():
-        raise ProjectError(
-            f"{run.path}: its project {run.project or place} is gone; say by --project where it is"
-        )
-    return open_recorded(project, reading, moved=run.project)
-
-
-def _earlier(run: Run, console: Console) -> Fitted | None:
-    """The fit of a run; None where it was made without, or stopped before it was saved."""
-    saved = round_folder(run.path, 0) / APPEARANCE
-    if run.rounds and saved.exists():
-        return Fitted.load(saved)
-    console.line(f"{run.path}: holds no fitted Gaussians; the fit begins anew")
-    return None
 
 
 def _figures(path: Path) -> Mapping[str, Any]:

@@ -44,13 +44,7 @@ def automatic_voxel(
 
     Recorded depth and sparse points tell z. Only where no view has either is depth computed, by a
     rough version of the source.
-
-    Args:
-        context: names of the views that may be looked at.
-        percentile: of each view's footprints, 0 to 100.
     """
-    import numpy as np
-
     from gvtools.depth.source import is_recorded
 
     rows = {name: row for row, name in enumerate(scene.names)}
@@ -61,8 +55,9 @@ def automatic_voxel(
     footprints: list[float] = []
     for name in evenly_spread(with_depth):
         view = scene[name]
-        depths = _recorded(view) if is_recorded(source, view) else _of_points(scene, rows[name])
-        footprints += _footprint(view, depths, percentile)
+        depth = view.load().depth if is_recorded(source, view) else _of_points(scene, rows[name])
+        if depth is not None:
+            footprints += _footprint(view, depth[depth > 0], percentile)
     if not footprints:
         footprints = _computed(scene, context, source, percentile=percentile, say=say)
     return float(np.median(footprints))
@@ -111,28 +106,17 @@ def _computed(
     return footprints
 
 
-def _recorded(view: View) -> NDArray[np.float32]:
-    import numpy as np
-
-    depth = view.load().depth
-    return np.zeros(0, np.float32) if depth is None else depth[depth > 0]
-
-
 def _of_points(scene: Scene, row: int) -> NDArray[np.float32]:
     """Depths of the sparse points in a view's tracks."""
-    import numpy as np
-
     points = scene.points
     assert points is not None
     mine = points.point_index[points.view_index == row]
     _, z = scene.views[row].camera.project(points.positions[mine])
-    return z[0][z[0] > 0].astype(np.float32)
+    return z[0].astype(np.float32)
 
 
 def _footprint(view: View, depths: NDArray[np.float32], percentile: float) -> list[float]:
     """One footprint, or none without depth."""
-    import numpy as np
-
     if not depths.size:
         return []
     focal = float(np.sqrt(view.camera.K[0, 0, 0] * view.camera.K[0, 1, 1]))
@@ -165,14 +149,7 @@ def sufficient_scale(
 ) -> float:
     """The coarsest share of the configured voxel edge that shows as much as the best one.
 
-    Of ``SCALES``, it predicts views within ``loss`` of the best.
-
-    Args:
-        config: of the run: the edge to start from, and how points are lifted, kept and projected.
-        loss: dB that the mean PSNR of the predicted views may fall behind.
-
-    Returns:
-        A share of ``config.voxel``; 1 where there are too few views to tell.
+    Of ``SCALES``, it predicts views within ``loss`` dB of the best; 1 where too few views tell.
     """
     voxel = config.voxel
     if voxel is None or len(names) <= NEIGHBOURS:
@@ -195,7 +172,9 @@ def sufficient_scale(
             ]
         # Pixels that the finest of these memories covers; coarser ones cover more.
         masks = [mask for _, mask in shown[min(shown)]]
-        return {at: _psnr(pairs, masks) for at, pairs in shown.items()} if _enough(masks) else {}
+        if not any(mask.sum() >= LEAST for mask in masks):
+            return {}
+        return {at: _psnr(pairs, masks) for at, pairs in shown.items()}
 
     psnrs = _search(look, loss)
     if not psnrs:
@@ -214,9 +193,7 @@ def _search(look: Callable[[float], dict[float, float]], loss: float) -> dict[fl
     """PSNR by scale, of as few scales as tell which is best; empty where too little compares.
 
     Of finer edges the PSNR rises, then falls: no more are looked at than it takes to see that.
-
-    Args:
-        look: adds a scale; gives the PSNR of all scales so far, empty where too little compares.
+    ``look`` adds a scale, and gives the PSNR of all so far.
     """
     psnrs = look(START)
     for scale in [scale for scale in reversed(SCALES) if scale < START]:
@@ -244,10 +221,6 @@ def at_scale(config: RunSettings, scale: float) -> RunSettings:
         "memory.voxels_per_footprint": scale * config.memory.voxels_per_footprint,
     }
     return with_values(config, changes)
-
-
-def _enough(masks: Sequence[NDArray[np.bool_]]) -> bool:
-    return any(mask.sum() >= LEAST for mask in masks)
 
 
 def _psnr(
@@ -295,20 +268,17 @@ def _probe(scene: Scene, name: str, others: Sequence[str], *, frames: dict[str, 
     row, col = (np.arange(length) // TILE % 2 == 0 for length in truth.rgb.shape[:2])
     tiles = row[:, None] & col[None]
     wanted = cv2.dilate(tiles.astype(np.uint8), np.ones((2 * MARGIN + 1,) * 2, np.uint8)) > 0
+    cameras = {other: scene[other].camera for other in others}
     seen = [
-        (
-            scene[other].camera,
-            frames[other],
-            _falls_on(scene[other].camera, frames[other], camera, wanted=wanted),
-        )
-        for other in others
+        (own, frames[other], _pixels_onto(own, frames[other], camera, wanted=wanted))
+        for other, own in cameras.items()
     ]
     if truth.mask is not None:
         tiles &= truth.mask
     return _Probe(camera, truth.rgb, tiles, grid_frame(scene, others), seen)
 
 
-def _falls_on(
+def _pixels_onto(
     camera: Cameras, frame: Frame, onto: Cameras, *, wanted: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
     """(H, W), the pixels with depth that fall on the ``wanted`` pixels of another camera.
@@ -339,14 +309,9 @@ def _fused(probe: _Probe, config: RunSettings) -> SpatialMemory:
     for camera, frame, mask in probe.seen:
         assert frame.depth is not None
         memory.observe(
-            frame.rgb,
-            frame.depth,
-            camera,
-            round=0,
-            mask=mask,
-            options=config.back_projection,
-            pixel_binning=config.savings.pixel_binning,
-        )
+            frame.rgb, frame.depth, camera, round=0, mask=mask,
+            options=config.back_projection, pixel_binning=config.savings.pixel_binning,
+        )  # fmt: skip
     return memory
 
 

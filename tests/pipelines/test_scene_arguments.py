@@ -4,6 +4,7 @@ import argparse
 
 import numpy as np
 import pytest
+from command_line import arguments
 from scenes_workspace import sevenscenes, workspace
 
 from gvtools.errors import OptionError, ProjectError
@@ -28,6 +29,11 @@ def test_nothing_given_is_no_rgbd_option(tmp_path):
     assert rgbd_options(parsed().reading()) is None
     workspace(tmp_path)
     assert parsed().open_scene(tmp_path).kind == "colmap"
+
+
+def test_masks_of_photographs_are_no_option_of_recordings(tmp_path):
+    words = ("capture", tmp_path, "--out", tmp_path / "out", "--masks", tmp_path)
+    assert arguments(*words, "--depth-unit", 0.002).reading() == {"depth_unit": 0.002}
 
 
 def test_images_and_masks_reach_the_reader(tmp_path):

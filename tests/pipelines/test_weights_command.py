@@ -9,6 +9,7 @@ import geoverse_models as micro
 import published_folder as published
 import pytest
 import torch
+from command_line import refused
 from safetensors.torch import load_file, save_file
 
 from gvtools.completers.geoverse import from_pretrained
@@ -26,19 +27,6 @@ def weights(*arguments: object) -> int:
     return main(["weights", *map(str, arguments)])
 
 
-def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
-    """The one line with which the command ends, status 2."""
-    try:
-        status = weights(*arguments)
-    except SystemExit as stop:
-        status = int(stop.code or 0)
-    lines = capsys.readouterr().err.strip().splitlines()
-    assert status == 2
-    assert len(lines) == 1
-    assert lines[0].startswith("gvtools: ")
-    return lines[0]
-
-
 @pytest.fixture
 def own(tmp_path: Path) -> Path:
     save_pretrained(micro.model(PLAIN), tmp_path / "own")
@@ -50,9 +38,6 @@ def micro_file(tmp_path: Path) -> Path:
     path = tmp_path / "micro.json"
     path.write_text(json.dumps(to_json(PLAIN)))
     return path
-
-
-# list
 
 
 # Tensors and numbers of the official networks; safetensors keep six shared names less. Sizes as the
@@ -110,10 +95,9 @@ def test_the_list_is_readable(capsys: pytest.CaptureFixture[str], micro_file: Pa
 
 
 def test_an_unknown_configuration_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    assert "'large'; expected base, gld, tiny or a config.json" in refused(capsys, "list", "large")
-
-
-# check
+    assert "'large'; expected base, gld, tiny or a config.json" in refused(
+        capsys, "weights", "list", "large"
+    )
 
 
 def test_a_folder_that_fits(capsys: pytest.CaptureFixture[str], own: Path, tmp_path: Path) -> None:
@@ -165,22 +149,21 @@ def test_what_does_not_fit_is_said_for_each_part(capsys, tmp_path):
 def test_the_configuration_may_be_another_than_the_folders(capsys, own, micro_file):
     assert weights("check", own, "--config", micro_file, "--quiet") == 0
     assert weights("check", own, "--config", own, "--quiet") == 0
-    line = refused(capsys, "check", own, "--config", "tiny", "--quiet")
+    line = refused(capsys, "weights", "check", own, "--config", "tiny", "--quiet")
     assert "missing: " in line
     assert "of another shape: " in line
 
 
 def test_a_folder_that_is_none(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     report = tmp_path / "check.json"
-    line = refused(capsys, "check", tmp_path / "absent", "--json", report)
+    line = refused(capsys, "weights", "check", tmp_path / "absent", "--json", report)
     assert "absent does not exist" in line
     found = json.loads(report.read_text())
     assert found["ok"] is False
     assert found["problem"] in line
-    assert "neither config.json nor a published file" in refused(capsys, "check", tmp_path)
-
-
-# create
+    assert "neither config.json nor a published file" in refused(
+        capsys, "weights", "check", tmp_path
+    )
 
 
 def test_a_created_model_is_untrained_and_its_seeds_own(capsys, tmp_path, micro_file):
@@ -202,12 +185,12 @@ def test_a_created_model_is_untrained_and_its_seeds_own(capsys, tmp_path, micro_
 
 def test_nothing_is_overwritten(capsys, own, micro_file, tmp_path):
     before = {path: path.read_bytes() for path in own.iterdir()}
-    assert "nothing is overwritten" in refused(capsys, "create", micro_file, own)
+    assert "nothing is overwritten" in refused(capsys, "weights", "create", micro_file, own)
     assert {path: path.read_bytes() for path in own.iterdir()} == before
-    assert "nothing is overwritten" in refused(capsys, "create", micro_file, micro_file)
+    assert "nothing is overwritten" in refused(capsys, "weights", "create", micro_file, micro_file)
     (tmp_path / "new" / "video").mkdir(parents=True)
     assert weights("create", micro_file, tmp_path / "new") == 0
-    assert "'huge'" in refused(capsys, "create", "huge", tmp_path / "huge")
+    assert "'huge'" in refused(capsys, "weights", "create", "huge", tmp_path / "huge")
     assert not (tmp_path / "huge").exists()
 
 
@@ -216,10 +199,7 @@ def test_a_created_model_says_that_it_lacks_the_video_prior(capsys, tmp_path):
     path.write_text(json.dumps(to_json(micro.config(injection="control"))))
     assert weights("create", path, tmp_path / "model") == 0
     assert f"truncate-wan SOURCE {tmp_path / 'model' / 'video'}" in capsys.readouterr().out
-    assert "video: absent" in refused(capsys, "check", tmp_path / "model", "--quiet")
-
-
-# the video prior
+    assert "video: absent" in refused(capsys, "weights", "check", tmp_path / "model", "--quiet")
 
 
 def test_the_video_prior_is_cut_and_completed(capsys, tmp_path):
@@ -238,21 +218,20 @@ def test_the_video_prior_is_cut_and_completed(capsys, tmp_path):
     assert f"of {size:.3g} kB written" in text or "kB written" in text
     assert f"gvtools weights empty-prompt TEXT_ENCODER {video}" in text
     assert json.loads((video / "transformer" / "config.json").read_text())["num_layers"] == 4
-    assert "is there already" in refused(capsys, "truncate-wan", source, video)
-    assert "empty_prompt.safetensors is absent" in refused(capsys, "check", folder, "--quiet")
-    assert "no folder" in refused(capsys, "empty-prompt", tmp_path, tmp_path / "absent")
-    line = refused(capsys, "empty-prompt", tmp_path / "absent", video)
+    assert "is there already" in refused(capsys, "weights", "truncate-wan", source, video)
+    assert "empty_prompt.safetensors is absent" in refused(
+        capsys, "weights", "check", folder, "--quiet"
+    )
+    assert "no folder" in refused(capsys, "weights", "empty-prompt", tmp_path, tmp_path / "absent")
+    line = refused(capsys, "weights", "empty-prompt", tmp_path / "absent", video)
     assert "transformers" in line
     save_file({"embedding": tiny_wan.prompt()}, video / "empty_prompt.safetensors")
-    assert "nothing is overwritten" in refused(capsys, "empty-prompt", tmp_path, video)
+    assert "nothing is overwritten" in refused(capsys, "weights", "empty-prompt", tmp_path, video)
     assert weights("check", folder) == 0
     assert "video     ok (video, " in capsys.readouterr().out
     assert from_pretrained(folder).video is not None
     shutil.rmtree(video / "vae")
-    assert "vae" in refused(capsys, "check", folder, "--quiet")
-
-
-# the command itself
+    assert "vae" in refused(capsys, "weights", "check", folder, "--quiet")
 
 
 @pytest.mark.parametrize("action", ACTIONS)
@@ -268,4 +247,4 @@ def test_every_help_of_an_action_starts_with_two_examples(action, capsys):
 
 def test_a_wrong_action_or_option_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     for arguments in ((), ("lst",), ("check",), ("list", "--jsn", "x"), ("create", "tiny")):
-        refused(capsys, *arguments)
+        refused(capsys, "weights", *arguments)

@@ -68,7 +68,8 @@ def part(number: int, cell: BlockCell, *, gain: float) -> BlockAppearance:
     logs = np.full((3, 3), -np.log(gain))
     owners = NAMES[:1] if number == 0 else NAMES[1:]
     block = SceneBlock(
-        str(number), ("0", "1"), "", {}, cell, owners, (), (), {}, refined=False
+        name=str(number), names=("0", "1"), project="", reading={}, low=cell.low, high=cell.high,
+        owners=owners, helpers=(), targets=(), poses={}, refined=False,
     )  # fmt: skip
     exposures = Exposures(frame.cam_from_local(poses), logs, 1.0)
     return BlockAppearance(

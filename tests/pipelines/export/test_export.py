@@ -15,10 +15,8 @@ from plyfile import PlyData
 from gvtools.errors import OptionError, ProjectError
 from gvtools.memory.ply import export_memory_ply
 from gvtools.memory.spatial_memory import SpatialMemory
-from gvtools.memory.store.local_frame import LocalFrame
 from gvtools.memory.thinning import thinned
 from gvtools.scenes.project import open_project
-from pipelines.cli import main
 from pipelines.export.formats import FORMATS
 
 ORIGIN = (431_000.0, 5_650_000.0, 120.0)
@@ -169,27 +167,6 @@ def test_glb_is_what_trimesh_reads(memory, saved, tmp_path):
     assert material["pbrMetallicRoughness"]["metallicFactor"] == 0
 
 
-def test_glb_keeps_millimetres_far_from_the_origin(scene, tmp_path):
-    trimesh = pytest.importorskip("trimesh")
-    near = fused(scene, [0])
-    far = fused(scene, [0])
-    far.frame = LocalFrame.at(ORIGIN)
-    far.views.frame = far.frame
-    far.save(tmp_path / "memory.npz")
-    export_run(tmp_path / "memory.npz", "glb", tmp_path / "cloud.glb")
-    loaded = trimesh.load_scene(tmp_path / "cloud.glb")
-    matrix, name = loaded.graph[loaded.graph.nodes_geometry[0]]
-    local = np.asarray(loaded.geometry[name].vertices)
-    assert np.abs(local).max() < 5
-    world = local @ matrix[:3, :3].T + matrix[:3, 3]
-    expected = near.positions[thinned(near, None).rows] + ORIGIN
-    np.testing.assert_allclose(world, expected, atol=1e-5)
-    data = (tmp_path / "cloud.glb").read_bytes()
-    length = int.from_bytes(data[12:16], "little")
-    (node,) = (node for node in json.loads(data[20 : 20 + length])["nodes"] if "mesh" in node)
-    assert node["extras"]["origin"] == node["matrix"][12:15] == matrix[:3, 3].tolist()
-
-
 @pytest.mark.parametrize("kind", [name for name, form in FORMATS.items() if form.needs])
 def test_an_absent_package_is_named_with_what_to_install(saved, tmp_path, monkeypatch, kind):
     form = FORMATS[kind]
@@ -206,13 +183,6 @@ def test_another_suffix_is_refused(saved, tmp_path, kind):
     with pytest.raises(OptionError, match=f"ends with {next(iter(FORMATS[kind].suffixes))}"):
         export_run(saved, kind, tmp_path / "out.jpg")
     assert not (tmp_path / "out.jpg").exists()
-
-
-def test_the_command_line_ends_with_2_for_a_wrong_name(saved, tmp_path, capsys):
-    words = ["export", str(saved), "--format", "las", "--out", str(tmp_path / "out.txt")]
-    assert main(words) == 2
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 1 and "ends with .las or .laz" in lines[0]
 
 
 def test_a_view_fused_twice_is_one_camera(scene, tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pycolmap
@@ -11,7 +12,6 @@ from box_project import VOXEL, fused
 from export_runs import export_run
 from PIL import Image
 
-from gvtools.cameras import Cameras
 from gvtools.errors import OptionError, ProjectError
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.store.views import SourceView
@@ -30,7 +30,7 @@ def saved(scene, tmp_path):
 
 def add_view(memory, camera, name, *, number, generated):
     """A fused view that left no observation."""
-    named = Cameras(camera.K, camera.cam_from_world, camera.width, camera.height, (name,))
+    named = replace(camera, names=(name,))
     memory.views.append(SourceView(named, number, generated, np.zeros((0, 0), np.float32)))
 
 
@@ -114,10 +114,7 @@ def test_track_elements_follow_the_renamed_views(scene, tmp_path):
     memory = fused(scene, [0, 2])
     other = scene.views[5]
     frame = other.load()
-    namesake = Cameras(
-        other.camera.K, other.camera.cam_from_world, other.camera.width, other.camera.height,
-        ("view_0.png",),
-    )  # fmt: skip
+    namesake = replace(other.camera, names=("view_0.png",))
     memory.observe(frame.rgb, frame.depth, namesake, round=2, generated=True)
     count = int(memory.generated.sum())
     assert count
@@ -140,16 +137,13 @@ def test_cameras_far_from_the_origin_are_told_apart(scene, tmp_path):
     memory = SpatialMemory(VOXEL, origin=ORIGIN)
     shift = np.eye(4)
     shift[:3, 3] = -np.array(ORIGIN)
-    far = [
-        Cameras(view.camera.K, view.camera.cam_from_world @ shift, view.camera.width,
-                view.camera.height, ("a.png",))
-        for view in scene
-    ]  # fmt: skip
-    beside = far[0].cam_from_world.copy()
+    camera = scene.views[0].camera
+    far = replace(camera, cam_from_world=camera.cam_from_world @ shift, names=("a.png",))
+    beside = far.cam_from_world.copy()
     beside[0, 0, 3] += 0.5
-    near = Cameras(far[0].K, beside, far[0].width, far[0].height, ("a.png",))
+    near = replace(far, cam_from_world=beside)
     frame = scene.views[0].load()
-    memory.observe(frame.rgb, frame.depth, far[0], round=0)
+    memory.observe(frame.rgb, frame.depth, far, round=0)
     add_view(memory, near, "a.png", number=1, generated=True)
     memory.save(tmp_path / "memory.npz")
     export_run(tmp_path / "memory.npz", "colmap", tmp_path / "out")

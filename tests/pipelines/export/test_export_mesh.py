@@ -12,9 +12,8 @@ from export_runs import export_run, glb_colors
 
 from gvtools.errors import DegenerateError, OptionError
 from gvtools.memory.spatial_memory import SpatialMemory
-from pipelines.export import surfaces
-from pipelines.export.mesh import simplify
-from pipelines.export.surfaces import tsdf_mesh
+from pipelines.export import mesh as meshes
+from pipelines.export.mesh import simplify, tsdf_mesh
 from pipelines.export.texture import atlas
 
 trimesh = pytest.importorskip("trimesh")
@@ -150,7 +149,7 @@ def test_triangles_without_area_do_not_stop_the_simplification(bare_run):
 
 
 def test_voxels_that_would_fill_the_memory_are_refused_or_widened(bare_run, tmp_path, monkeypatch):
-    monkeypatch.setattr(surfaces, "MOST_BLOCKS", 20)
+    monkeypatch.setattr(meshes, "MOST_BLOCKS", 20)
     with pytest.raises(OptionError, match=r"--voxel 0.02: the scene has \d+ blocks"):
         export_run(bare_run.folder, "mesh", tmp_path / "out.ply", "--voxel", 0.02)
     assert not (tmp_path / "out.ply").exists()

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 from box_project import fused
 from export_runs import export_run
+from plyfile import PlyData
 
 from gvtools.errors import OptionError
 from gvtools.memory.store.local_frame import LocalFrame
@@ -48,16 +51,6 @@ def test_laspy_reads_points_colours_and_what_is_known_of_each(bare_run, tmp_path
     assert memory.generated[rows].any()
 
 
-def test_las_keeps_its_steps_far_from_the_origin(far, tmp_path):
-    laspy = pytest.importorskip("laspy")
-    pytest.importorskip("lazrs")
-    memory, positions = far
-    export_run(memory, "las", tmp_path / "out.las")
-    cloud = laspy.read(tmp_path / "out.las")
-    assert cloud.header.global_encoding.wkt
-    np.testing.assert_allclose(cloud.xyz, positions, atol=0.51 * cloud.header.scales[0] + 1e-6)
-
-
 @pytest.mark.parametrize("suffix", [".usdc", ".usda"])
 def test_pxr_reads_the_points(bare_run, tmp_path, suffix):
     pytest.importorskip("pxr")
@@ -87,18 +80,69 @@ def test_pxr_reads_the_points(bare_run, tmp_path, suffix):
     np.testing.assert_array_equal(np.array(generated), memory.generated[rows])
 
 
-def test_usd_moves_far_points_by_a_double_translation(far, tmp_path):
+def far_las(path):
+    cloud = pytest.importorskip("laspy").read(path)
+    assert cloud.header.scales[0] <= 0.003 and cloud.header.global_encoding.wkt
+    return cloud.xyz
+
+
+def far_usd(path):
+    """The parent's translation is double, what it moves is near 0."""
     pytest.importorskip("pxr")
     from pxr import Usd, UsdGeom
 
-    memory, positions = far
-    export_run(memory, "usd", tmp_path / "out.usdc")
-    stage = Usd.Stage.Open(str(tmp_path / "out.usdc"))
+    stage = Usd.Stage.Open(str(path))
     cloud = UsdGeom.Points(stage.GetPrimAtPath("/gvtools/memory"))
     local = np.array(cloud.GetPointsAttr().Get(), np.float64)
     assert np.abs(local).max() < 5
-    world = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(cloud.GetPrim()))
-    np.testing.assert_allclose(local + world[3, :3], positions, atol=1e-5)
+    return local + np.array(UsdGeom.XformCache().GetLocalToWorldTransform(cloud.GetPrim()))[3, :3]
+
+
+def far_glb(path):
+    """Likewise the node's matrix, which its extras repeat."""
+    loaded = pytest.importorskip("trimesh").load_scene(path)
+    matrix, name = loaded.graph[loaded.graph.nodes_geometry[0]]
+    local = np.asarray(loaded.geometry[name].vertices)
+    assert np.abs(local).max() < 5
+    data = path.read_bytes()
+    header = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+    (node,) = (node for node in header["nodes"] if "mesh" in node)
+    assert node["extras"]["origin"] == node["matrix"][12:15] == matrix[:3, 3].tolist()
+    return local @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+def far_splat(path):
+    """Positions count from a point that the header names."""
+    data = PlyData.read(path)
+    (line,) = (line for line in data["vertex"].comments if line.startswith("origin"))
+    xyz = np.stack([np.asarray(data["vertex"][axis], float) for axis in "xyz"], axis=1)
+    return xyz + np.array(line.split()[1:], float)
+
+
+def far_rrd(path):
+    """Positions count from the memory's origin."""
+    pytest.importorskip("rerun")
+    from rerun.chunk import RrdReader
+
+    batches = [chunk.to_record_batch() for chunk in RrdReader(path).store().stream()]
+    columns = [batch.to_pydict() for batch in batches]
+    name = "Points3D:positions"
+    return np.concatenate([each[name][0] for each in columns if name in each]) + ORIGIN
+
+
+@pytest.mark.parametrize(
+    ("name", "read", "off"),
+    [("out.las", far_las, 2e-3), ("out.usdc", far_usd, 1e-5), ("out.glb", far_glb, 1e-5),
+     ("out.ply", far_splat, 1e-5), ("out.rrd", far_rrd, 1e-5)],
+)  # fmt: skip
+def test_positions_far_from_the_origin_keep_their_digits(far, tmp_path, name, read, off):
+    memory, positions = far
+    forms = {".usdc": "usd", ".ply": "splat"}
+    out = tmp_path / name
+    export_run(memory, forms.get(out.suffix, out.suffix[1:]), out)
+    found = np.asarray(read(out))
+    assert found.shape == positions.shape
+    np.testing.assert_allclose(found, positions, atol=off)
 
 
 @pytest.mark.parametrize("form", ["ply", "las", "glb"])

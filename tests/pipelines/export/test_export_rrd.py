@@ -6,11 +6,9 @@ import io
 
 import numpy as np
 import pytest
-from box_project import fused, write_box
 from export_runs import export_run
 from PIL import Image
 
-from gvtools.memory.store.local_frame import LocalFrame
 from gvtools.memory.thinning import thinned
 
 pytest.importorskip("rerun")
@@ -90,14 +88,3 @@ def test_an_earlier_round_has_no_later_cameras(reconstructed_run, tmp_path):
     export_run(reconstructed_run.path, "rrd", tmp_path / "out.rrd", "--round", 0)
     entities = [entity for entity, _ in chunks(tmp_path / "out.rrd")]
     assert entities and not any("generated" in entity for entity in entities)
-
-
-def test_a_memory_alone_far_from_the_origin(tmp_path):
-    memory = fused(write_box(tmp_path / "box"), [0, 2], generated=(2,))
-    near = memory.positions[thinned(memory, None).rows]
-    memory.frame = memory.views.frame = LocalFrame.at(ORIGIN)
-    memory.save(tmp_path / "far.npz")
-    export_run(tmp_path / "far.npz", "rrd", tmp_path / "out.rrd")
-    read = np.concatenate([positions for _, positions in points(tmp_path / "out.rrd").values()])
-    assert len(read) == len(near)
-    np.testing.assert_allclose(np.sort(read, axis=0), np.sort(near, axis=0), atol=1e-5)

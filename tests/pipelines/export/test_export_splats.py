@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from box_project import fused
 from export_runs import export_run
 from plain_splats import draw, read_splats
 from plyfile import PlyData
@@ -15,7 +14,6 @@ from reference_gaussians import rotations
 
 from gvtools.errors import OptionError
 from gvtools.memory.splat.api import SplatOptions
-from gvtools.memory.store.local_frame import LocalFrame
 from gvtools.memory.thinning import thinned
 from gvtools.runs.run import load_appearance
 from pipelines.rendering import render_view
@@ -114,20 +112,6 @@ def test_a_memory_without_a_fit_shows_its_points(scene, bare_run, tmp_path):
     assert psnr(drawn(splats, camera)[both], shown.rgb[0][both]) > 28
     export_run(bare_run.folder, "splat", tmp_path / "out.ply", "--max-points", 300)
     assert 50 < len(read_splats(tmp_path / "out.ply")["positions"]) <= 300
-
-
-def test_far_from_the_origin_positions_count_from_a_point_that_the_header_names(scene, tmp_path):
-    memory = fused(scene, [0])
-    near = memory.positions.copy()
-    memory.frame = memory.views.frame = LocalFrame.at(ORIGIN)
-    memory.save(tmp_path / "memory.npz")
-    export_run(tmp_path / "memory.npz", "splat", tmp_path / "out.ply")
-    data = PlyData.read(tmp_path / "out.ply")
-    (line,) = (line for line in data["vertex"].comments if line.startswith("origin"))
-    origin = np.array(line.split()[1:], float)
-    xyz = np.stack([np.asarray(data["vertex"][axis], float) for axis in "xyz"], axis=1)
-    rows = thinned(memory, None).rows
-    np.testing.assert_allclose(xyz + (origin - ORIGIN), near[rows], atol=1e-5)
 
 
 def test_gsply_reads_the_spz_as_the_ply(fitted_run, tmp_path):

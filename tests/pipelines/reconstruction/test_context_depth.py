@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from PIL import Image
+from run_files import report_of
 from tiny_scan import render, world_from_cam, write_colmap_scan, write_scan
 
 from gvtools.depth import choice
@@ -20,7 +21,9 @@ from pipelines.cli import main
 
 pytestmark = pytest.mark.usefixtures("unpainted")
 
-RUN = ("--targets", "range:3-4", "--views-per-round", "1", "--context", "first:3", "--quiet")
+RUN = ("--targets", "range:3-4", "--views-per-round", "1", "--context", "first:3",
+       "--refine", "0", "--depth", "plane-sweep", "--quiet")  # fmt: skip
+# Every view's depth is asked for, whatever memory explains.
 ALL = ("--set", "savings.depth_from_memory=none")
 
 
@@ -52,18 +55,7 @@ def scan(tmp_path, monkeypatch):
 
 
 def reconstruct(scan, out, *more: object) -> int:
-    words = [
-        "reconstruct",
-        scan,
-        "--refine",
-        "0",
-        "--out",
-        out,
-        *RUN,
-        "--depth",
-        "plane-sweep",
-        *more,
-    ]
+    words = ("reconstruct", scan, "--out", out, *RUN, *more)
     return main([str(word) for word in words])
 
 
@@ -81,7 +73,7 @@ def test_depth_that_nothing_confirms_is_fused_as_generated(scan, tmp_path, monke
         if name == "guessed":
             monkeypatch.setattr(Exact, "depth", half_guessed)
         assert reconstruct(scan, tmp_path / name, "--voxel", "0.03", *ALL) == 0
-        report = json.loads((tmp_path / name / "rounds.jsonl").read_text().splitlines()[0])
+        report = report_of(tmp_path / name)
         counts.append((report["observed"], report["generated"], report["dropped"]["masked"]))
     (all_observed, none, masked), (observed, generated, masked_too) = counts
     assert none == 0 and masked_too == masked
@@ -106,7 +98,7 @@ def test_computed_depth_is_kept_and_asked_for_once(scan, tmp_path):
         )
         assert str(stored["source"]) == "exact"
     assert kept[0].with_suffix(".png").is_file()
-    report = json.loads((out / "round_000" / "report.json").read_text())
+    report = report_of(out)
     assert [entry["source"] for entry in report["depth"]] == ["exact"] * 3
     assert report["depth"][0]["known"] == 1
     assert report["depth"][0]["scale"] is None
@@ -115,7 +107,7 @@ def test_computed_depth_is_kept_and_asked_for_once(scan, tmp_path):
 def test_a_view_that_memory_explains_needs_none_computed(scan, tmp_path):
     out = tmp_path / "run"
     assert reconstruct(scan, out, "--voxel", "0.03", "--set", "savings.depth_from_memory=0.8") == 0
-    report = json.loads((out / "round_000" / "report.json").read_text())
+    report = report_of(out)
     sources = [entry["source"] for entry in report["depth"]]
     assert sources[0] == "exact" and sources.count("memory") == 3 - Exact.asked > 0
     row = sources.index("memory")
@@ -158,7 +150,7 @@ def test_a_view_without_depth_does_not_stop_the_others(scan, tmp_path, monkeypat
     out = tmp_path / "run"
     assert reconstruct(scan, out, *ALL) == 0
     assert "1 of 3 views have no depth" in capsys.readouterr().err
-    report = json.loads((out / "round_000" / "report.json").read_text())
+    report = report_of(out)
     assert [entry["known"] for entry in report["depth"]] == [1, 0, 1]
     assert "frame-000001" in report["depth"][1]["failed"]
     Lacking.none = True
@@ -188,21 +180,9 @@ def test_views_off_the_sparse_points_scale_are_reported_and_named(
     monkeypatch.setattr(choice, "_stereo", lambda *_: Scaled())
     scan, out = write_colmap_scan(tmp_path / "colmap", views=8), tmp_path / "run"
     options = ("--context", "not:first:1", "--targets", "first:1", "--completer", "none")
-    # Every view's depth is asked for, whatever memory explains.
-    every = ("--set", "savings.depth_from_memory=none")
-    words = [
-        "reconstruct",
-        str(scan),
-        "--refine",
-        "0",
-        "--out",
-        str(out),
-        *options,
-        *every,
-        "--quiet",
-    ]
-    assert main(words) == 0
-    for entry in json.loads((out / "round_000" / "report.json").read_text())["depth"]:
+    words = ["reconstruct", str(scan), "--refine", "0", "--out", str(out), *options, *ALL]
+    assert main([*words, "--quiet"]) == 0
+    for entry in report_of(out)["depth"]:
         off, scale = int(entry["view"][5:-4]) in wrong, entry["scale"]
         assert scale["disagrees"] is off
         assert scale["scale"] == pytest.approx(0.75 if off else 1, rel=1e-3)
@@ -214,7 +194,7 @@ def test_views_off_the_sparse_points_scale_are_reported_and_named(
         assert "2 of 7 views is off the sparse points' scale: view_1.png, view_4.png;" in last[0]
         assert str(out / "round_000" / "report.json") in last[0]
         # A run that is taken up again says it as well.
-        assert main([*words, "--resume"]) == 0
+        assert main([*words, "--quiet", "--resume"]) == 0
         assert "view_1.png, view_4.png;" in capsys.readouterr().err
     else:
         assert last == []

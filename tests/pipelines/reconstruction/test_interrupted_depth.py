@@ -6,6 +6,7 @@ The pictures are of the tiny scan and the depth comes from the plane sweep itsel
 from __future__ import annotations
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -14,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from run_files import results
+from run_files import results, untimed
 from tiny_scan import write_scan
 
 from gvtools.depth.stereo.plane_sweep import PlaneSweepStereo
@@ -65,12 +66,6 @@ def reconstruct(scan: Path, out: Path, *more: str) -> int:
     return main(words(scan, out, *more))
 
 
-def first_report(out: Path) -> dict:
-    report = json.loads((out / "round_000" / "report.json").read_text())
-    report.pop("seconds")
-    return report
-
-
 @pytest.fixture
 def asked(monkeypatch) -> list[str]:
     """Names of the views that the sweep is asked for, in order."""
@@ -83,6 +78,13 @@ def asked(monkeypatch) -> list[str]:
 
     monkeypatch.setattr(PlaneSweepStereo, "depth", noted)
     return names
+
+
+def interrupted(scan: Path, out: Path) -> None:
+    """A run that is interrupted before its fourth view."""
+    with pytest.MonkeyPatch.context() as patch:
+        stop_before(patch, 6, KeyboardInterrupt())
+        assert reconstruct(scan, out) == 1
 
 
 def stop_before(monkeypatch, index: int, error: BaseException) -> None:
@@ -117,14 +119,12 @@ def test_a_killed_run_goes_on_with_the_next_view(scan, whole, tmp_path, asked, a
     for name, written in kept.items():
         assert (out / "round_000" / name).stat().st_mtime_ns == written
     assert results(out) == results(whole)
-    assert first_report(out) == first_report(whole)
+    assert untimed(out) == untimed(whole)
 
 
 def test_an_interrupt_keeps_what_is_whole_and_nothing_else(scan, whole, tmp_path, monkeypatch):
     out = tmp_path / "run"
-    with monkeypatch.context() as patch:
-        stop_before(patch, 6, KeyboardInterrupt())
-        assert reconstruct(scan, out) == 1
+    interrupted(scan, out)
     part = out / ".round_000.part"
     assert len(list(part.glob("context_depth_*.npz"))) == 3
     assert {path.name[:14] for path in part.iterdir()} == {"context_depth_"}
@@ -136,9 +136,7 @@ def test_an_interrupt_keeps_what_is_whole_and_nothing_else(scan, whole, tmp_path
 @pytest.mark.parametrize("other", [("--set", "stereo.window=5"), ("--seed", "3")])
 def test_another_run_computes_its_own(scan, tmp_path, monkeypatch, asked, other):
     out = tmp_path / "run"
-    with monkeypatch.context() as patch:
-        stop_before(patch, 6, KeyboardInterrupt())
-        assert reconstruct(scan, out) == 1
+    interrupted(scan, out)
     asked.clear()
     assert reconstruct(scan, out, *other, "--resume") == 0
     assert len(asked) == VIEWS
@@ -150,14 +148,8 @@ def test_another_run_computes_its_own(scan, tmp_path, monkeypatch, asked, other)
 @pytest.mark.slow
 def test_changed_pictures_and_versions_compute_anew(scan, tmp_path, monkeypatch, asked):
     mine, out = write_scan(tmp_path / "scan", views=2 * VIEWS), tmp_path / "run"
-
-    def interrupted() -> None:
-        with monkeypatch.context() as patch:
-            stop_before(patch, 6, KeyboardInterrupt())
-            assert reconstruct(mine, out) == 1
-        asked.clear()
-
-    interrupted()
+    interrupted(mine, out)
+    asked.clear()
     picture = mine / "frame-000002.color.png"
     picture.write_bytes(picture.read_bytes())
     with monkeypatch.context() as patch:
@@ -176,9 +168,7 @@ def test_a_damaged_file_of_an_unfinished_round_is_computed_anew(
     scan, whole, tmp_path, monkeypatch, asked
 ):
     out = tmp_path / "run"
-    with monkeypatch.context() as patch:
-        stop_before(patch, 6, KeyboardInterrupt())
-        assert reconstruct(scan, out) == 1
+    interrupted(scan, out)
     asked.clear()
     kept = sorted((out / ".round_000.part").glob("context_depth_*.npz"))
     kept[0].write_bytes(kept[0].read_bytes()[:200])
@@ -203,15 +193,13 @@ def test_why_a_view_has_no_depth_outlasts_the_interrupt(scan, tmp_path, monkeypa
     assert reconstruct(scan, out, "--resume") == 0
     assert "1 of 6 views have no depth" in capsys.readouterr().err
     assert results(out) == results(straight)
-    assert first_report(out) == first_report(straight)
+    assert untimed(out) == untimed(straight)
 
 
 @pytest.mark.slow
 def test_what_was_taken_over_is_said(scan, tmp_path, monkeypatch, capsys):
     out = tmp_path / "run"
-    with monkeypatch.context() as patch:
-        stop_before(patch, 6, KeyboardInterrupt())
-        assert reconstruct(scan, out) == 1
+    interrupted(scan, out)
     loud = [word for word in words(scan, out) if word != "--quiet"]
     assert main(loud) == 0
     assert "taking over the depth of 3 of 6 context views" in capsys.readouterr().out
@@ -219,8 +207,6 @@ def test_what_was_taken_over_is_said(scan, tmp_path, monkeypatch, capsys):
 
 def test_a_first_round_that_is_done_anew_is_taken_up_too(scan, whole, tmp_path, monkeypatch, asked):
     """A finished run whose first round was removed, and that was interrupted on its way back."""
-    import shutil
-
     out = tmp_path / "run"
     shutil.copytree(whole, out)
     shutil.rmtree(out / "round_000")

@@ -7,20 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from run_files import Killed
+from run_files import Killed, reconstructed
 from tiny_scan import write_scan
 
-from gvtools.errors import ProjectError
 from gvtools.memory.spatial_memory import TiledMemory
 from gvtools.memory.store import tile_set
 from gvtools.runs.run import load_memory, load_run
-from gvtools.scenes.project import open_project
-from gvtools.settings import with_texts
 from pipelines.cli import main
-from pipelines.console import Console
 from pipelines.reconstruction import run as runs
-from pipelines.reconstruction.run import reconstruct
-from pipelines.reconstruction.settings import RunSettings
 
 pytestmark = pytest.mark.usefixtures("unpainted")
 
@@ -49,8 +43,7 @@ def tiled(scan, tmp_path_factory):
 
 
 def run(scan: Path, out: Path, *settings: str, resume: bool = False) -> Path:
-    config = with_texts(RunSettings(), (*SETTINGS, *settings))
-    return reconstruct(open_project(scan), config, out, console=Console(quiet=True), resume=resume)
+    return reconstructed(scan, out, *SETTINGS, *settings, resume=resume)
 
 
 def figures(out: Path) -> dict:
@@ -93,11 +86,6 @@ def test_a_run_goes_on_after_a_kill_with_any_budget(
     assert (out / "round_001" / "memory.tiles").is_dir()
     run(scan, out, budget, resume=True)
     assert_same_results(out, in_ram)
-
-
-def test_other_settings_still_belong_to_another_run(scan, tiled):
-    with pytest.raises(ProjectError, match=r"another run \(settings"):
-        run(scan, tiled, TINY, "memory.weight_cap=7", resume=True)
 
 
 def test_rounds_are_forgotten_when_a_run_is_read(tiled, in_ram):

@@ -12,7 +12,6 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 from tiny_scan import write_scan
 
-from gvtools.cameras import Cameras
 from gvtools.memory.back_projection import back_project
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.scenes.project import open_project
@@ -45,14 +44,7 @@ class World:
         pose = view.camera.world_from_cam.copy()
         pose[0, :3, :3] = Rotation.from_rotvec(self.rotation).as_matrix() @ pose[0, :3, :3]
         pose[0, :3, 3] = self.points(view.camera.world_from_cam[0, :3, 3])
-        known = view.camera
-        camera = Cameras(
-            known.K,
-            np.linalg.inv(pose).astype(np.float64),
-            known.width,
-            known.height,
-            names=known.names,
-        )
+        camera = replace(view.camera, cam_from_world=np.linalg.inv(pose).astype(np.float64))
 
         def load() -> Frame:
             frame = view.load()

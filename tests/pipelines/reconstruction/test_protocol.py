@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 
 import pytest
-from run_files import untimed
+from run_files import report_of, untimed
 from tiny_scan import write_scan
 
 from gvtools.settings import dotted, with_values
@@ -41,7 +41,7 @@ def test_a_run_by_it_shows_whole_views_and_resumes(tmp_path, capsys):
     assert "protocol paper with completer 'inpaint'; expected geoverse" in said
     assert not (tmp_path / "run").exists()
     assert main([*words, "--rounds", "1"]) == 0
-    report = json.loads((tmp_path / "run" / "round_001" / "report.json").read_text())
+    report = report_of(tmp_path / "run", 1)
     (view,) = report["views"]
     # Pixels with depth are fused wherever they are, those that the memory knew, too.
     pixels = view["camera"]["width"] * view["camera"]["height"]

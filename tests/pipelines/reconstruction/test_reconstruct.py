@@ -12,16 +12,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from run_files import results, untimed
+from PIL import Image
+from run_files import Killed, reconstructed, results, untimed
 from tiny_scan import write_scan
 
 from gvtools.errors import OptionError, ProjectError
 from gvtools.memory.spatial_memory import SpatialMemory
-from gvtools.scenes.project import open_project
-from gvtools.settings import with_texts
-from pipelines.console import Console
-from pipelines.reconstruction.run import reconstruct
-from pipelines.reconstruction.settings import RunSettings
 
 pytestmark = pytest.mark.usefixtures("unpainted")
 
@@ -39,11 +35,8 @@ def whole(scan, tmp_path_factory):
     return run(scan, tmp_path_factory.mktemp("runs") / "whole")
 
 
-def run(scan: Path, out: Path, *settings: str, resume: bool = False, dry_run: bool = False) -> Path:
-    config = with_texts(RunSettings(), ("refine.steps=0", *SETTINGS, *settings))
-    return reconstruct(
-        open_project(scan), config, out, console=Console(quiet=True), resume=resume, dry_run=dry_run
-    )
+def run(scan: Path, out: Path, *settings: str, **how: bool) -> Path:
+    return reconstructed(scan, out, "refine.steps=0", *SETTINGS, *settings, **how)
 
 
 def test_the_memory_grows_round_by_round(whole):
@@ -79,14 +72,7 @@ def test_forgetting_the_last_round_gives_the_memory_before_it(whole, scan, tmp_p
 
 
 def test_two_runs_give_the_same_bytes(whole, scan, tmp_path):
-    again = run(scan, tmp_path / "again")
-    assert results(again).keys() == results(whole).keys()
-    for name, data in results(whole).items():
-        assert results(again)[name] == data, name
-
-
-class Killed(BaseException):
-    """Stands for a kill: nothing catches it."""
+    assert results(run(scan, tmp_path / "again")) == results(whole)
 
 
 @pytest.mark.parametrize("moment", range(0, 40, 3))
@@ -187,31 +173,24 @@ def test_a_disk_that_fills_up_leaves_the_rounds_before(whole, scan, tmp_path, mo
 
 
 @pytest.mark.parametrize(
-    ("setting", "error", "text"),
+    ("setting", "text"),
     [
-        ("completer=inpant", OptionError, "inpaint"),
-        ("depth=colmap", OptionError, "rgbd"),
-        ("depth=guess", OptionError, "sensor"),
-        ("targets=first:1", OptionError, "allow-overlap"),
-        ("views_per_round=0", OptionError, "at least 1"),
-        ("device=tpu", OptionError, "cuda"),
-        ("completer.sweps=1", OptionError, "sweeps"),
-        ("voxel=-1", OptionError, "more than 0"),
-        ("seed=-1", OptionError, "at least 0"),
-        ("memory.observations_per_voxel=0", OptionError, "at least 1"),
-        ("memory.weight_cap=0", OptionError, "at least 1e-20"),
-        ("memory.merge_angle_deg=-2", OptionError, "at least 0 and at most 180"),
-        ("back_projection.edge=-5", OptionError, "more than 0"),
-        ("back_projection.grazing=2", OptionError, "less than 1"),
-        ("fusion.voxel_percentile=300", OptionError, "at most 100"),
-        ("fusion.voxel_scale=0", OptionError, "more than 0"),
-        ("completer.sweeps=-3", OptionError, "at least 0"),
-        ("completer.confidence_reach=0", OptionError, "more than 0"),
-        ("targets=every", OptionError, "every:2"),
+        ("completer=inpant", "inpaint"),
+        ("depth=colmap", "rgbd"),
+        ("depth=guess", "sensor"),
+        ("targets=first:1", "allow-overlap"),
+        ("targets=every", "every:2"),
+        ("device=tpu", "cuda"),
+        ("completer.sweps=1", "sweeps"),
+        ("completer.sweeps=-3", "at least 0"),
+        ("memory.weight_cap=0", "at least 1e-20"),
+        ("memory.merge_angle_deg=-2", "at least 0 and at most 180"),
+        ("back_projection.grazing=2", "less than 1"),
+        ("fusion.voxel_percentile=300", "at most 100"),
     ],
 )
-def test_wrong_options_leave_no_folder(scan, tmp_path, setting, error, text):
-    with pytest.raises(error, match=text):
+def test_wrong_options_leave_no_folder(scan, tmp_path, setting, text):
+    with pytest.raises(OptionError, match=text):
         run(scan, tmp_path / "run", setting)
     assert not (tmp_path / "run").exists()
 
@@ -219,8 +198,6 @@ def test_wrong_options_leave_no_folder(scan, tmp_path, setting, error, text):
 def test_no_context_depth_is_said(scan, tmp_path):
     bare = write_scan(tmp_path / "bare")
     for path in bare.glob("*.depth.png"):
-        from PIL import Image
-
         Image.fromarray(np.zeros((72, 96), np.uint16)).save(path)
     with pytest.raises(ProjectError, match="depth"):
         run(bare, tmp_path / "run")

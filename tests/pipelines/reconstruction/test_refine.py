@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import refused
-from run_files import results
+from run_files import reconstructed, results
 from tiny_scan import write_scan
 
 from gvtools.appearance import fit, fit_options
@@ -18,15 +18,12 @@ from gvtools.errors import ProjectError
 from gvtools.files import write_json
 from gvtools.runs.poses import RunPoses
 from gvtools.runs.run import load_run
-from gvtools.scenes.project import open_project
-from gvtools.settings import with_texts
 from pipelines.cli import main
 from pipelines.console import Console
 from pipelines.reconstruction import fitting
 from pipelines.reconstruction import run as module
 from pipelines.reconstruction.fitting import Fitted
-from pipelines.reconstruction.run import reconstruct, refine
-from pipelines.reconstruction.settings import RunSettings
+from pipelines.reconstruction.run import refine
 
 pytestmark = pytest.mark.usefixtures("unpainted")
 
@@ -51,8 +48,7 @@ def copy(whole, tmp_path):
 
 
 def run(scan: Path, out: Path, *settings: str, resume: bool = False) -> Path:
-    config = with_texts(RunSettings(), (*SETTINGS, *settings))
-    return reconstruct(open_project(scan), config, out, console=QUIET, resume=resume)
+    return reconstructed(scan, out, *SETTINGS, *settings, resume=resume)
 
 
 def test_the_fit_goes_on_where_it_ended(copy):
@@ -104,7 +100,7 @@ def test_poses_that_predict_neighbours_better_are_kept(copy, monkeypatch):
         assert 0 < np.abs(now - before).max() < 0.003
 
 
-def test_photographs_are_shown_better_afterwards(copy):
+def test_photographs_are_shown_better_afterwards_by_a_moved_project(scan, copy, tmp_path):
     def error() -> float:
         appearance = Fitted.load(copy / APPEARANCE).appearance
         scene = load_run(copy).scenes[0]
@@ -113,8 +109,10 @@ def test_photographs_are_shown_better_afterwards(copy):
         return float(np.mean(np.square(off)))
 
     before = error()
-    refine(copy, steps=60, console=QUIET)
+    moved = Path(shutil.copytree(scan, tmp_path / "moved"))
+    refine(copy, steps=60, project=moved, console=QUIET)
     assert error() < 0.8 * before
+    assert json.loads((copy / "run.json").read_text())["project"] == str(moved)
 
 
 def test_the_same_steps_give_the_same_bytes(whole, tmp_path):
@@ -127,17 +125,12 @@ def test_the_same_steps_give_the_same_bytes(whole, tmp_path):
 
 def test_a_stop_at_any_moment_leaves_the_run_as_it_was(copy, monkeypatch):
     before = results(copy)
-    stops = [
-        (module, "fit_appearance"),
-        (module, "complete_run"),
-        (module, "_figures"),
-        (os, "rename"),
-    ]
-    for place, name in stops:
 
-        def stop(*args, **kwargs):
-            raise KeyboardInterrupt
+    def stop(*args, **kwargs):
+        raise KeyboardInterrupt
 
+    names = ("fit_appearance", "complete_run", "_figures", "rename")
+    for place, name in zip((module, module, module, os), names, strict=True):
         with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
             patch.setattr(place, name, stop)
             refine(copy, steps=1, console=QUIET)
@@ -191,7 +184,7 @@ def test_what_cannot_be_refined_is_one_line_with_status_2(scan, copy, tmp_path, 
     assert "run.json" in refused(capsys, "refine", tmp_path / "nowhere")
     assert not (tmp_path / "nowhere").exists()
     assert "at least 1" in refused(capsys, "refine", copy, "--steps", 0)
-    assert "above 0" in refused(capsys, "refine", copy, "--seconds", "nan")
+    assert "more than 0" in refused(capsys, "refine", copy, "--seconds", "nan")
     assert "not allowed with" in refused(capsys, "refine", copy, "--steps", 1, "--seconds", 1)
     assert "gone" in refused(capsys, "refine", copy, "--project", tmp_path / "moved")
     moved = Path(shutil.copytree(scan, tmp_path / "moved"))
@@ -224,9 +217,3 @@ def test_a_converged_fit_is_joined_by_another_if_there_are_steps(copy, monkeypat
     assert after.others[0].values.tobytes() != earlier.gaussians.values.tobytes()
     monkeypatch.setattr(fitting, "MOST_FITS", 2)
     assert "2 fits" in refused(capsys, "refine", copy, "--steps", 12)
-
-
-def test_a_moved_project_serves(scan, copy, tmp_path):
-    moved = Path(shutil.copytree(scan, tmp_path / "moved"))
-    refine(copy, steps=1, project=moved, console=QUIET)
-    assert json.loads((copy / "run.json").read_text())["project"] == str(moved)

@@ -6,12 +6,7 @@ import numpy as np
 import pytest
 
 from gvtools.cameras import Cameras
-from gvtools.completers.base import (
-    Completer,
-    Completion,
-    ScaleAlignment,
-    ScaleStatus,
-)
+from gvtools.completers.base import Completer, Completion, ScaleAlignment, ScaleStatus
 from gvtools.errors import ShapeError
 from gvtools.guidance import Guidance, concatenate
 from gvtools.memory.spatial_memory import FuseReport, SpatialMemory
@@ -76,17 +71,10 @@ def complete(memory: SpatialMemory, completer: Recorder, targets: list[Cameras],
     for target in followed:
         target.guidance()
     memory.project = counted  # type: ignore[method-assign]
-    results = list(
-        complete_targets(
-            followed,
-            1,
-            memory=memory,
-            completer=completer,
-            context=(),
-            config=with_texts(RunSettings(), settings),
-            clock=Clock(),
-        )
-    )
+    config = with_texts(RunSettings(), settings)
+    results = list(complete_targets(
+        followed, 1, memory=memory, completer=completer, context=(), config=config, clock=Clock(),
+    ))  # fmt: skip
     return results, sum((result.fusion for result in results), FuseReport()), calls
 
 

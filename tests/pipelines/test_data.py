@@ -1,4 +1,4 @@
-"""``gvtools data list``, ``check`` and ``stats`` on miniatures in the layout of 7-Scenes."""
+"""``gvtools check`` of projects and ``data`` on miniatures in the layout of 7-Scenes."""
 
 from __future__ import annotations
 
@@ -12,15 +12,98 @@ from typing import Any
 
 import numpy as np
 import pytest
-from command_line import refused
+import skimage.data
+from command_line import refused, run_command
 from data_sets.miniature import miniatures
+from PIL import Image
+from scenes_workspace import HEIGHT as ROWS
+from scenes_workspace import WIDTH as COLUMNS
+from scenes_workspace import sevenscenes, workspace
 from tiny_scan import FOCAL, WIDTH, render, world_from_cam, write_scan
 
+from gvtools.errors import ProjectError
 from gvtools.scenes.data_sets.catalogue import DataSetSpec, load_spec, read_scene, spec_names
 from gvtools.scenes.scene import Scene
+from gvtools.scenes.shards import open_shards
 from pipelines.cli import main
 from pipelines.data_sets import downloads
 from pipelines.data_sets.log_histogram import LogHistogram
+
+
+def check(*words: object) -> None:
+    run_command("check", *words)
+
+
+def test_a_good_project_is_ok_and_told_in_lines(tmp_path, capsys):
+    sevenscenes(tmp_path)
+    check(tmp_path)
+    out = capsys.readouterr().out
+    assert "ok: true" in out
+    assert f"{COLUMNS}x{ROWS} (3 views)" in out
+    assert "info: depth unit: 0.001 m" in out
+
+
+def test_json_holds_the_report(tmp_path):
+    reconstruction = workspace(tmp_path / "project", "PINHOLE")
+    check(tmp_path / "project", "--json", tmp_path / "report.json")
+    data = json.loads((tmp_path / "report.json").read_text())
+    assert data["ok"] is True
+    assert data["views"] == data["views_opened"] == reconstruction.num_reg_images()
+    assert data["sparse_points"] == reconstruction.num_points3D()
+    assert data["depth"] is None
+
+
+def test_a_project_without_depth_is_ok_and_told(tmp_path, capsys):
+    workspace(tmp_path)
+    check(tmp_path)
+    out = capsys.readouterr().out
+    assert "info: none of the 4 views has recorded depth" in out
+    assert "ok: true" in out
+
+
+def test_an_unreadable_picture_is_an_error_after_the_report(tmp_path, capsys):
+    sevenscenes(tmp_path / "project")
+    (tmp_path / "project" / "frame-000001.color.png").write_bytes(b"no picture")
+    with pytest.raises(ProjectError, match=r"not ok: 1 errors, first: .*frame-000001"):
+        check(tmp_path / "project")
+    out = capsys.readouterr().out
+    assert "ok: false" in out
+    assert out.index("error: ") < out.index("info: ")
+    with pytest.raises(ProjectError):
+        check(tmp_path / "project", "--json", tmp_path / "report.json")
+    data = json.loads((tmp_path / "report.json").read_text())
+    assert data["ok"] is False
+    assert data["views_opened"] == 2
+
+
+def test_what_cannot_be_opened_is_in_the_json_too(tmp_path):
+    with pytest.raises(ProjectError, match="no such folder"):
+        check(tmp_path / "absent", "--json", tmp_path / "report.json")
+    data = json.loads((tmp_path / "report.json").read_text())
+    assert data["ok"] is False
+    assert "no such folder" in data["findings"][0]["message"]
+
+
+@pytest.mark.data
+def test_the_kitchen(shared, capsys):
+    check(shared / "data" / "redwood_rgbd5")
+    out = capsys.readouterr().out
+    assert "ok: true" in out
+    assert np.char.count(out, "info: ") >= 1
+
+
+def test_poses_that_contradict_each_other_are_a_warning(tmp_path, capsys):
+    sevenscenes(tmp_path, frames=4)
+    pose = (tmp_path / "frame-000000.pose.txt").read_text()
+    for i, name in enumerate(("astronaut", "astronaut", "coffee", "coffee")):
+        picture = Image.fromarray(getattr(skimage.data, name)()).resize((COLUMNS, ROWS))
+        picture.save(tmp_path / f"frame-{i:06d}.color.png")
+        (tmp_path / f"frame-{i:06d}.pose.txt").write_text(pose)
+    check(tmp_path)
+    out = capsys.readouterr().out
+    assert "warning: 4 pairs of views have nearly equal cameras but show different things" in out
+    assert "ok: true" in out
+
 
 FIRST, SECOND = "wall/seq-01", "wall/seq-02"
 
@@ -221,3 +304,84 @@ def printed(script: str) -> str:
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return done.stdout.splitlines()[-1]
+
+
+@pytest.fixture(scope="module")
+def download(tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("download")
+    for name in ("chess/seq-01", "chess/seq-02", "fire/seq-01"):
+        write_scan(root / name, views=4)
+    return root
+
+
+def test_a_data_set_is_converted_kept_and_verified(download, tmp_path, capsys):
+    out = tmp_path / "shards"
+    start = ("shards", "7-Scenes", "--root", download, "--out", out, "--size", 0.05)
+    assert data(*start) == 0
+    said = capsys.readouterr().out.splitlines()
+    count = len(said) - 1
+    assert said[-1].startswith(f"{out}: {count} shards of 3 scenes, 12 views, 12 with depth")
+    assert data(*start) == 0
+    again = capsys.readouterr().out.splitlines()
+    assert [line.endswith("(complete before)") for line in again] == [True] * count + [False]
+    assert data("verify", out) == 0
+    assert "all as their checksums say" in capsys.readouterr().out
+    assert open_shards(out).data_set == "7scenes"
+
+
+def test_some_scenes_reduced(download, tmp_path):
+    wanted = ("--scenes", "fire/seq-01", "chess/seq-02", "--max-side", 64, "--quiet")
+    assert data("shards", "7-Scenes", "--root", download, "--out", tmp_path, *wanted) == 0
+    opened = open_shards(tmp_path)
+    assert opened.names == ("chess/seq-02", "fire/seq-01")
+    assert opened.read("fire/seq-01").views[0].load().rgb.shape == (48, 64, 3)
+
+
+def test_a_project_is_converted_and_what_is_damaged_warned_of(tmp_path, capsys):
+    folder = write_scan(tmp_path / "kitchen", views=3)
+    (folder / "frame-000001.color.png").write_bytes(b"\x89PNG")
+    assert data("shards", folder, "--out", tmp_path / "shards") == 0
+    found = capsys.readouterr()
+    assert "1 scenes, 2 views" in found.out
+    (line,) = found.err.splitlines()
+    assert line.startswith("warning: left out: ") and "frame-000001.color.png" in line
+
+
+def test_damaged_shards_are_lines_with_status_2(download, tmp_path, capsys):
+    start = ("shards", "7-Scenes", "--root", download, "--out", tmp_path, "--size", 0.05, "--quiet")
+    assert data(*start) == 0
+    for name in ("shard-000000.tar", "shard-000001.tar"):
+        content = np.fromfile(tmp_path / name, np.uint8)
+        content[700] ^= 255
+        content.tofile(tmp_path / name)
+    assert data("verify", tmp_path) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 3 and all("damaged" in line for line in lines)
+    assert lines[-1].startswith("gvtools: 2 of ")
+    assert data(*start) == 0 and data("verify", tmp_path) == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (("shards", "7-Scense", "--root", "ROOT", "--out", "OUT"), "did you mean '7scenes'?"),
+        (("shards", "spec:7-Scenes", "--out", "OUT"), "spec:7-Scenes: no root; give the folder"),
+        (
+            ("shards", "7-Scenes", "--root", "ROOT", "--out", "OUT", "--scenes", "chess/seq-03"),
+            "did you mean 'chess/seq-02'?",
+        ),
+        (("shards", "ROOT/none", "--out", "OUT"), "no such folder"),
+        (("shards", "ROOT/fire/seq-01", "--out", "OUT", "--max-side", "20"), "at least 64"),
+        (("shards", "ROOT/fire/seq-01", "--out", "OUT", "--size", "0"), "more than 0"),
+        (("verify", "ROOT"), "no index.json; expected complete shards"),
+    ],
+)
+def test_shards_that_cannot_be_are_one_line(arguments, complaint, download, tmp_path, capsys):
+    places = {"ROOT": str(download), "OUT": str(tmp_path / "out")}
+    words = [
+        next((word.replace(k, v) for k, v in places.items() if k in word), word)
+        for word in arguments
+    ]
+    assert data(*words) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("gvtools: ") and complaint in line
