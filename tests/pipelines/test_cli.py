@@ -64,7 +64,7 @@ def test_the_commands_start_without_heavy_imports(only, more):
     assert out.stdout.strip() == "[]"
 
 
-def test_a_run_and_what_it_leaves(scan, tmp_path, capsys):
+def test_a_run_and_what_it_leaves_and_is_left_alone_by_another(scan, tmp_path, capsys):
     out = tmp_path / "run"
     assert main([str(a) for a in reconstruct(scan, "--out", out)]) == 0
     names = {path.name for path in out.iterdir()}
@@ -75,6 +75,10 @@ def test_a_run_and_what_it_leaves(scan, tmp_path, capsys):
     assert record["derived"]["voxel"] > 0 and record["settings"]["voxel"] is None
     assert record["versions"]["numpy"] == np.__version__
     assert capsys.readouterr().out == ""
+    memory = (out / "memory.npz").read_bytes()
+    line = refused(capsys, *reconstruct(scan, "--out", out, "--seed", 3, "--resume"))
+    assert "another run" in line
+    assert (out / "memory.npz").read_bytes() == memory
 
 
 def _missing(scan: Path) -> None:
@@ -158,16 +162,7 @@ def test_a_rotation_orthonormal_to_4e_4_is_accepted(scan, tmp_path):
     pose = np.loadtxt(path)
     pose[:3, :3] *= 1 + 2e-4
     np.savetxt(path, pose)
-    assert main([str(a) for a in reconstruct(scan, "--out", tmp_path / "run")]) == 0
-
-
-def test_an_output_folder_of_another_run_is_left_alone(capsys, scan, tmp_path):
-    out = tmp_path / "run"
-    assert main([str(a) for a in reconstruct(scan, "--out", out)]) == 0
-    memory = (out / "memory.npz").read_bytes()
-    line = refused(capsys, *reconstruct(scan, "--out", out, "--seed", 3, "--resume"))
-    assert "another run" in line
-    assert (out / "memory.npz").read_bytes() == memory
+    assert main([str(a) for a in reconstruct(scan, "--out", tmp_path / "run", "--dry-run")]) == 0
 
 
 def limited(size: int) -> None:

@@ -125,9 +125,9 @@ def far_rrd(path):
     from rerun.chunk import RrdReader
 
     batches = [chunk.to_record_batch() for chunk in RrdReader(path).store().stream()]
-    columns = [batch.to_pydict() for batch in batches]
     name = "Points3D:positions"
-    return np.concatenate([each[name][0] for each in columns if name in each]) + ORIGIN
+    read = [batch.column(name)[0].as_py() for batch in batches if name in batch.schema.names]
+    return np.concatenate(read) + ORIGIN
 
 
 @pytest.mark.parametrize(

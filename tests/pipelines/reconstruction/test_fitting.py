@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import signal
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +13,7 @@ from PIL import Image
 from run_files import Killed, kill_after_round_0, reconstructed, report_of, results, untimed
 from tiny_scan import write_colmap_scan, write_scan
 
+from benchmarks.made_scenes import PLACES, write_place
 from gvtools.appearance.appearance import Appearance, Blend, Picture, recolor
 from gvtools.appearance.fit import Fit
 from gvtools.appearance.gaussians import Gaussians
@@ -419,3 +421,24 @@ def test_ctrl_c_ends_a_fit_and_a_second_one_the_run(capsys):
             signal.raise_signal(signal.SIGINT)
     assert signal.getsignal(signal.SIGINT) is before
     assert "the run goes on with it" in capsys.readouterr().out
+
+
+# How much worse a fit may be than none, and a longer fit than a shorter one [dB].
+THAN_NONE, THAN_SHORTER = 0.2, 0.1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["object indoors", "facade", "street", "from above"])
+def test_a_fit_never_hurts(tmp_path, name):
+    place = PLACES[name]
+    write_place(tmp_path / "scan", replace(place, views=14, size=(320, 240)))
+
+    def psnr(seconds):
+        out = tmp_path / f"run-{seconds}"
+        settings = ("context=not:every:5+2", "targets=every:5+2", f"refine.seconds={seconds}")
+        reconstructed(tmp_path / "scan", out, *settings)
+        return json.loads((out / "metrics.json").read_text())["psnr"]
+
+    none, short, long = (psnr(seconds) for seconds in (0, 10, 30))
+    assert short > none - THAN_NONE
+    assert long > max(none - THAN_NONE, short - THAN_SHORTER)

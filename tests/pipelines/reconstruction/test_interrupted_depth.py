@@ -122,13 +122,14 @@ def test_a_killed_run_goes_on_with_the_next_view(scan, whole, tmp_path, asked, a
     assert untimed(out) == untimed(whole)
 
 
-def test_an_interrupt_keeps_what_is_whole_and_nothing_else(scan, whole, tmp_path, monkeypatch):
+def test_an_interrupt_keeps_what_is_whole_and_nothing_else(scan, whole, tmp_path, capsys):
     out = tmp_path / "run"
     interrupted(scan, out)
     part = out / ".round_000.part"
     assert len(list(part.glob("context_depth_*.npz"))) == 3
     assert {path.name[:14] for path in part.iterdir()} == {"context_depth_"}
-    assert reconstruct(scan, out, "--resume") == 0
+    assert main([word for word in words(scan, out, "--resume") if word != "--quiet"]) == 0
+    assert "taking over the depth of 3 of 6 context views" in capsys.readouterr().out
     assert results(out) == results(whole)
 
 
@@ -194,15 +195,6 @@ def test_why_a_view_has_no_depth_outlasts_the_interrupt(scan, tmp_path, monkeypa
     assert "1 of 6 views have no depth" in capsys.readouterr().err
     assert results(out) == results(straight)
     assert untimed(out) == untimed(straight)
-
-
-@pytest.mark.slow
-def test_what_was_taken_over_is_said(scan, tmp_path, monkeypatch, capsys):
-    out = tmp_path / "run"
-    interrupted(scan, out)
-    loud = [word for word in words(scan, out) if word != "--quiet"]
-    assert main(loud) == 0
-    assert "taking over the depth of 3 of 6 context views" in capsys.readouterr().out
 
 
 def test_a_first_round_that_is_done_anew_is_taken_up_too(scan, whole, tmp_path, monkeypatch, asked):
