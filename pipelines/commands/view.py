@@ -173,7 +173,7 @@ class PlotCommand(Arguments):
 def _figure(what: str, folder: Path) -> Figure:
     title = folder.resolve().name
     if what == "losses":
-        from viz.plots.losses import draw_losses
+        from viz.plots.curves import draw_losses
 
         return draw_losses(read_training(folder), title=title)
     from gvtools.runs.run import load_run

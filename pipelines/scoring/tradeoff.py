@@ -25,7 +25,7 @@ from pipelines.reconstruction.run import reconstruct
 from pipelines.reconstruction.settings import RunSettings
 from pipelines.scoring.sweep import BEGUN, DONE, FAILED, InTurn, Job, Record, sweep
 from pipelines.tuning.options import FEWEST_VIEWS, TuneOptions
-from viz.plots.comparisons import draw_pareto
+from viz.plots.curves import draw_pareto
 
 if TYPE_CHECKING:
     from pipelines.reconstruction.plan import Plan

@@ -18,8 +18,7 @@ from scipy.spatial.transform import Rotation
 from gvtools.errors import OptionError
 from pipelines.cli import main
 from viz.plots.canvas import png
-from viz.plots.comparisons import draw_pareto
-from viz.plots.losses import draw_losses, loss_names, running_median
+from viz.plots.curves import draw_losses, draw_pareto, loss_names, running_median
 from viz.plots.rounds import draw_growth, draw_quality, draw_timing, growth_text, stage_seconds
 from viz.plots.trajectories import Trajectories, draw_trajectories, principal_axes
 

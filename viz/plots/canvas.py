@@ -24,6 +24,7 @@ BLACK, ORANGE, SKY, GREEN, YELLOW, BLUE, RED, PINK = (
     "#000000", "#E69F00", "#56B4E9", "#009E73", "#F0E442", "#0072B2", "#D55E00", "#CC79A7",
 )  # fmt: skip
 GREY = "#999999"
+COLORFUL = (BLUE, ORANGE, GREEN, RED, SKY, PINK)
 
 COLORS = {
     "observed": BLUE,

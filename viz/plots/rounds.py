@@ -14,6 +14,7 @@ from gvtools.errors import OptionError
 from viz.plots.canvas import (
     BLACK,
     COLORS,
+    GREY,
     HATCHES,
     LEGEND,
     LINES,
@@ -126,10 +127,7 @@ def _stored_panel(axes: Axes, *, rounds: Rounds) -> None:
     further = {"scanned": [*map(_scanned, rounds)], "generated": [e["generated"] for e in rounds]}
     for name, counts in further.items():
         if name == "generated" or any(counts):
-            axes.bar(
-                at, counts, bottom=below, color=COLORS[name], hatch=HATCHES[name],
-                edgecolor="white", linewidth=0, label=name,
-            )  # fmt: skip
+            axes.bar(at, counts, bottom=below, **_bars(name, COLORS[name]))
             below = [a + b for a, b in zip(below, counts, strict=True)]
     voxels = [entry["voxels"] for entry in rounds]
     axes.plot(at, voxels, "o-", color=COLORS["voxels"], markersize=4, label="voxels")
@@ -148,10 +146,7 @@ def _fates_panel(axes: Axes, *, rounds: Rounds) -> None:
     step = 0.8 / len(FATES)
     for k, name in enumerate(FATES):
         at = [i + (k - (len(FATES) - 1) / 2) * step for i in range(len(rounds))]
-        axes.bar(
-            at, values[name], step, color=COLORS[name], hatch=HATCHES.get(name),
-            edgecolor="white", linewidth=0, label=name,
-        )  # fmt: skip
+        axes.bar(at, values[name], step, **_bars(name, COLORS[name]))
     axes.set_title("what became of the points that arrived")
     axes.set_ylabel("points, voxels (logarithmic)")
     # Round 0 takes all the context in and would hide every later round on a linear axis.
@@ -182,7 +177,7 @@ def _coverage_panel(axes: Axes, *, rounds: Rounds) -> None:
         axes.text(0.5, 0.5, "no targets", transform=axes.transAxes, ha="center")
         return
     at, before, after = zip(*known, strict=True)
-    axes.vlines(at, before, after, color="#999999", linewidth=2, zorder=2)
+    axes.vlines(at, before, after, color=GREY, linewidth=2, zorder=2)
     axes.scatter(
         at, before, s=45, color="white", edgecolor=COLORS["observed"], linewidth=1.8, zorder=3,
         label="before the round",
@@ -198,10 +193,15 @@ def _coverage_panel(axes: Axes, *, rounds: Rounds) -> None:
     axes.legend(ncols=2, loc="upper left", **LEGEND)
 
 
-def _engineering(axes: Axes) -> None:
-    from matplotlib.ticker import FuncFormatter
+def _bars(name: str, color: str) -> dict[str, Any]:
+    return {
+        "color": color, "hatch": HATCHES.get(name), "edgecolor": "white", "linewidth": 0,
+        "label": name,
+    }  # fmt: skip
 
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: _count(value)))
+
+def _engineering(axes: Axes) -> None:
+    axes.yaxis.set_major_formatter(lambda value, _: _count(value))
 
 
 def _count(value: float) -> str:
@@ -249,10 +249,7 @@ def _stages_panel(axes: Axes, *, rounds: Rounds) -> None:
     totals = {stage: sum(seconds) for stage, seconds in stages.items()}
     whole, longest = sum(totals.values()), max(totals.values(), default=1e-3)
     for place, (stage, seconds) in enumerate(totals.items()):
-        axes.barh(
-            place, seconds, color=_color(stage, list(stages)), hatch=HATCHES.get(stage),
-            edgecolor="white", linewidth=0,
-        )  # fmt: skip
+        axes.barh(place, seconds, **_bars(stage, _color(stage, list(stages))))
         axes.annotate(
             f"{seconds:.3g} s, {seconds / whole:.0%}", (seconds, place), (4, 0),
             textcoords="offset points", va="center", fontsize="small",
@@ -269,10 +266,8 @@ def _times_panel(axes: Axes, *, rounds: Rounds) -> None:
     bottom = [0.0] * len(rounds)
     stages = stage_seconds(rounds)
     for stage, seconds in stages.items():
-        axes.bar(
-            range(len(rounds)), seconds, bottom=bottom, color=_color(stage, list(stages)),
-            hatch=HATCHES.get(stage), edgecolor="white", linewidth=0, label=stage,
-        )  # fmt: skip
+        style = _bars(stage, _color(stage, list(stages)))
+        axes.bar(range(len(rounds)), seconds, bottom=bottom, **style)
         bottom = [a + b for a, b in zip(bottom, seconds, strict=True)]
     axes.set_title("time of each round")
     axes.set_ylabel("seconds")

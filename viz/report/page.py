@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from gvtools.evaluation.tables import Ranked, Table, shown
 from viz.plots.canvas import Rounds, check_rounds, png
-from viz.plots.comparisons import Point, draw_by_views
+from viz.plots.curves import Point, draw_by_views
 from viz.plots.rounds import draw_growth, draw_quality, draw_timing, is_measured
 from viz.plots.trajectories import Trajectories, draw_trajectories
 from viz.report.pictures import SUPPORT, WORST, Thumbnail, data_uri, error_colors

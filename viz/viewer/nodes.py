@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,25 +39,13 @@ NO_SHADOW: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False}
 CameraKey = tuple[str, str, int]
 
 
-class Node(Protocol):
-    """Of a scene."""
-
-    visible: bool
-
-    def remove(self) -> None:
-        """Take it from the scene."""
-
-
-AnyNode = TypeVar("AnyNode", bound=Node)
-
-
-class RoundNodes(Generic[AnyNode]):
+class RoundNodes:
     """Nodes of a scene, one a round, the same for all who look."""
 
     def __init__(self, server: viser.ViserServer, frame: PageFrame, *, visible: bool) -> None:
         self._server = server
         self._frame = frame
-        self._nodes: dict[int, AnyNode] = {}
+        self._nodes: dict[int, Any] = {}
         self._visible, self._round = visible, 0
 
     def show(self, number: int) -> None:
@@ -75,7 +63,7 @@ class RoundNodes(Generic[AnyNode]):
         return self._visible and round <= self._round
 
 
-class PointNodes(RoundNodes["viser.PointCloudHandle"]):
+class PointNodes(RoundNodes):
     """The memory's points."""
 
     def __init__(self, server: viser.ViserServer, frame: PageFrame) -> None:
@@ -136,7 +124,7 @@ class PointNodes(RoundNodes["viser.PointCloudHandle"]):
         return sum(len(places) for round, places in self._places.items() if round <= number)
 
 
-class GaussianNodes(RoundNodes["viser.GaussianSplatHandle"]):
+class GaussianNodes(RoundNodes):
     """Gaussians, sorted and blended over all rounds by the page."""
 
     def __init__(self, server: viser.ViserServer, frame: PageFrame) -> None:

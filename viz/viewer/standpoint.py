@@ -114,17 +114,9 @@ def camera_outside(run: RunView, *, width: int = 1280, height: int = 960) -> Cam
 
 
 def pinhole(pose: Float64, size: tuple[int, int], field_of_view: float, *, name: str) -> Cameras:
-    """A camera that looks through its middle, a batch of one.
-
-    Args:
-        pose: (4, 4) cam_from_world.
-        size: width and height, pixels.
-        field_of_view: vertical, radians.
-    """
-    width, height = size
-    focal = height / (2 * np.tan(field_of_view / 2))
-    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-    return Cameras(K[None], pose[None], np.array([width]), np.array([height]), (name,))
+    """A camera (4, 4) cam_from_world of a vertical field of view, radians, a batch of one."""
+    focal = size[1] / (2 * np.tan(field_of_view / 2))
+    return Cameras.pinhole(*size, focal=focal, cam_from_world=pose, name=name)
 
 
 @dataclass(frozen=True, eq=False)
