@@ -7,6 +7,8 @@ reads in a child process.
 
 from __future__ import annotations
 
+import io
+import json
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -30,6 +32,8 @@ GLB, JSON = b"glTF", b"JSON"
 VERTEX_BYTES, SPARE_BYTES = 128, 96 << 20
 # Of points without a colour.
 GREY = 160
+# By their number in glTF.
+COLOR_TYPES: dict[int, np.dtype[Any]] = {5123: np.dtype("<u2"), 5126: np.dtype("<f4")}
 
 
 def load_mesh(path: Path) -> trimesh.Trimesh | trimesh.PointCloud:
@@ -39,11 +43,13 @@ def load_mesh(path: Path) -> trimesh.Trimesh | trimesh.PointCloud:
     data = read_bytes(path)
     if data.startswith(b"ply"):
         read_header(path)
-    elif data.startswith(GLB):
-        _check_glb(path, data)
+    place: Any = path
+    kind = path.suffix.lower().removeprefix(".")
+    if data.startswith(GLB):
+        place, kind = io.BytesIO(_checked_glb(path, data)), "glb"
     del data
     with _small_pictures(path.stat().st_size):
-        scene = trimesh.load_scene(path, process=False, resolver=_beside(path))
+        scene = trimesh.load_scene(place, process=False, resolver=_beside(path), file_type=kind)
         loaded: Any = scene.to_geometry()
     points = isinstance(loaded, trimesh.PointCloud)
     if not points and not (isinstance(loaded, trimesh.Trimesh) and len(loaded.faces)):
@@ -92,8 +98,11 @@ def _most_pixels(size: int) -> int:
     return (PIXEL_BYTES + PIXEL_RATIO * size) // 8
 
 
-def _check_glb(path: Path, data: bytes) -> None:
-    """Refuse arrays that are not in the file, and more copies of meshes than it explains."""
+def _checked_glb(path: Path, data: bytes) -> bytes:
+    """A GLB with colours as trimesh takes them.
+
+    Arrays that are not in the file are refused, and more copies of meshes than it explains.
+    """
     try:
         length, kind = struct.unpack_from("<I4s", data, 12)
         if kind != JSON or 20 + length > len(data):
@@ -116,10 +125,59 @@ def _check_glb(path: Path, data: bytes) -> None:
         # Vertices that are drawn once take at least 6 bytes of the file; copies take none.
         if (vertices - len(data) // 6) * VERTEX_BYTES > SPARE_BYTES:
             raise ValueError(f"nodes draw {vertices} vertices")
+        return _with_plain_colors(tree, data[28 + length :]) or data
     except (AttributeError, IndexError, KeyError, TypeError, ValueError, struct.error) as error:
         raise MemoryFileError(
             f"{path}: no GLB of meshes or points ({error}); the file is damaged; save it again"
         ) from None
+
+
+def _with_plain_colors(tree: dict[str, Any], body: bytes) -> bytes | None:
+    """A GLB whose colours of vertices are bytes of sRGB; None where there are no others.
+
+    glTF has linear light. Bytes stay what they are, as most programs write sRGB in them.
+    """
+    places = set()
+    for part in (part for mesh in tree.get("meshes", ()) for part in mesh["primitives"]):
+        if "COLOR_0" in part["attributes"]:
+            places.add(part["attributes"]["COLOR_0"])
+            # trimesh gives up colours for a material, even one without a texture.
+            material = tree["materials"][part["material"]] if "material" in part else {}
+            if "baseColorTexture" not in material.get("pbrMetallicRoughness", {}):
+                part.pop("material", None)
+    most = 2 * len(body)  # colours that do not overlap take less as bytes than as they were
+    changed = False
+    for place in sorted(places):
+        accessor = tree["accessors"][place]
+        kind = COLOR_TYPES.get(accessor["componentType"])
+        if kind is None:
+            continue
+        view = tree["bufferViews"][accessor["bufferView"]]
+        shape = accessor["count"], {"VEC3": 3, "VEC4": 4}[accessor["type"]]
+        start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
+        step = view.get("byteStride") or shape[1] * kind.itemsize
+        stored = np.ndarray(shape, kind, body, start, (step, kind.itemsize))
+        linear = np.nan_to_num(stored.astype(np.float64) / (65535 if kind.kind == "u" else 1))
+        colors = np.full((len(linear), 4), 255, np.uint8)
+        colors[:, :3] = _srgb(linear[:, :3])
+        accessor |= {"bufferView": len(tree["bufferViews"]), "byteOffset": 0, "type": "VEC4"}
+        accessor |= {"componentType": 5121, "normalized": True}
+        body = body.ljust(-(-len(body) // 4) * 4, b"\0")
+        place_of = {"buffer": 0, "byteOffset": len(body), "byteLength": colors.nbytes}
+        tree["bufferViews"].append(place_of)
+        body += colors.tobytes()
+        if len(body) > most:
+            raise ValueError("colours that overlap")
+        changed = True
+    if not changed:
+        return None
+    tree["buffers"][0]["byteLength"] = len(body)
+    head = json.dumps(tree).encode()
+    head = head.ljust(-(-len(head) // 4) * 4)
+    size = 28 + len(head) + len(body)
+    parts = (struct.pack("<4sII", GLB, 2, size), struct.pack("<I4s", len(head), JSON), head,
+             struct.pack("<I4s", len(body), b"BIN\0"), body)  # fmt: skip
+    return b"".join(parts)
 
 
 def read_usd(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
