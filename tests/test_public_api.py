@@ -57,7 +57,7 @@ DOCTESTED = (
     "pipelines.blocks.appearance",
     "pipelines.blocks.block",
     "pipelines.options",
-    "pipelines.data_sets.log_histogram",
+    "pipelines.data_sets.downloads",
 )
 
 

@@ -30,11 +30,7 @@ DEPTH_SUFFIXES = (".geometric.bin", ".photometric.bin", ".npy", ".npz")
 
 
 def read_colmap(
-    root: Path,
-    *,
-    images: Path | None = None,
-    masks: Path | None = None,
-    model: int | None = None,
+    root: Path, *, images: Path | None = None, masks: Path | None = None, model: int | None = None
 ) -> Scene:
     """A COLMAP project with every view in an undistorted pinhole camera.
 

@@ -23,12 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gvtools.errors import ProjectError
-from gvtools.scenes.undistort import (
-    ROUND_TRIP_TOLERANCE,
-    Undistortion,
-    camera_of,
-    undistortion,
-)
+from gvtools.scenes.undistort import ROUND_TRIP_TOLERANCE, Undistortion, camera_of, undistortion
 
 if TYPE_CHECKING:
     import pycolmap
@@ -239,11 +234,7 @@ class Face(Undistortion):
 
 
 def perspective_views(
-    model: str,
-    params: Sequence[float] | Float64,
-    size: tuple[int, int],
-    *,
-    what: str,
+    model: str, params: Sequence[float] | Float64, size: tuple[int, int], *, what: str
 ) -> tuple[Undistortion, ...]:
     """The mappings of a camera to one pinhole camera, or to several where it sees too much for one.
 

@@ -43,12 +43,7 @@ class Layout:
 
     @classmethod
     def of_folder(
-        cls,
-        name: str,
-        holds: str,
-        *,
-        matches: Callable[[Path], bool],
-        read: Callable[..., Scene],
+        cls, name: str, holds: str, *, matches: Callable[[Path], bool], read: Callable[..., Scene]
     ) -> Layout:
         """A layout of which a folder or file is one scene."""
         return cls(

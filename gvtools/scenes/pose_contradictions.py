@@ -115,6 +115,13 @@ class _Tracks:
         return len(np.intersect1d(own[0], own[1])), min(inside)
 
 
+def turn_degrees(a: Float64, b: Float64) -> Float64:
+    """(...) degrees between rotations, which (..., 3, 3) or (..., 4, 4) begin with."""
+    apart = np.linalg.norm(a[..., :3, :3] - b[..., :3, :3], axis=(-2, -1))
+    # The Frobenius distance of two rotations that differ by the angle t is sqrt(8) sin(t / 2).
+    return np.asarray(np.degrees(2 * np.arcsin(np.minimum(apart / np.sqrt(8), 1))))
+
+
 def thumbnail(frame: Frame) -> GreyThumbnail:
     """The frame's picture reduced to ``SIDE`` pixels on its longer side."""
     height, width = frame.rgb.shape[:2]
@@ -170,7 +177,7 @@ def contradictions(
         if a in thumbnails and b in thumbnails:
             pair = thumbnails[a], thumbnails[b]
             enough = 0.0 if unshared else DISAGREEING
-            differs = _disagreement(*pair, _homography(pair, cameras, (a, b)), enough=enough)
+            differs = disagreement(*pair, homography(pair, cameras, (a, b)), enough=enough)
         if unshared or (differs is not None and differs > DISAGREEING):
             names = scene.views[a].name, scene.views[b].name
             shared, of = points or (None, None)
@@ -178,23 +185,15 @@ def contradictions(
     return sorted(found, key=lambda pair: -(pair.disagreement or 1.0))
 
 
-def disagreement(a: GreyThumbnail, b: GreyThumbnail, cameras: Cameras) -> float | None:
-    """Share of the area with contrast in which two pictures differ.
+def disagreement(
+    a: GreyThumbnail, b: GreyThumbnail, H: Float64, *, enough: float = 0.0
+) -> float | None:
+    """Share of the area with contrast in which two pictures differ, carried over by a homography.
 
-    Args:
-        b: the second, which is carried onto the first by the homography of the rotation.
-
-    Returns:
-        None where less than ``COMPARABLE`` of the picture lies in both and has contrast in both.
-    """
-    return _disagreement(a, b, _homography((a, b), cameras, (0, 1)), enough=0.0)
-
-
-def _disagreement(a: GreyThumbnail, b: GreyThumbnail, H: Float64, *, enough: float) -> float | None:
-    """As ``disagreement``; the search among shifts ends once the share is at most ``enough``.
-
-    Each shift can lower the share alone, so that ending early never turns a pair into a
-    contradiction or back. Most pairs agree at once, unshifted.
+    None where less than ``COMPARABLE`` of the picture lies in both and has contrast in both. The
+    search among shifts ends once the share is at most ``enough``: each shift can lower it alone,
+    so that ending early never turns a pair into a contradiction or back. Most pairs agree at once,
+    unshifted.
     """
     x = a.grey - a.grey.mean()
     y, valid = _carried(b, H, a.grey.shape)
@@ -229,7 +228,7 @@ def _window(values: Float32) -> Float32:
     return np.asarray(cv2.blur(values, (WINDOW, WINDOW), borderType=cv2.BORDER_CONSTANT))
 
 
-def _homography(
+def homography(
     pair: tuple[GreyThumbnail, GreyThumbnail], cameras: Cameras, views: tuple[int, int]
 ) -> Float64:
     """(3, 3) from pixels of the first picture to those of the second, as OpenCV counts them."""
@@ -291,8 +290,7 @@ def _near_pairs(cameras: Cameras, reach: Float64) -> list[tuple[int, int, float,
     near = []
     for a, b in sorted(pairs):
         distance = float(np.linalg.norm(centers[a] - centers[b]))
-        sine = np.linalg.norm(rotations[a] - rotations[b]) / np.sqrt(8)
-        degrees = float(np.degrees(2 * np.arcsin(min(sine, 1.0))))
+        degrees = float(turn_degrees(rotations[a], rotations[b]))
         if a != b and distance < min(reach[a], reach[b]) and degrees < NEAR_DEGREES:
             near.append((a, b, distance, degrees))
     return near

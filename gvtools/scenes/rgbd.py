@@ -50,13 +50,7 @@ from gvtools.scenes.matching import (
     pictures_in,
     pose_at,
 )
-from gvtools.scenes.photographs import (
-    NO_POSE,
-    PosedFrame,
-    Registration,
-    first_size,
-    posed_scene,
-)
+from gvtools.scenes.photographs import NO_POSE, PosedFrame, Registration, first_size, posed_scene
 from gvtools.scenes.scene import Finding, Scene
 from gvtools.scenes.undistort import LensParameters
 from gvtools.settings import Settings, changes, with_file
@@ -210,14 +204,8 @@ class _SevenScenes(RgbdFolder):
 
 # fx, fy, cx, cy and k1, k2, p1, p2, k3 as published with TUM RGB-D; freiburg3 is rectified.
 PUBLISHED = {
-    "freiburg1": (
-        (517.3, 516.5, 318.6, 255.3),
-        (0.2624, -0.9531, -0.0054, 0.0026, 1.1633),
-    ),
-    "freiburg2": (
-        (520.9, 521.0, 325.1, 249.7),
-        (0.2312, -0.7849, -0.0033, -0.0001, 0.9172),
-    ),
+    "freiburg1": ((517.3, 516.5, 318.6, 255.3), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
+    "freiburg2": ((520.9, 521.0, 325.1, 249.7), (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
     "freiburg3": ((535.4, 539.2, 320.1, 247.6), ()),
 }
 

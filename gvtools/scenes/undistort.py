@@ -123,6 +123,9 @@ class Undistortion:
 
     @cached_property
     def _source_pixel(self) -> NDArray[np.int32]:
+        return self.flat_pixels()
+
+    def flat_pixels(self) -> NDArray[np.int32]:
         """(H, W) int32, the flat index of the recorded pixel seen by each pixel; -1 for none."""
         source = self.source_positions()
         w, h = self.source_size
@@ -151,11 +154,7 @@ def _positions(lens: Undistortion) -> tuple[NDArray[Any], NDArray[Any]]:
 
 
 def undistortion(
-    model: str,
-    params: Sequence[float] | NDArray[np.float64],
-    size: tuple[int, int],
-    *,
-    what: str,
+    model: str, params: Sequence[float] | NDArray[np.float64], size: tuple[int, int], *, what: str
 ) -> Undistortion:
     """The mapping of a camera of COLMAP's; pinholes without distortion are passed untouched.
 
@@ -185,11 +184,7 @@ def undistortion(
 
 
 def camera_of(
-    model: str,
-    params: Sequence[float] | NDArray[np.float64],
-    size: tuple[int, int],
-    *,
-    what: str,
+    model: str, params: Sequence[float] | NDArray[np.float64], size: tuple[int, int], *, what: str
 ) -> pycolmap.Camera:
     """A camera of COLMAP from its model's name, parameters and size, checked."""
     import pycolmap

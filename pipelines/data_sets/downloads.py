@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from gvtools.errors import GvError, OptionError, ProjectError
 from gvtools.files import json_list_written, write_json
@@ -21,7 +22,7 @@ from gvtools.scenes.data_sets.catalogue import (
     spec_names,
 )
 from gvtools.scenes.inspection import SceneReport, inspect, spread
-from pipelines.data_sets.log_histogram import LogHistogram
+from gvtools.scenes.pose_contradictions import turn_degrees
 
 if TYPE_CHECKING:
     from gvtools.scenes.scene import Scene
@@ -199,6 +200,65 @@ def _print_check(check: SceneCheck, console: Console, said: set[tuple[str, str]]
 # --- stats ------------------------------------------------------------------------------------
 
 
+# Bins from 10^LOW to 10^HIGH; neighbouring bins' middles differ by 1.16 %.
+LOW, HIGH, PER_DECADE = -6, 8, 200
+
+
+class LogHistogram:
+    """Counts of values by their logarithm.
+
+    A percentile is the middle of its bin: right to 0.6 % from 1e-6 to 1e8. The smallest and the
+    largest value are kept as they are; a percentile below 1e-6 is given as the smallest.
+
+    >>> values = LogHistogram()
+    >>> values.add([1, 2, 3, 4, 1000])
+    >>> round(values.percentile(50), 1), values.maximum
+    (3.0, 1000.0)
+    """
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.minimum = np.inf
+        self.maximum = -np.inf
+        self._bins = np.zeros((HIGH - LOW) * PER_DECADE, np.int64)
+
+    def add(self, values: ArrayLike) -> None:
+        """Count values of any shape that are 0 or more."""
+        flat = np.asarray(values, np.float64).ravel()
+        if not flat.size:
+            return
+        self.count += flat.size
+        self.minimum = min(self.minimum, float(flat.min()))
+        self.maximum = max(self.maximum, float(flat.max()))
+        logs = np.log10(np.maximum(flat, 10.0**LOW))
+        rows = np.clip(((logs - LOW) * PER_DECADE).astype(np.int64), 0, len(self._bins) - 1)
+        self._bins += np.bincount(rows, minlength=len(self._bins))
+
+    def percentile(self, percent: float) -> float:
+        """The value below which so many of a hundred lie; NaN where there is none."""
+        if not self.count:
+            return float("nan")
+        # The nearest rank, as numpy's method "inverted_cdf" takes it.
+        rank = max(1, int(np.ceil(percent / 100 * self.count)))
+        row = int(np.searchsorted(np.cumsum(self._bins), rank))
+        if row == 0:
+            return self.minimum
+        middle = 10.0 ** (LOW + (row + 0.5) / PER_DECADE)
+        return float(np.clip(middle, self.minimum, self.maximum))
+
+
+# What is measured, by name.
+MEASURED = {
+    "views_per_scene": "views per scene",
+    "baseline": "baseline to the next view, {unit}",
+    "turn": "turn to the next view, degrees",
+    "focal": "focal length, pixels",
+    "field_of_view": "field of view, degrees",
+    "depth": "depth, {unit}",  # of sampled views
+    "coverage": "pixels with depth, %",
+}
+
+
 @dataclass
 class DownloadStatistics:
     """Figures of scenes that were seen one after the other."""
@@ -211,13 +271,9 @@ class DownloadStatistics:
     unreadable: int = 0  # of the views that were to be
     metric: int = 0  # scenes whose units are metres
     sizes: Counter[str] = field(default_factory=Counter)  # "WIDTHxHEIGHT", numbers of views
-    views_per_scene: LogHistogram = field(default_factory=LogHistogram)
-    baseline: LogHistogram = field(default_factory=LogHistogram)  # scene units
-    turn: LogHistogram = field(default_factory=LogHistogram)  # to the next view, degrees
-    focal: LogHistogram = field(default_factory=LogHistogram)  # pixels
-    field_of_view: LogHistogram = field(default_factory=LogHistogram)  # across, degrees
-    depth: LogHistogram = field(default_factory=LogHistogram)  # of sampled views, scene units
-    coverage: LogHistogram = field(default_factory=LogHistogram)  # pixels with depth, per cent
+    measured: dict[str, LogHistogram] = field(
+        default_factory=lambda: {name: LogHistogram() for name in MEASURED}
+    )
 
     @property
     def unit(self) -> str:
@@ -226,39 +282,25 @@ class DownloadStatistics:
             return "m"
         return "scene units" if not self.metric else "mixed units"
 
-    @property
-    def distributions(self) -> dict[str, tuple[str, LogHistogram]]:
-        """By name, what is measured and its values."""
-        labels = {
-            "views_per_scene": "views per scene",
-            "baseline": f"baseline to the next view, {self.unit}",
-            "turn": "turn to the next view, degrees",
-            "focal": "focal length, pixels",
-            "field_of_view": "field of view, degrees",
-            "depth": f"depth, {self.unit}",
-            "coverage": "pixels with depth, %",
-        }
-        return {name: (label, getattr(self, name)) for name, label in labels.items()}
-
     def add(self, scene: Scene) -> None:
         """See a scene; a few of its views are decoded."""
         self.scenes += 1
         self.metric += scene.metric
         self.views += len(scene)
-        self.views_per_scene.add(len(scene))
+        self.measured["views_per_scene"].add(len(scene))
         self.with_depth += sum(view.has_depth for view in scene)
         if not scene.views:
             return
         cameras = scene.cameras
         self.sizes.update(f"{w}x{h}" for w, h in zip(cameras.width, cameras.height, strict=True))
-        self.focal.add(cameras.K[:, (0, 1), (0, 1)].mean(axis=1))
+        self.measured["focal"].add(cameras.K[:, (0, 1), (0, 1)].mean(axis=1))
         half = cameras.width / 2 / cameras.K[:, 0, 0]
-        self.field_of_view.add(np.degrees(2 * np.arctan(half)))
-        self.baseline.add(np.linalg.norm(np.diff(cameras.centers, axis=0), axis=1))
-        R = cameras.cam_from_world[:, :3, :3]
-        # The Frobenius distance of two rotations that differ by the angle t is sqrt(8) sin(t / 2).
-        sine = np.linalg.norm(R[1:] - R[:-1], axis=(1, 2)) / np.sqrt(8)
-        self.turn.add(np.degrees(2 * np.arcsin(np.minimum(sine, 1))))
+        self.measured["field_of_view"].add(np.degrees(2 * np.arctan(half)))
+        steps = np.diff(cameras.centers, axis=0)
+        self.measured["baseline"].add(np.linalg.norm(steps, axis=1))
+        self.measured["turn"].add(
+            turn_degrees(cameras.cam_from_world[:-1], cameras.cam_from_world[1:])
+        )
         for number in spread(len(scene), PROBES):
             self._decode(scene, number)
 
@@ -273,13 +315,13 @@ class DownloadStatistics:
         self.sampled += 1
         if frame.depth is not None:
             known = frame.depth[frame.depth > 0]
-            self.depth.add(known)
-            self.coverage.add(100 * known.size / frame.depth.size)
+            self.measured["depth"].add(known)
+            self.measured["coverage"].add(100 * known.size / frame.depth.size)
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-ready values."""
         counts = ("scenes", "skipped", "views", "with_depth", "sampled", "unreadable")
-        spreads = {name: _spread(values) for name, (_, values) in self.distributions.items()}
+        spreads = {name: _spread(values) for name, values in self.measured.items()}
         sizes = {"unit": self.unit, "sizes": dict(self.sizes)}
         return {**{name: getattr(self, name) for name in counts}, **sizes, **spreads}
 
@@ -321,9 +363,10 @@ def _print_statistics(total: DownloadStatistics, console: Console) -> None:
     more = f" and {len(total.sizes) - 5} more sizes" if len(total.sizes) > 5 else ""
     console.line(f"pixels (views): {sizes}{more}")
     rows = []
-    for label, values in total.distributions.values():
+    for name, values in total.measured.items():
         if values.count:
             numbers = [values.percentile(percent) for percent in PERCENTILES]
+            label = MEASURED[name].format(unit=total.unit)
             rows.append((label, f"{values.count:,}", values.minimum, *numbers, values.maximum))
     columns = ("", "count", "min", *(f"{percent} %" for percent in PERCENTILES), "max")
     console.table(columns, rows)

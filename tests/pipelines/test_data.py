@@ -27,7 +27,7 @@ from gvtools.scenes.scene import Scene
 from gvtools.scenes.shards import open_shards
 from pipelines.cli import main
 from pipelines.data_sets import downloads
-from pipelines.data_sets.log_histogram import LogHistogram
+from pipelines.data_sets.downloads import LogHistogram
 
 
 def check(*words: object) -> None:

@@ -11,13 +11,7 @@ from zipfile import ZipFile
 import numpy as np
 import pytest
 from data_sets.miniature import Expected, compare
-from phone_exports import (
-    polycam,
-    record3d,
-    record3d_export,
-    scanner_app,
-    stray_scanner,
-)
+from phone_exports import polycam, record3d, record3d_export, scanner_app, stray_scanner
 from PIL import Image
 
 from gvtools.errors import OptionError, ProjectError

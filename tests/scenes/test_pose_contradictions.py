@@ -13,13 +13,13 @@ import pytest
 import skimage.data
 
 from gvtools.cameras import Cameras
-from gvtools.scenes import pose_contradictions
 from gvtools.scenes.colmap import read_colmap
 from gvtools.scenes.inspection import inspect
 from gvtools.scenes.pose_contradictions import (
     DISAGREEING,
     contradictions,
     disagreement,
+    homography,
     thumbnail,
 )
 from gvtools.scenes.project import open_project
@@ -118,8 +118,8 @@ def test_pictures_without_contrast_cannot_be_compared() -> None:
     scene = walk(views=2)
     flat = thumbnail(Frame(np.full((HEIGHT, WIDTH, 3), 128, np.uint8)))
     other = thumbnail(scene.views[0].load())
-    assert disagreement(flat, other, scene.cameras) is None
-    assert disagreement(other, other, scene.cameras[[0, 0]]) == 0
+    assert disagreement(flat, other, homography((flat, other), scene.cameras, (0, 1))) is None
+    assert disagreement(other, other, np.eye(3)) == 0
 
 
 def test_a_search_that_ends_early_finds_the_same_contradictions() -> None:
@@ -128,9 +128,9 @@ def test_a_search_that_ends_early_finds_the_same_contradictions() -> None:
     agree = 0
     for a, b in combinations(range(len(scene)), 2):
         pair = pictures[a], pictures[b]
-        whole = disagreement(*pair, scene.cameras[[a, b]])
-        H = pose_contradictions._homography(pair, scene.cameras, (a, b))
-        early = pose_contradictions._disagreement(*pair, H, enough=DISAGREEING)
+        H = homography(pair, scene.cameras, (a, b))
+        whole = disagreement(*pair, H)
+        early = disagreement(*pair, H, enough=DISAGREEING)
         assert whole is not None and early is not None
         assert whole <= early
         assert (whole > DISAGREEING) == (early > DISAGREEING)
@@ -146,8 +146,9 @@ def test_masked_pixels_are_not_compared() -> None:
     mask = np.ones((HEIGHT, WIDTH), np.bool_)
     mask[:, : WIDTH // 3] = False
     first = thumbnail(frames[0])
-    open_to_all = disagreement(first, thumbnail(Frame(spoilt)), scene.cameras)
-    masked = disagreement(first, thumbnail(Frame(spoilt, mask=mask)), scene.cameras)
+    H = homography((first, first), scene.cameras, (0, 1))
+    open_to_all = disagreement(first, thumbnail(Frame(spoilt)), H)
+    masked = disagreement(first, thumbnail(Frame(spoilt, mask=mask)), H)
     assert open_to_all is not None and masked is not None
     assert masked == 0 < open_to_all
 
@@ -178,14 +179,7 @@ def test_near_views_that_share_no_sparse_point_are_told() -> None:
 
 @pytest.mark.data
 @pytest.mark.parametrize(
-    "name",
-    [
-        "fox_colmap",
-        "fern_colmap",
-        "sceaux_colmap",
-        "sevenscenes_reg",
-        "sevenscenes_clip",
-    ],
+    "name", ["fox_colmap", "fern_colmap", "sceaux_colmap", "sevenscenes_reg", "sevenscenes_clip"]
 )
 def test_real_scenes_raise_no_false_alarm(shared: Path, name: str) -> None:
     assert contradiction_messages(open_project(shared / "data" / name)) == []

@@ -170,9 +170,7 @@ def test_masks_and_images_may_be_given(tmp_path):
     with pytest.raises(ProjectError, match="without images"):
         read_colmap(tmp_path / "project")
     scene = read_colmap(
-        tmp_path / "project",
-        images=tmp_path / "pictures",
-        masks=tmp_path / "ignore",
+        tmp_path / "project", images=tmp_path / "pictures", masks=tmp_path / "ignore"
     )
     frame = scene[name].load()
     assert not frame.mask.any()

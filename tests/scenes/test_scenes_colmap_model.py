@@ -178,10 +178,7 @@ def test_no_picture_on_disk(tmp_path):
     workspace(tmp_path)
     for path in (tmp_path / "images").iterdir():
         path.unlink()
-    with pytest.raises(
-        ProjectError,
-        match=r"none of 4 frames .* have no picture.* --images",
-    ):
+    with pytest.raises(ProjectError, match=r"none of 4 frames .* have no picture.* --images"):
         read_colmap(tmp_path)
 
 

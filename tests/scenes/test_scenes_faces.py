@@ -12,13 +12,7 @@ import pytest
 from PIL import Image
 
 from gvtools.errors import OptionError, ProjectError
-from gvtools.scenes.faces import (
-    DIRECTIONS,
-    face_name,
-    face_rotation,
-    perspective_views,
-    picture_of,
-)
+from gvtools.scenes.faces import DIRECTIONS, face_name, face_rotation, perspective_views, picture_of
 from gvtools.scenes.project import open_project
 from gvtools.scenes.selection import check_disjoint, select
 

@@ -17,11 +17,7 @@ def turned(degrees, translation):
     angle = np.radians(degrees)
     matrix = np.eye(4)
     rotation = np.array(
-        [
-            [np.cos(angle), -np.sin(angle), 0],
-            [np.sin(angle), np.cos(angle), 0],
-            [0, 0, 1],
-        ]
+        [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
     )
     tilt = np.array(
         [

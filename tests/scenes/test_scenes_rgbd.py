@@ -270,8 +270,9 @@ def test_tum_lists_of_windows_programs(tmp_path, name):
 def test_a_default_camera_is_a_warning_at_every_door(tmp_path, layout, write):
     root = write(tmp_path / "recording")
     (root / "camera.json").unlink(missing_ok=True)
-    levels = [f.level for f in layout.read(root).findings if "driver's default" in f.message]
-    assert levels == ["warning"]
+    scene = layout.read(root)
+    assert [f.level for f in scene.findings if "driver's default" in f.message] == ["warning"]
+    np.testing.assert_allclose(scene.cameras.K[0], [[525, 0, 320], [0, 525, 240], [0, 0, 1]])
     np.savetxt(root / "camera-intrinsics.txt", [[90, 0, 47.5], [0, 91, 35.5], [0, 0, 1]])
     scene = layout.read(root)
     assert scene.cameras.K[0, 1, 1] == 91
@@ -312,13 +313,6 @@ def test_redwood_trajectory_that_does_not_fit(tmp_path):
     (root / "trajectory.log").write_text(text.split("1 1 2")[0].replace("0 0 1", "7 7 8"))
     with pytest.raises(ProjectError, match="1 poses numbered 7 for 3 pictures"):
         REDWOOD.read(root)
-
-
-def test_redwood_without_intrinsics_takes_the_sensors(tmp_path):
-    root = redwood(tmp_path)
-    (root / "camera.json").unlink()
-    K = REDWOOD.read(root).cameras.K[0]
-    np.testing.assert_allclose(K, [[525, 0, 320], [0, 525, 240], [0, 0, 1]])
 
 
 # --- ScanNet ----------------------------------------------------------------------------------

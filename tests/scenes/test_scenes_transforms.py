@@ -264,8 +264,7 @@ def test_absolute_and_relative_pictures_may_be_mixed(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "text",
-    ["{", "[]", "{}", '{"frames": []}', '{"frames": [1]}', '{"w": ' + "9" * 400 + "}"],
+    "text", ["{", "[]", "{}", '{"frames": []}', '{"frames": [1]}', '{"w": ' + "9" * 400 + "}"]
 )
 def test_malformed_files(tmp_path, text):
     (tmp_path / "transforms.json").write_text(text)

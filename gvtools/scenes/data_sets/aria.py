@@ -11,11 +11,12 @@ glasses' colour sensor lies on its side: pictures are read as stored, not turned
 from __future__ import annotations
 
 import csv
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,15 +25,13 @@ from gvtools.cameras import invert_rigid
 from gvtools.errors import ProjectError
 from gvtools.optional import require
 from gvtools.scenes.calibration import MILLIMETRES, Float64, quaternion_pose
+from gvtools.scenes.images import readings
 from gvtools.scenes.layout import Layout
 from gvtools.scenes.matching import pose_at, scenes_holding
 from gvtools.scenes.photographs import Depth, PosedFrame, posed_scene
 from gvtools.scenes.scene import Finding, Frame, Scene
-from gvtools.scenes.undistort import LensParameters
+from gvtools.scenes.undistort import Undistortion, camera_of
 from gvtools.untrusted import read_json, read_text, reading
-
-if TYPE_CHECKING:
-    import pycolmap
 
 VIDEO, TRAJECTORY, DEPTH = "video.vrs", "aria_trajectory.csv", "depth_images.vrs"
 METADATA = ("metadata.json", "gt-metadata.json")
@@ -49,24 +48,22 @@ def _read(root: Path, scene: str) -> Scene:
     folder = root / scene
     version = _version(folder)
     times, world_from_device = read_trajectory(folder / TRAJECTORY, version=version)
-    camera = rgb_camera(folder / VIDEO)
-    cam_from_world = invert_rigid(world_from_device @ camera.device_from_cam)
+    lens, device_from_cam = rgb_camera(folder / VIDEO)
+    cam_from_world = invert_rigid(world_from_device @ device_from_cam)
     depth = folder / DEPTH
     pictures = [
         PosedFrame(
             str(time),
             folder / VIDEO,
-            camera.pinhole,
+            (lens,),
             pose_at(time, times, cam_from_world, same=SAME, longest_gap=LONGEST_GAP),
             depth if depth.is_file() else None,
-            partial(read_rgb_depth, time=time, camera=camera),
-            read=partial(read_rgb, index=i, camera=camera),
+            partial(read_rgb_depth, time=time),
+            read=partial(read_rgb, index=i),
         )
         for i, time in enumerate(rgb_times(folder / VIDEO))
     ]
-    (width, height), focal = camera.lens.size, camera.lens.values[0]
-    line = f"Aria's fisheye {width}x{height} to PINHOLE with focal length {focal:.1f} px"
-    findings = [Finding("info", f"{line}; quaternions of version {version}")]
+    findings = [Finding("info", f"quaternions of version {version}")]
     return posed_scene(folder, pictures, poses="cam_from_world", metric=True, findings=findings)
 
 
@@ -103,68 +100,37 @@ OPEN_FILES = 4  # that are kept open in a process
 
 
 @dataclass(frozen=True, eq=False)
-class AriaCamera:
-    """The calibration of an Aria camera, and the pinhole that its pictures are brought to.
+class AriaLens(Undistortion):
+    """From the fisheye to a pinhole with its size and focal length, whose picture lies inside."""
 
-    The pinhole has the fisheye's size and focal length, its principal point in the middle, and the
-    same axes: its picture lies wholly inside the fisheye's round one.
-    """
+    radius: float = np.inf  # within which the sensor sees anything, pixels from the principal point
 
-    lens: LensParameters  # of the fisheye, pixels, first pixel's centre (0.5, 0.5)
-    radius: float  # within which the sensor sees anything, pixels from the principal point
-    device_from_cam: Float64  # (4, 4), metres
-
-    @property
-    def pinhole(self) -> LensParameters:
-        """Of the views."""
-        width, height = self.lens.size
-        focal = self.lens.values[0]
-        return LensParameters("PINHOLE", (focal, focal, width / 2, height / 2), self.lens.size)
-
-    def picture(self, rgb: NDArray[np.uint8]) -> Frame:
-        """(h, w, 3) recorded, as the pinhole sees it; the mask tells what is outside the lens."""
-        import cv2
-
-        x, y, seen = self._source
-        shown = cv2.remap(rgb, x, y, cv2.INTER_LINEAR)
-        return Frame(np.asarray(shown, np.uint8), mask=None if seen.all() else seen)
-
-    def depth(self, recorded: NDArray[np.uint16]) -> Depth:
-        """(h, w) recorded millimetres along z, as (h, w) float32 metres of the pinhole."""
-        import cv2
-
-        x, y, seen = self._source
-        found = cv2.remap(recorded.astype(np.float32), x, y, cv2.INTER_NEAREST)
-        return np.where(seen, found * np.float32(MILLIMETRES), np.float32(0))
+    def image(self, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """As of any lens, black where nothing is seen."""
+        return np.where((self._source_pixel >= 0)[..., None], super().image(rgb), np.uint8(0))
 
     @cached_property
-    def _source(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
-        """For each pixel the recorded position, counted by pixels' centres, and whether seen."""
-        width, height = self.lens.size
-        focal, _, cx, cy = self.pinhole.values
-        y, x = np.mgrid[:height, :width] + 0.5
-        rays = np.stack([(x - cx) / focal, (y - cy) / focal, np.ones_like(x)], axis=-1)
-        source = np.asarray(self._fisheye.img_from_cam(rays.reshape(-1, 3)))
-        off = source - self.lens.values[2:4]
+    def _source_pixel(self) -> NDArray[np.int32]:
+        off = self.source_positions() - self.source.params[2:4]
         with np.errstate(invalid="ignore"):
-            seen = (np.hypot(*off.T) <= self.radius) & (source >= 0).all(axis=1)
-            seen &= (source <= self.lens.size).all(axis=1)
-        place = np.where(seen[:, None], source - 0.5, -1).astype(np.float32)
-        columns, rows = place.T.reshape(2, height, width)
-        return columns, rows, seen.reshape(height, width)
-
-    @cached_property
-    def _fisheye(self) -> pycolmap.Camera:
-        import pycolmap
-
-        width, height = self.lens.size
-        return pycolmap.Camera(
-            model=self.lens.model, width=width, height=height, params=list(self.lens.values)
-        )
+            seen = np.hypot(off[..., 0], off[..., 1]) <= self.radius
+        return np.where(seen, self.flat_pixels(), -1).astype(np.int32)
 
 
-def rgb_camera(path: Path) -> AriaCamera:
-    """The colour camera of a recording."""
+def aria_lens(params: Sequence[float], size: tuple[int, int], radius: float) -> AriaLens:
+    """The lens of Aria's FISHEYE624 parameters, pixels, whose first pixel's centre is (0, 0)."""
+    import pycolmap
+
+    focal, cx, cy, *distortion = params
+    fisheye = (focal, focal, cx + 0.5, cy + 0.5, *distortion)
+    pinhole = [focal, focal, size[0] / 2, size[1] / 2]
+    target = pycolmap.Camera(model="PINHOLE", width=size[0], height=size[1], params=pinhole)
+    source = camera_of(FISHEYE, fisheye, size, what="Aria's colour camera")
+    return AriaLens(source, target, False, radius)
+
+
+def rgb_camera(path: Path) -> tuple[AriaLens, Float64]:
+    """The colour camera of a recording, and (4, 4) device_from_cam, metres."""
     calibration = _provider(path).get_device_calibration()
     camera = None if calibration is None else calibration.get_camera_calib(RGB_LABEL)
     if camera is None:
@@ -175,14 +141,10 @@ def rgb_camera(path: Path) -> AriaCamera:
             f"{path}: {camera.get_model_name()} with {len(values)} parameters; expected Aria's "
             "FISHEYE624 with 15"
         )
-    focal, cx, cy, *distortion = values
     width, height = (int(side) for side in camera.get_image_size())
     radius = camera.get_valid_radius()
-    return AriaCamera(
-        LensParameters(FISHEYE, (focal, focal, cx + 0.5, cy + 0.5, *distortion), (width, height)),
-        np.inf if radius is None else float(radius),
-        np.asarray(camera.get_transform_device_camera().to_matrix(), np.float64),
-    )
+    lens = aria_lens(values, (width, height), np.inf if radius is None else float(radius))
+    return lens, np.asarray(camera.get_transform_device_camera().to_matrix(), np.float64)
 
 
 def rgb_times(path: Path) -> list[int]:
@@ -193,14 +155,14 @@ def rgb_times(path: Path) -> list[int]:
     return [int(time) for time in times]
 
 
-def read_rgb(path: Path, *, index: int, camera: AriaCamera) -> Frame:
-    """A picture of the colour camera as a pinhole sees it."""
+def read_rgb(path: Path, *, index: int) -> Frame:
+    """A picture of the colour camera."""
     stream = _tools().stream_id.StreamId(RGB_STREAM)
     data, _ = _provider(path).get_image_data_by_index(stream, index)
-    return camera.picture(_array(data, path))
+    return Frame(_array(data, path))
 
 
-def read_rgb_depth(path: Path, *, time: int, camera: AriaCamera) -> Depth:
+def read_rgb_depth(path: Path, *, time: int) -> Depth:
     """The depth map of a picture of the colour camera: the nearest in time, nanoseconds.
 
     Streams of ``depth_images.vrs`` name the recorded streams that they belong to.
@@ -214,7 +176,7 @@ def read_rgb_depth(path: Path, *, time: int, camera: AriaCamera) -> Depth:
                 tools.sensor_data.TimeDomain.DEVICE_TIME,
                 tools.sensor_data.TimeQueryOptions.CLOSEST,
             )
-            return camera.depth(_array(data, path))
+            return readings(_array(data, path), unit=MILLIMETRES)
     raise ProjectError(f"{path}: no stream of {RGB_STREAM}; copy it again")
 
 

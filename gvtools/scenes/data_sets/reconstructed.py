@@ -16,11 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from gvtools.errors import ProjectError
-from gvtools.scenes.calibration import (
-    MILLIMETRES,
-    finite_array,
-    pinhole_lens,
-)
+from gvtools.scenes.calibration import MILLIMETRES, finite_array, pinhole_lens
 from gvtools.scenes.colmap import colmap_frames, colmap_scene, model_in
 from gvtools.scenes.colmap_model import (
     ColmapModel,
@@ -31,12 +27,7 @@ from gvtools.scenes.colmap_model import (
 )
 from gvtools.scenes.images import read_depth, readings
 from gvtools.scenes.layout import Layout
-from gvtools.scenes.matching import (
-    PICTURES,
-    natural,
-    pictures_by_stem,
-    scenes_holding,
-)
+from gvtools.scenes.matching import PICTURES, natural, pictures_by_stem, scenes_holding
 from gvtools.scenes.photographs import Depth, PosedFrame, first_size, posed_scene
 from gvtools.scenes.scene import Finding, Scene
 from gvtools.scenes.transforms import FILE as TRANSFORMS

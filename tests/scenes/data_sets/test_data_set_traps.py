@@ -25,12 +25,11 @@ from data_sets.room_frames import room_frames
 from PIL import Image
 
 from gvtools.errors import OptionError, ProjectError
-from gvtools.scenes.data_sets.aria import FISHEYE, AriaCamera
+from gvtools.scenes.data_sets.aria import aria_lens
 from gvtools.scenes.data_sets.hypersim import read_color, turned_pinhole
 from gvtools.scenes.data_sets.mvs import decomposed
 from gvtools.scenes.matching import pose_at
 from gvtools.scenes.scene import Scene
-from gvtools.scenes.undistort import LensParameters
 from gvtools.scenes.video import read_frame
 
 
@@ -507,10 +506,7 @@ def test_waymo_takes_the_frames_pose_where_pictures_have_none(tmp_path: Path) ->
 
 def test_aria_lens_projects_as_the_official_tools() -> None:
     """Values that projectaria_tools 2.3.0 gives for a FISHEYE624 camera of these parameters."""
-    focal, cx, cy = 610.9, 711.2, 709.4
-    lens = LensParameters(
-        FISHEYE, (focal, focal, cx + 0.5, cy + 0.5, *mini_aria.PARAMS[3:]), (1408, 1408)
-    )
+    values = (610.9, 711.2, 709.4, *mini_aria.PARAMS[3:])
     points = np.array([[0, 0, 1], [0.3, 0.2, 1], [-0.5, 0.4, 1], [0.9, -0.7, 1], [-1, 1, 1]])
     official = [
         [711.2, 709.4],
@@ -519,7 +515,7 @@ def test_aria_lens_projects_as_the_official_tools() -> None:
         [1197.46209743, 331.38097377],
         [205.24181961, 1215.57873122],
     ]
-    found = AriaCamera(lens, 700.0, np.eye(4))._fisheye.img_from_cam(points)
+    found = aria_lens(values, (1408, 1408), 700.0).source.img_from_cam(points)
     np.testing.assert_allclose(found, np.array(official) + 0.5, rtol=0, atol=1e-7)
 
 
@@ -538,10 +534,7 @@ def test_aria_recordings_need_the_official_package(tmp_path, monkeypatch):
         read("aria_digital_twin", tmp_path, expected.scene)
     (tmp_path / expected.scene / "video.vrs").write_bytes(b"none")
     monkeypatch.undo()
-    with (
-        projectaria_tools(),
-        pytest.raises(ProjectError, match="expected a VRS file; copy"),
-    ):
+    with projectaria_tools(), pytest.raises(ProjectError, match="expected a VRS file; copy"):
         read("aria_digital_twin", tmp_path, expected.scene)
 
 
