@@ -64,10 +64,8 @@ def back_project(
     are measured badly); depth edges are dropped. The spacing is the pixel's footprint, z / f.
 
     Args:
-        rgb: (H, W, 3) uint8.
         depth: (H, W) z-depth, scene units; 0, NaN and inf mean none.
         frame: ``memory.frame``; None for the world's.
-        confidence: (H, W) float32 > 0.
         mask: (H, W), True = use.
         levels: ``memory.levels``, for ``pixel_binning``.
         pixel_binning: merge 2 x 2 pixels into one point, their mean, if together they are at most

@@ -44,14 +44,10 @@ def export_memory_ply(
     """Write the observations with colour, confidence, spacing, round, view, generated and scanned.
 
     x, y, z are in the input's world frame: float, or double where the origin is so far away that
-    float would lose a tenth of a voxel.
-
-    Args:
-        max_points: thin to at most so many points: one per voxel (the most confident), of voxels
-            as much larger than the memory's as it takes; None keeps every observation.
-
-    Returns:
-        Points written, and the voxel edge they were thinned to (0 when all were kept).
+    float would lose a tenth of a voxel. ``max_points`` thins to one point per voxel (the most
+    confident), of voxels as much larger than the memory's as it takes; None keeps every
+    observation. Returns the points written, and the voxel edge they were thinned to (0 when all
+    were kept).
     """
     count = len(memory) - (memory.generated_count if observed else 0)
     if observed and not count:

@@ -173,11 +173,7 @@ def can_adjust(cameras: Cameras, tracks: Tracks | None) -> bool:
 
 
 def tracks_of(scene: Scene, names: Sequence[str], frame: LocalFrame) -> Tracks | None:
-    """The tracks of a project's sparse points in some views; None where these are too few.
-
-    Args:
-        names: of the views, which the tracks number in this order.
-    """
+    """The tracks of a project's sparse points in some views, numbered so; None for too few."""
     points = scene.points
     if points is None or not len(points.view_index):
         return None

@@ -33,14 +33,11 @@ def extract_sift(
     first_octave: int = -1,
     one_camera: bool = True,
 ) -> None:
-    """Find SIFT features of some pictures.
+    """Find SIFT features of some pictures, for a database.
 
-    Args:
-        database: where they go.
-        masks: folder of masks, black where no feature may be.
-        side: longer side that pictures are reduced to before, pixels.
-        first_octave: -1 doubles pictures before; 0 takes a quarter of the time.
-        one_camera: whether all of them have one camera, and so one size.
+    Pictures are reduced to a longer side of ``side`` pixels before; ``masks`` is a folder, black
+    where no feature may be; ``first_octave`` -1 doubles pictures before, 0 takes a quarter of the
+    time.
     """
     import pycolmap
 

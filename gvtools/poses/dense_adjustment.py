@@ -90,12 +90,9 @@ def adjusted(
     """All cameras with their poses adjusted together.
 
     What the pictures do not tell, the scale of the scene above all, stays as the poses have it:
-    each pose is held to where it was.
-
-    Args:
-        equations: for each reference view its row, its sources' rows and what was measured.
-        rotation: expected error of a pose, radians.
-        translation: likewise, scene units.
+    each pose is held to where it was, by the expected errors ``rotation`` [rad] and ``translation``
+    [scene units]. ``equations``: for each reference view its row, its sources' rows and what was
+    measured.
     """
     count = len(cameras)
     system, right = np.zeros((6 * count, 6 * count)), np.zeros(6 * count)

@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import invert_rigid
 from gvtools.features import mutual_nearest, root_sift
-from gvtools.poses.motions import turn_of, within
-from gvtools.poses.pose_graph import Pair
+from gvtools.poses.motions import Pair, turn_of, within
 from gvtools.scenes.scene import Scene
 
 if TYPE_CHECKING:

@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import invert_rigid
-from gvtools.poses.motions import chained, within
+from gvtools.poses.motions import Pair, chained, connected, first_poses, optimised, residual, within
 from gvtools.poses.odometry import RgbdFrames, compare, start_from_features
-from gvtools.poses.pose_graph import Pair, connected, first_poses, optimised, residual
 
 Float64 = NDArray[np.float64]
 

@@ -17,9 +17,16 @@ import torch
 from kornia.filters import gaussian_blur2d
 from numpy.typing import NDArray
 
-from gvtools.poses.motions import mean_near, motions_between, moved, nearest, nearest_pairs
+from gvtools.poses.motions import (
+    Pair,
+    mean_near,
+    motions_between,
+    moved,
+    nearest,
+    nearest_pairs,
+    optimised,
+)
 from gvtools.poses.odometry import BEYOND, TYPICAL_DEPTH, register
-from gvtools.poses.pose_graph import Pair, optimised
 from gvtools.poses.views import FitView, ReducedView, reduced
 from gvtools.similarity import align_poses
 
@@ -85,9 +92,8 @@ def refined_poses(
 ) -> RefinedPoses | None:
     """Poses on which neighbouring views agree; None where the given ones are as good.
 
-    Args:
-        views: all with depth, neighbours along the path beside each other.
-        poses: (V, 4, 4) told by features; None finds some by odometry.
+    All views have depth and are in the order of the path; ``poses`` (V, 4, 4) are told by features,
+    None finds some by odometry.
     """
     if len(views) < 2:
         return None
@@ -116,11 +122,7 @@ def refined_poses(
 
 
 def agreeing_poses(views: Iterable[FitView]) -> NDArray[np.float64]:
-    """(V, 4, 4) refined ``cam_from_local``, on average where they were given.
-
-    Args:
-        views: all with depth, neighbours along the path beside each other.
-    """
+    """(V, 4, 4) refined ``cam_from_local``, on average where they were given."""
     views = list(views)
     height, width = views[0].rgb.shape[:2]
     scale = min(1.0, SIDE / max(height, width))
@@ -203,12 +205,8 @@ def prediction_error(
     """Mean over pairs of neighbouring photographs of the median colour difference, 0 to 1.
 
     Each pixel with depth is looked up in the neighbour; what is hidden there is a minority that the
-    median passes over. NaN where no pair overlaps.
-
-    Args:
-        small: at least two, with depth; see ``compared``.
-        poses: (V, 4, 4) of the cameras, in the frame of the views.
-        at: (V, 4, 4) where each camera is when it is compared with the others; None: at its pose.
+    median passes over. NaN where no pair overlaps. ``small``: at least two, see ``compared``;
+    ``at`` is where each camera is when it is compared with the others; None: at its pose.
     """
     at = poses if at is None else at
     depths = np.concatenate([view.depth.ravel() for view in small if view.depth is not None])

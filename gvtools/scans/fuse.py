@@ -30,9 +30,6 @@ def fuse_scan(
 
     A point's spacing is the distance between its neighbours; it decides the point's voxel and the
     size of its splat.
-
-    Args:
-        scan: in its own frame.
     """
     # Relative to both origins: georeferenced coordinates are too large for float32.
     turn = placement.world_from_scan[:3, :3]
@@ -61,14 +58,9 @@ def fuse_scan(
 
 
 def point_spacing(positions: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """The spacing of points on a surface, from the density around each.
+    """The spacing of points (N, 3) on a surface, from the density around each, and isolated ones.
 
-    Args:
-        positions: (N, 3).
-
-    Returns:
-        (N,) spacing, the unit of ``positions``: with the k-th neighbour at a distance r it is
-        r sqrt(pi / (k - 1)). (N,) bool, isolated points.
+    With the k-th neighbour at a distance r the spacing is r sqrt(pi / (k - 1)).
 
     >>> grid = np.stack(np.meshgrid(np.arange(20.0), np.arange(20.0), [0.0]), -1).reshape(-1, 3)
     >>> round(float(np.median(point_spacing(grid)[0])), 1)

@@ -35,11 +35,7 @@ UNIT = 1e-3
 
 
 def open_lidar(path: Path, *, generated: bool = False) -> ScanFile:
-    """A LAS, LAZ or E57, its header read.
-
-    Args:
-        generated: whether points of a LAS are kept that a completer made.
-    """
+    """A LAS, LAZ or E57, its header read; ``generated`` keeps a completer's points of a LAS."""
     suffix = path.suffix.lower()
     packages = {".las": ("laspy",), ".laz": ("laspy", "lazrs"), ".e57": ("pye57",)}[suffix]
     for package in packages:
@@ -55,15 +51,8 @@ def open_lidar(path: Path, *, generated: bool = False) -> ScanFile:
         Station(item["name"], None if item["center"] is None else tuple(item["center"]))
         for item in head[0]["stations"]
     )
-    return ScanFile(path, head[0]["count"], stations, _chunks(items))
-
-
-def _chunks(items: Iterator[Item]) -> Iterator[Chunk]:
-    for facts, arrays in items:
-        yield Chunk(
-            arrays["positions"], arrays.get("colors"), arrays.get("intensity"),
-            facts["station"], facts["dropped"],
-        )  # fmt: skip
+    chunks = (Chunk(**{**facts, **arrays}) for facts, arrays in items)
+    return ScanFile(path, head[0]["count"], stations, chunks)
 
 
 def _sent(chunk: Chunk) -> Item:

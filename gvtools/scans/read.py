@@ -30,9 +30,7 @@ FARTHEST = 1e15
 def open_scan(path: Path, *, generated: bool = False) -> ScanFile:
     """The scan in a file, its header read and checked against the file's size.
 
-    Args:
-        path: PLY, LAS, LAZ, E57 or PCD, told by its suffix.
-        generated: whether points of a LAS that a completer made are kept.
+    ``generated`` keeps points of a LAS that a completer made.
     """
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
@@ -52,13 +50,7 @@ def open_scan(path: Path, *, generated: bool = False) -> ScanFile:
 
 
 def read_scan(path: Path, *, most: int = MOST_POINTS, generated: bool = False) -> Scan:
-    """The points of a scan, at most ``most``: beyond it one of each cell of a grid.
-
-    Args:
-        path: see ``open_scan``.
-        most: at least 2.
-        generated: see ``open_scan``.
-    """
+    """The points of a scan, at most ``most``: beyond it one of each cell of a grid."""
     file = open_scan(path, generated=generated)
     reading = _Reading(most)
     with _one_line(path):

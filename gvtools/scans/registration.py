@@ -165,11 +165,8 @@ def register(
 ) -> Placement:
     """The similarity from a scan's frame to the photographs' world.
 
-    Args:
-        scan: in the file's frame and unit.
-        photographed: in the world, scene units.
-        least: smallest fitness that is accepted, 0 to 1.
-        metric: whether the world's unit is the metre: METRIC scales are then tried first.
+    ``least`` is the smallest fitness that is accepted, 0 to 1; in a ``metric`` world, whose unit is
+    the metre, METRIC scales are tried first.
     """
     for name, surface in (("scan", scan), ("photographs", photographed)):
         if len(surface.positions) < FEWEST:

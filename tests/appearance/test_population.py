@@ -2,12 +2,30 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import torch
+from scipy.spatial import cKDTree
+from splat_scene import photographs, rough_gaussians, walk
 
+from gvtools.appearance import population as module
 from gvtools.appearance.gaussians import Gaussians
-from gvtools.appearance.population import FAINTEST, SHRINK, Population
-from gvtools.appearance.splat.project_kernels import LOG_SCALE, LOGIT, QUATERNION, SH
+from gvtools.appearance.population import (
+    FAINTEST,
+    LARGEST,
+    MOST_OPAQUE,
+    NEGLIGIBLE,
+    NEIGHBOURS,
+    SHRINK,
+    Population,
+    Sample,
+    from_depth,
+    from_points,
+)
+from gvtools.appearance.splat.project_kernels import LOG_SCALE, LOGIT, QUATERNION, SH, VALUES
+from gvtools.memory.store.local_frame import LocalFrame
 
 WIDE = 2.0
 
@@ -115,3 +133,144 @@ def test_all_fade_by_a_share_of_their_opacity():
     people.fade(0.1)
     after = 1 / (1 + np.exp(-people.values[:, LOGIT]))
     np.testing.assert_allclose(after, 0.9 * before, rtol=1e-5)
+
+
+def some_values() -> np.ndarray:
+    values = rough_gaussians().values
+    values[:, LOGIT] = np.linspace(-5, 6, len(values))
+    return values
+
+
+def test_a_negligible_share_leaves_all_as_they_are():
+    values = some_values()
+    sample = Sample(values, NEGLIGIBLE / 2, rng=np.random.default_rng(0))
+    gradients, seen = np.ones((3, VALUES), np.float32), np.array([1, 5, 9])
+    assert sample.values is values
+    np.testing.assert_array_equal(sample.back(seen, gradients), seen)
+    assert (gradients == 1).all()
+
+
+def test_those_that_are_left_stop_the_light_of_those_that_are_missing():
+    values, before = some_values(), some_values()
+    sample = Sample(values, 0.3, rng=np.random.default_rng(0))
+    np.testing.assert_array_equal(values, before)
+    assert 0.62 < len(sample.values) / len(values) < 0.78
+    rows = sample.back(
+        np.arange(len(sample.values)), np.ones((len(sample.values), VALUES), np.float32)
+    )
+    assert (np.diff(rows) > 0).all()
+    others = np.arange(VALUES) != LOGIT
+    np.testing.assert_array_equal(sample.values[:, others], values[rows][:, others])
+    opacity, raised = (1 / (1 + np.exp(-each[:, LOGIT])) for each in (values[rows], sample.values))
+    np.testing.assert_allclose(raised, np.minimum(opacity / 0.7, MOST_OPAQUE), rtol=1e-4)
+
+
+def test_gradients_come_back_by_the_chain_rule():
+    values, rng = some_values(), np.random.default_rng(1)
+    sample = Sample(values, 0.4, rng=rng)
+    seen = np.arange(0, len(sample.values), 3)
+    by_raised = rng.normal(size=(len(seen), VALUES)).astype(np.float32)
+    gradients = by_raised.copy()
+    rows = sample.back(seen, gradients)
+    logits = torch.from_numpy(values[rows, LOGIT]).double().requires_grad_()
+    raised = torch.clamp(torch.sigmoid(logits) / 0.6, max=MOST_OPAQUE)
+    (torch.logit(raised) * torch.from_numpy(by_raised[:, LOGIT]).double()).sum().backward()
+    assert logits.grad is not None
+    assert 0.2 < (logits.grad == 0).double().mean() < 0.8
+    np.testing.assert_allclose(gradients[:, LOGIT], logits.grad.numpy(), rtol=1e-2, atol=1e-4)
+    others = np.arange(VALUES) != LOGIT
+    np.testing.assert_array_equal(gradients[:, others], by_raised[:, others])
+
+
+FRAME = LocalFrame.at([1.0, 2.0, 3.0])
+
+
+def sizes(some):
+    widths = np.exp(some.values[:, 3:6])
+    np.testing.assert_array_equal(widths, widths[:, :1].repeat(3, axis=1))
+    return widths[:, 0]
+
+
+def colors_of(places):
+    return np.full((len(places), 3), 100, np.uint8)
+
+
+def test_points_of_a_grid_are_as_wide_as_it():
+    places = np.mgrid[0:1.25:0.25, 7:8.25:0.25, 900:901.25:0.25].reshape(3, -1).T
+    some = from_points(places, colors_of(places), frame=FRAME)
+    np.testing.assert_allclose(sizes(some), 0.25, rtol=1e-3)
+    np.testing.assert_allclose(some.values[:, :3], places, rtol=1e-6)
+    assert some.frame is FRAME
+
+
+def test_sizes_are_distances_to_the_nearest_neighbours():
+    places = np.random.default_rng(0).normal(size=(500, 3))
+    distances, _ = cKDTree(places).query(places, NEIGHBOURS + 1)
+    expected = np.sqrt(np.square(distances[:, 1:]).mean(axis=1))
+    found = sizes(from_points(places, colors_of(places), frame=FRAME))
+    usual = expected < np.quantile(expected, LARGEST)
+    np.testing.assert_allclose(found[usual], expected[usual], rtol=1e-4)
+    np.testing.assert_allclose(found[~usual], np.quantile(expected, LARGEST), rtol=1e-4)
+
+
+def test_points_in_one_place_still_have_a_size():
+    places = np.random.default_rng(0).normal(size=(100, 3))
+    places[:20] = places[0]
+    found = sizes(from_points(places, colors_of(places), frame=FRAME))
+    assert found[:20].min() == found.min() > 0
+    assert np.isfinite(found).all()
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_fewer_points_than_neighbours_are_enough(count):
+    places = np.array([[0.0, 0, 0], [0.5, 0, 0], [0, 0.5, 0]])[:count]
+    found = sizes(from_points(places, colors_of(places), frame=FRAME))
+    assert (found > 0.3).all() and (found < 1).all()
+
+
+@pytest.mark.parametrize(("most", "kept"), [(None, 100), (60, 50), (100, 100), (7, 7)])
+def test_many_points_are_thinned_evenly(monkeypatch, most, kept):
+    monkeypatch.setattr(module, "STARTING_GAUSSIANS", 100)
+    places = np.random.default_rng(0).normal(size=(100, 3))
+    colors = np.arange(300, dtype=np.uint8).reshape(100, 3)
+    some = from_points(places, colors, frame=FRAME, most=most)
+    assert len(some) == kept
+    rows = np.arange(0, 100, -(-100 // kept))
+    np.testing.assert_allclose(some.values[:, :3], places[rows], rtol=1e-6)
+
+
+def test_pixels_with_depth_become_gaussians_on_the_surface():
+    views = photographs(walk(3), depth=True)
+    mask = np.ones(views[0].rgb.shape[:2], bool)
+    mask[:, 20:] = False
+    first, second = views[0].depth, views[1].depth
+    assert first is not None and second is not None
+    second = np.where(second > 2.5, np.float32(0), second)
+    views[0], views[1] = replace(views[0], mask=mask), replace(views[1], depth=second)
+    views[2] = replace(views[2], depth=None)
+    some = from_depth(views, frame=FRAME, seed=0, most=400)
+    assert 200 < len(some) <= 400
+    missed = 0
+    for place, color in zip(some.values[:, :3], some.values[:, 11:14], strict=True):
+        rgb = (0.5 + 0.28209479177387814 * color) * 255
+        matches = False
+        for view, depth, usable in ((views[0], first, mask), (views[1], second, second > 0)):
+            point = view.cam_from_local[:3, :3] @ place + view.cam_from_local[:3, 3]
+            x, y = (view.K @ point)[:2] / point[2] - 0.5
+            row, column = round(y), round(x)
+            if 0 <= row < 36 and 0 <= column < 48 and usable[row, column]:
+                same = np.abs(view.rgb[row, column] - rgb).max() < 1
+                centred = abs(x - column) < 1e-3 and abs(y - row) < 1e-3
+                matches |= same and centred and abs(depth[row, column] - point[2]) < 1e-4
+        missed += not matches
+    assert missed == 0
+
+
+def test_pixels_are_picked_by_the_seed_and_each_at_most_once():
+    views = photographs(walk(2), depth=True)
+    one, same, other = (
+        from_depth(views, frame=FRAME, seed=seed, most=300).values for seed in (0, 0, 1)
+    )
+    np.testing.assert_array_equal(one, same)
+    assert len(np.unique(one[:, :3], axis=0)) == len(one) == 300
+    assert (one[:, :3] != other[:, :3]).any()

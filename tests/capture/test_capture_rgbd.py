@@ -17,8 +17,8 @@ from rgbd_walk import write_tum as write_tum_walk
 from gvtools.cameras import invert_rigid
 from gvtools.capture.rgbd_project import capture_rgbd
 from gvtools.errors import ProjectError
+from gvtools.poses.motions import residual
 from gvtools.poses.odometry import RgbdFrames, compare, start_from_features
-from gvtools.poses.pose_graph import residual
 from gvtools.scenes.project import open_project
 from gvtools.scenes.rgbd import RgbdOptions, count_unposed, read_unposed, rgbd_scene
 from pipelines.cli import main

@@ -7,10 +7,31 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scenes_workspace import workspace
+from tiny_scan import write_scan
 
 from gvtools.cameras import Cameras
-from gvtools.depth.source import LEAST, RecordedDepth, contradicted
-from gvtools.scenes.scene import Frame, Scene, View
+from gvtools.depth import choice, colmap_patch_match
+from gvtools.depth.choice import choose_source, rough_source
+from gvtools.depth.colmap_patch_match import ColmapPatchMatch
+from gvtools.depth.options import StereoOptions
+from gvtools.depth.source import (
+    LEAST,
+    DepthMap,
+    MixedDepth,
+    RecordedDepth,
+    contradicted,
+    disagrees,
+    is_recorded,
+    scale_to_points,
+)
+from gvtools.depth.stereo.plane_sweep import PlaneSweepStereo
+from gvtools.errors import CheckpointError, DegenerateError, OptionError, ProjectError
+from gvtools.scenes.colmap import read_colmap
+from gvtools.scenes.images import write_depth_map
+from gvtools.scenes.rgbd import SEVENSCENES
+from gvtools.scenes.scene import Frame, Scene, SparsePoints, View
+from pipelines.cli import main
 
 HEIGHT, WIDTH, FAR = 40, 60, 3.0
 K = np.array([[50.0, 0, 30], [0, 50, 20], [0, 0, 1]])
@@ -134,3 +155,244 @@ def test_recorded_depth_is_dropped_counted_and_not_trusted():
     assert checked.contradicted == (with_blob() < FAR).sum()
     np.testing.assert_array_equal(checked.depth, np.where(with_blob() < FAR, 0, wall()))
     np.testing.assert_array_equal(first.load().depth, with_blob())
+
+
+pytestmark = pytest.mark.usefixtures("unpainted")
+
+
+class Computed:
+    """A source that always has 2."""
+
+    name = "computed"
+
+    def covers(self, view: View) -> bool:
+        return True
+
+    def depth(self, scene: Scene, view: View, frame: Frame) -> DepthMap:
+        depth = np.full(frame.rgb.shape[:2], 2, np.float32)
+        return DepthMap(depth, np.ones_like(depth), self.name)
+
+
+@pytest.fixture
+def scan(tmp_path) -> Scene:
+    return SEVENSCENES.read(write_scan(tmp_path / "scan"))
+
+
+def without_depth(scene: Scene, *rows: int) -> Scene:
+    """The scene with some views' depth taken away."""
+
+    def bare(view: View) -> View:
+        return replace(view, load=lambda: replace(view.load(), depth=None), has_depth=False)
+
+    views = tuple(bare(view) if i in rows else view for i, view in enumerate(scene.views))
+    return replace(scene, views=views)
+
+
+def _with_points(scene: Scene) -> Scene:
+    none = np.zeros(0, np.int32)
+    points = SparsePoints(
+        np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0, np.float32), none, none,
+        np.zeros((0, 2)),
+    )  # fmt: skip
+    return replace(scene, points=points)
+
+
+def test_auto_takes_recorded_depth_where_all_have_it(scan):
+    chosen = choose_source(scan, scan.names, "auto")
+    assert isinstance(chosen.source, RecordedDepth)
+    assert "every context view" in chosen.reason
+
+
+def test_auto_mixes_view_by_view(scan, monkeypatch):
+    monkeypatch.setattr(choice, "_stereo", lambda *_: Computed())
+    partly = without_depth(scan, 1, 3)
+    chosen = choose_source(partly, partly.names, "auto")
+    assert isinstance(chosen.source, MixedDepth)
+    assert chosen.reason.startswith("4 of 6 views have recorded depth")
+    for i, view in enumerate(partly):
+        found = chosen.source.depth(partly, view, view.load())
+        assert found.source == ("computed" if i in (1, 3) else "recorded")
+        assert chosen.source.covers(view)
+
+
+def test_auto_computes_where_there_is_none(scan, monkeypatch):
+    monkeypatch.setattr(choice, "_stereo", lambda *_: Computed())
+    bare = without_depth(scan, *range(6))
+    chosen = choose_source(bare, bare.names, "auto")
+    assert chosen.source.name == "computed"
+    assert "plane-sweep" in chosen.reason
+
+
+def test_settings_that_a_source_ignores_are_said(scan, tmp_path, capsys):
+    bare = without_depth(scan, *range(6))
+    given = StereoOptions(window=5, planes=64)
+    assert set(choose_source(scan, scan.names, "auto", stereo=given).ignored) == {
+        "stereo.window=5",
+        "stereo.planes=64",
+    }
+    assert not choose_source(scan, scan.names, "auto", stereo=StereoOptions()).ignored
+    assert not choose_source(bare, bare.names[:2], "auto", stereo=given).ignored
+    words = [
+        "reconstruct",
+        str(scan.root),
+        "--refine",
+        "0",
+        "--out",
+        str(tmp_path / "run"),
+        "--dry-run",
+    ]
+    words += ["--context", "first:2", "--targets", "range:3-4"]
+    assert main([*words, "--set", "stereo.window=5"]) == 0
+    assert capsys.readouterr().err.splitlines() == [
+        "warning: stereo.window=5 changes nothing: no plane sweep computes depth here, but recorded"
+    ]
+    assert main(words) == 0
+    assert not capsys.readouterr().err
+
+
+def test_what_is_recorded_is_told_from_what_is_computed(scan):
+    partly = without_depth(scan, 1)
+    mixed = MixedDepth(RecordedDepth(), Computed())
+    assert [is_recorded(mixed, view) for view in partly][:3] == [True, False, True]
+    assert not is_recorded(RecordedDepth(), partly.views[1])
+    # Asked to compute, a source does not read what lies there.
+    assert not is_recorded(Computed(), scan.views[0])
+
+
+def test_a_rough_source_is_a_small_sweep_without_posing(scan, tmp_path):
+    bare = without_depth(scan, *range(1, 6))
+    given = StereoOptions(window=5, align=True)
+    chosen = choose_source(bare, bare.names, "auto", stereo=given)
+    rough = rough_source(bare, chosen.source)
+    assert isinstance(rough, PlaneSweepStereo)
+    assert (rough.options.window, rough.options.align) == (5, False)
+    assert rough.options.max_side <= 160
+    assert rough.views == bare.names
+    patch_match = rough_source(bare, ColmapPatchMatch(_with_points(bare), bare.names))
+    assert isinstance(patch_match, PlaneSweepStereo)
+    assert patch_match.views == bare.names
+    recorded = RecordedDepth()
+    assert rough_source(scan, recorded) is recorded
+
+
+def test_patch_match_comes_first_where_there_is_cuda(tmp_path, monkeypatch):
+    workspace(tmp_path)
+    scene = read_colmap(tmp_path)
+    monkeypatch.setattr(choice, "has_patch_match", lambda: True)
+    for asked in ("auto", "colmap"):
+        assert isinstance(choose_source(scene, scene.names, asked).source, ColmapPatchMatch)
+    # Without sparse points, it could not run.
+    monkeypatch.setattr(choice, "_stereo", lambda *_: Computed())
+    bare = replace(scene, points=None)
+    assert choose_source(bare, bare.names, "auto").source.name == "computed"
+
+
+def test_a_single_view_leaves_nothing_to_compute_from(scan):
+    bare = without_depth(scan, *range(6))
+    with pytest.raises(ProjectError, match="at least 2 views"):
+        choose_source(bare, bare.names[:1], "auto")
+    with pytest.raises(ProjectError, match="at least 2"):
+        choose_source(bare, bare.names[:1], "plane-sweep")
+
+
+def test_what_a_project_cannot_give_is_refused(scan, tmp_path):
+    with pytest.raises(OptionError, match="rgbd"):
+        choose_source(scan, scan.names, "colmap")
+    with pytest.raises(OptionError, match="plane-sweep"):
+        choose_source(scan, scan.names, "guess")
+    with pytest.raises(CheckpointError, match="needs weights"):
+        choose_source(scan, scan.names, "da3")
+    bare = without_depth(scan, *range(6))
+    with pytest.raises(ProjectError, match="add depth maps"):
+        choose_source(bare, bare.names, "sensor")
+    workspace(tmp_path / "colmap")
+    scene = read_colmap(tmp_path / "colmap")
+    with pytest.raises(OptionError, match="colmap project"):
+        choose_source(scene, scene.names, "sensor")
+    with pytest.raises(ProjectError, match=r"no CUDA.*patch_match_stereo"):
+        choose_source(scene, scene.names, "colmap")
+
+
+def test_patch_match_gets_a_workspace_of_the_given_views_alone(tmp_path, monkeypatch):
+    """The workspace is a real one, that pycolmap reads; its maps come back as depth."""
+    import pycolmap
+
+    workspace(tmp_path / "project")
+    scene = read_colmap(tmp_path / "project")
+    given = scene.names[:3]
+    seen: list[Path] = []
+
+    def fake(folder, **_):
+        folder = Path(folder)
+        seen.append(folder)
+        model = pycolmap.Reconstruction(folder / "sparse")
+        assert {image.name for image in model.images.values()} == set(given)
+        assert scene.points is not None
+        assert len(model.points3D) == len(scene.points.positions)
+        assert model.compute_mean_reprojection_error() < 0.5
+        assert all(len(point.track.elements) == 3 for point in model.points3D.values())
+        lines = (folder / "stereo" / "patch-match.cfg").read_text().split("\n")
+        assert lines[:2] == [given[0], "__auto__, 20"]
+        assert sorted(p.name for p in (folder / "images").rglob("*.*")) == sorted(
+            Path(name).name for name in given
+        )
+        for view in scene.views[:2]:
+            size = int(view.camera.height[0]), int(view.camera.width[0])
+            write_depth_map(
+                folder / "stereo/depth_maps" / f"{view.name}.geometric.bin", np.full(size, 3.0)
+            )
+
+    monkeypatch.setattr(pycolmap, "patch_match_stereo", fake)
+    source = ColmapPatchMatch(scene, given)
+    view = scene.views[0]
+    for _ in range(2):
+        found = source.depth(scene, view, view.load())
+    assert len(seen) == 1
+    assert not seen[0].exists()
+    assert (found.depth == 3).all()
+    assert found.source == "colmap-patch-match"
+    assert not source.covers(scene.views[3])
+    with pytest.raises(DegenerateError, match="gave no depth"):
+        source.depth(scene, scene.views[2], scene.views[2].load())
+
+
+def test_patch_match_that_fails_is_said(tmp_path, monkeypatch):
+    import pycolmap
+
+    def fails(*_, **__):
+        raise RuntimeError("out of memory")
+
+    workspace(tmp_path / "project")
+    scene = read_colmap(tmp_path / "project")
+    monkeypatch.setattr(pycolmap, "patch_match_stereo", fails)
+    with pytest.raises(ProjectError, match="out of memory"):
+        ColmapPatchMatch(scene, scene.names).depth(scene, scene.views[0], scene.views[0].load())
+    with pytest.raises(ProjectError, match="sparse points"):
+        ColmapPatchMatch(replace(scene, points=None), scene.names)
+    assert colmap_patch_match.has_patch_match() in (True, False)
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.3])
+def test_the_scale_of_depth_is_that_of_the_sparse_points(scan, factor):
+    view = scan.views[0]
+    frame = view.load()
+    assert frame.depth is not None
+    rng = np.random.default_rng(0)
+    xy = np.stack([rng.uniform(1, 95, 60), rng.uniform(1, 71, 60)], axis=1)
+    z = frame.depth[xy[:, 1].astype(int), xy[:, 0].astype(int)].astype(float)
+    rays = np.column_stack([xy, np.ones(60)]) @ np.linalg.inv(view.camera.K[0]).T
+    world = np.column_stack([rays * z[:, None], np.ones(60)]) @ view.camera.world_from_cam[0].T
+    points = SparsePoints(
+        world[:, :3], np.zeros((60, 3), np.uint8), np.zeros(60, np.float32),
+        np.arange(60, dtype=np.int32), np.zeros(60, np.int32), xy,
+    )  # fmt: skip
+    scene = replace(scan, points=points)
+    fit = scale_to_points(scene, view.name, frame.depth / np.float32(factor))
+    assert fit is not None
+    assert fit.scale == pytest.approx(factor, rel=1e-3)
+    assert disagrees(fit) == (factor != 1)
+    few = scale_to_points(scene, scan.names[1], frame.depth)
+    assert few is not None
+    assert not few.ok
+    assert not disagrees(few)
+    assert scale_to_points(scan, view.name, frame.depth) is None

@@ -1,14 +1,24 @@
+"""Voxels as wide as the footprints of what they hold."""
+
 from __future__ import annotations
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from memory_scenes import camera, points
+from memory_scenes import camera, plane_view, points, random_memory, saved_bytes
 from reference_fusion import ReferenceMemory, chains_of
 
 from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory
-from gvtools.memory.store.voxel_index import EMPTY_KEY, MAX_VOXEL, group_by_block, voxel_keys
+from gvtools.memory.store.voxel_index import (
+    EMPTY_KEY,
+    MAX_VOXEL,
+    VoxelLevels,
+    group_by_block,
+    voxel_keys,
+)
+from gvtools.memory.thinning import thinned
+from viz.viewer.colors import view_counts
 
 ONE_EDGE = MemoryOptions(voxels_per_footprint=0.0)
 
@@ -165,3 +175,187 @@ def test_grouping_is_a_stable_sort_by_first_appearance():
     for rank, block in enumerate(first):
         rows = order[starts[rank] : starts[rank + 1]]
         np.testing.assert_array_equal(rows, np.flatnonzero(blocks == block))
+
+
+PLACE = (0.3, 0.3, 10.3)
+
+
+@pytest.mark.parametrize("world", [1.0, 0.1, 1 / 3, 7.0, 1e-6, 1e6])
+def test_levels_double_with_the_footprint_in_any_unit(world):
+    """Whole ratios of depths belong to one level, however the world is scaled."""
+    levels = VoxelLevels(0.01 * world, 1.0)
+    shares = np.array([0.1, 1, 1.9, 2, 3.9, 4, 8, 127, 128, 1e9, 1e30])
+    spacing = (shares * 0.01 * world).astype(np.float32)
+    assert levels.of(spacing).tolist() == [0, 0, 0, 1, 1, 2, 3, 6, 7, 7, 7]
+    assert not VoxelLevels(0.01 * world).of(spacing).any()
+    twice = VoxelLevels(0.01 * world, 2.0)
+    assert twice.of(spacing).tolist() == [0, 1, 1, 2, 2, 3, 4, 7, 7, 7, 7]
+
+
+def _walls(options: MemoryOptions) -> SpatialMemory:
+    """A wall at 1 and one at 8, seen by cameras a little apart."""
+    depth = np.full((48, 64), 8.0, np.float32)
+    depth[:, :32] = 1.0
+    memory = SpatialMemory(1 / 60, options=options)
+    for number, x in enumerate(np.linspace(-0.1, 0.1, 6)):
+        source = camera(width=64, height=48, focal=60, center=(x, 0.3 * x, 0), name=f"v{number}")
+        memory.fuse(plane_view(source, depth, color=(200, 90, 30)), round=0)
+    return memory
+
+
+def test_a_far_wall_is_kept_once_and_seen_whole():
+    one, levels = _walls(ONE_EDGE), _walls(MemoryOptions())
+    far = [memory.columns.positions[:, 2] > 4 for memory in (one, levels)]
+    assert far[1].sum() < far[0].sum() / 3
+    assert set(levels.columns.level[: len(levels)][far[1]].tolist()) == {3}
+    near = [m.columns.positions[~mask] for m, mask in zip((one, levels), far, strict=True)]
+    np.testing.assert_array_equal(near[0], near[1])
+    for view in (one, levels):
+        seen = view.project(camera(width=64, height=48, focal=60))
+        assert seen.valid[0, 2:-2, 40:-3].all()
+        np.testing.assert_allclose(seen.depth[0, 2:-2, 40:-3], 8.0, rtol=1e-5)
+        assert np.abs(seen.rgb[0, 2:-2, 40:-3] * 255 - (200, 90, 30)).max() < 0.6
+
+
+def test_a_coarser_look_leaves_what_was_seen_finely_as_it_is():
+    memory = SpatialMemory(0.1)
+    memory.fuse(points([PLACE], spacing=0.1, source=camera(name="near")), round=0)
+    aside = (PLACE[0] + 0.4, *PLACE[1:])
+    far = points([aside], spacing=0.9, colors=(0, 0, 255), source=camera(name="far"))
+    assert memory.fuse(far, round=0).added == 1
+    records = memory.columns
+    np.testing.assert_allclose(memory.positions[0], PLACE, rtol=1e-6)
+    assert records.colors[0].tolist() == [128, 128, 128]
+    np.testing.assert_allclose(records.spacing[:2], (0.1, 0.9), rtol=1e-6)
+    assert memory.confidence.tolist() == [1.0, 1.0] and records.level[:2].tolist() == [0, 3]
+
+
+def test_a_finer_look_stands_on_its_own():
+    memory = SpatialMemory(0.1)
+    memory.fuse(points([PLACE], spacing=0.9, source=camera(name="far")), round=0)
+    assert memory.fuse(points([PLACE], spacing=0.1), round=0).added == 1
+    assert memory.columns.level[:2].tolist() == [3, 0] and memory.voxels == 2
+
+
+@pytest.mark.parametrize(("known", "made"), [(0.1, 0.9), (0.9, 0.1), (0.9, 0.3), (0.3, 0.9)])
+def test_observed_content_of_any_level_shuts_generated_content_out(known, made):
+    memory = SpatialMemory(0.1)
+    memory.fuse(points([PLACE], spacing=known), round=0)
+    aside = camera(center=(4, 0, 0), name="aside")
+    report = memory.fuse(points([PLACE], spacing=made, source=aside), round=1, generated=True)
+    assert (report.rejected_observed, report.added) == (1, 0)
+    # Generated content shuts nothing out, and observed content passes it by.
+    other = SpatialMemory(0.1)
+    other.fuse(points([PLACE], spacing=made), round=0, generated=True)
+    assert other.fuse(points([PLACE], spacing=known), round=0).added == 1
+
+
+def test_generated_content_does_not_get_there_by_merging_or_rounding():
+    memory = SpatialMemory(1.0)
+    memory.fuse(points([(1.5, 0.5, 0.5)], spacing=1.0, source=camera(center=(0, 0, -9))), round=0)
+    for number, x in enumerate((0.5, 2.5)):
+        made = points([(x, 0.5, 0.5)], spacing=4.0, source=camera(center=(0, 0, -9), name=f"{x}"))
+        assert memory.fuse(made, round=1, generated=True).merged == number
+    assert memory.columns.positions[:2, 0].tolist() == [1.5, 0.5] and memory.confidence[1] == 2
+    # The mean of both rounds into the observed voxel.
+    rounds = points([(1 - 2.0**-24, 4.5, 0.5), (1.0, 4.5, 0.5)], spacing=4.0)
+    memory = SpatialMemory(1.0)
+    memory.fuse(points([(1.5, 4.5, 0.5)], spacing=1.0), round=0)
+    assert memory.fuse(rounds, round=1, generated=True).rejected_observed == 2
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_no_generated_observation_lies_where_something_was_observed(seed):
+    rng = np.random.default_rng(seed)
+    memory = SpatialMemory(0.25)
+    for view in range(24):
+        where = rng.uniform((-2, -2, 3), (2, 2, 5), (150, 3))
+        source = camera(center=rng.normal(0, 0.3, 3), name=f"{view}")
+        spacing = rng.uniform(0.1, 3 if view >= 6 else 0.6, 150)
+        fresh = points(where, spacing=spacing, source=source)
+        memory.fuse(fresh, round=view // 6, generated=view >= 6)
+    count = len(memory)
+    level = memory.columns.level[:count].astype(int)
+    cell = np.floor(memory.columns.positions.astype(float) * 4.0).astype(int)
+    made = memory.generated
+    assert made.sum() > 100
+    for height in range(8):
+        seen = {tuple(row) for row in cell[~made & (level == height)] >> height}
+        assert not seen & {tuple(row) for row in cell[made] >> height}
+
+
+def test_pictures_of_a_memory_are_those_of_its_file(tmp_path):
+    """Also of observations that merging has moved and widened since their run was boxed."""
+    memory = SpatialMemory(0.5)
+    source = camera(name="a")
+    for view in range(40):
+        rng = np.random.default_rng(view % 20)
+        where = rng.uniform((-3, -3, 4), (3, 3, 30), (60, 3))
+        spacing = 0.5 + 0.4 * (view >= 20)
+        fresh = points(where, spacing=spacing, source=camera(center=(0.001 * view, 0, 0),
+                       name=f"{view}"))  # fmt: skip
+        memory.fuse(fresh, round=0)
+    memory.save(tmp_path / "memory.npz")
+    loaded = SpatialMemory.load(tmp_path / "memory.npz")
+    live, stored = (m.segments.group_box[: m.segments.groups] for m in (memory, loaded))
+    np.testing.assert_array_equal(live, stored)
+    one, two = memory.project(source), loaded.project(source)
+    np.testing.assert_array_equal(one.rgb, two.rgb)
+
+
+def test_a_view_in_parts_is_the_view():
+    rng = np.random.default_rng(3)
+    where = rng.uniform((-1, -1, 2), (1, 1, 3), (400, 3))
+    # Each place was seen at one footprint, as by a camera.
+    spacing = 0.05 + 0.4 * (where[:, 0] + 1)
+    whole, parts = SpatialMemory(0.1), SpatialMemory(0.1)
+    for memory in (whole, parts):
+        memory.fuse(points(where, spacing=0.2, source=camera(name="first")), round=0)
+    second = camera(center=(0.01, 0, 0), name="second")
+    # Each half's voxels are its own: averages within a voxel are of one fusion.
+    level = whole.levels.of(spacing.astype(np.float32))
+    cell = np.floor(where * (10.0 / 2.0**level)[:, None])
+    _, number = np.unique(np.column_stack([level, cell]), axis=0, return_inverse=True)
+    half = number.ravel() % 2 == 0
+    whole.fuse(points(where, spacing=spacing, source=second), round=0)
+    for rows in (half, ~half):
+        parts.fuse(points(where[rows], spacing=spacing[rows], source=second), round=0)
+    assert len(np.unique(whole.columns.level[: len(whole)])) == 4
+    order = [np.lexsort(memory.columns.positions.T) for memory in (whole, parts)]
+    for name in ("positions", "colors", "confidence", "spacing", "level"):
+        one, two = (
+            getattr(memory.columns, name)[: len(memory)][rows]
+            for memory, rows in zip((whole, parts), order, strict=True)
+        )
+        np.testing.assert_array_equal(one, two, err_msg=name)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_forgetting_and_loading_bring_every_level_back(seed, tmp_path):
+    memory = random_memory(seed, voxel=0.04)
+    assert memory.columns.level[: len(memory)].max() >= 2
+    before = saved_bytes(memory, tmp_path)
+    last = memory.rounds[-1]
+    rng = np.random.default_rng(seed)
+    fresh = points(rng.uniform((-2, -1.5, 1), (2, 1.5, 5), (200, 3)) + memory.origin,
+                   origin=memory.origin, spacing=rng.uniform(0.02, 0.4, 200))  # fmt: skip
+    loaded = SpatialMemory.load(tmp_path / "saved.npz")
+    reports = [one.fuse(fresh, round=last + 1) for one in (memory, loaded)]
+    assert reports[0] == reports[1] and reports[0].added
+    assert saved_bytes(memory, tmp_path) == saved_bytes(loaded, tmp_path)
+    memory.forget(round=last + 1)
+    assert saved_bytes(memory, tmp_path) == before
+    memory.fuse(fresh, round=last + 1)
+    assert saved_bytes(memory, tmp_path) == saved_bytes(loaded, tmp_path)
+
+
+def test_a_voxel_of_any_level_is_one_point_and_one_place():
+    memory = SpatialMemory(0.1)
+    for x, name in ((0, "a"), (3, "b"), (6, "c")):
+        # Apart by more than an edge, within one voxel of level 3; a fine one lies inside it.
+        where = np.array([(0.1 + 0.2 * x / 6, 0.1, 10.1), (0.05, 0.05, 9.65)])
+        source = camera(center=(x, 0, 0), name=name)
+        memory.fuse(points(where, spacing=(0.9, 0.1), source=source), round=0)
+    assert len(memory) == 6 and memory.voxels == 2
+    assert len(thinned(memory, None).rows) == 2
+    assert view_counts(memory).tolist() == [3] * 6

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numba
 import numpy as np
 import pytest
+import torch
 from memory_scenes import camera, plane_view, points, random_camera, random_memory
 from reference_splat import IMAGES, OTHERS, assert_same, reference_project
 
@@ -13,13 +14,21 @@ from gvtools.errors import OptionError, ShapeError
 from gvtools.guidance import Guidance
 from gvtools.memory.projection import project
 from gvtools.memory.spatial_memory import SpatialMemory
+from gvtools.memory.splat import torch_splatter as splat_torch
 from gvtools.memory.splat.api import SplatOptions
+from gvtools.memory.splat.one_pixel import NearestImage, project_nearest, project_open3d
+from gvtools.memory.splat.torch_splatter import torch_device
 
 
+@pytest.mark.parametrize(
+    ("backend", "device"),
+    [("cpu", "cpu"), ("torch", "cpu"), pytest.param("torch", "cuda", marks=pytest.mark.gpu)],
+)
 @pytest.mark.parametrize("options", OTHERS)
 @pytest.mark.parametrize("seed", range(8))
-def test_random_memories_look_as_the_reference_says(seed, options):
+def test_random_memories_look_as_the_reference_says(seed, options, backend, device):
     memory = random_memory(seed)
+    options = options.replaced(backend=backend, device=device)
     target = random_camera(np.random.default_rng(100 + seed), spread=0.5)
     assert_same(
         project(memory, target, options=options), reference_project(memory, target, options)
@@ -306,3 +315,169 @@ def test_one_pixel_back_ends_show_the_nearest_observation(backend):
         np.testing.assert_allclose(seen.rgb[0, r, c] * 255, memory.columns.colors[i], atol=1e-3)
         assert seen.confidence[0, r, c] == memory.confidence[i]
         assert seen.generated[0, r, c] == memory.generated[i]
+
+
+DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
+
+
+def project_torch(memory, cameras, *, options=None, device="auto"):
+    options = (options or SplatOptions()).replaced(backend="torch", device=device)
+    return project(memory, cameras, options=options)
+
+
+def _target(seed: int):
+    return random_camera(np.random.default_rng(100 + seed), spread=0.5)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("seed", range(4, 8))
+def test_a_larger_image_equals_the_compiled_back_end(seed, device):
+    memory = random_memory(seed, most=300)
+    cameras = concatenate([_target(seed).resized(160, 120), _target(seed + 1).resized(160, 120)])
+    ours = project_torch(memory, cameras, device=device)
+    assert ours.coverage > 0.1
+    assert_same(ours, project(memory, cameras))
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_the_same_projection_twice_gives_the_same_bytes(device):
+    memory = random_memory(5, most=300)
+    target = _target(5).resized(160, 120)
+    one, two = (project_torch(memory, target, device=device) for _ in range(2))
+    for name in IMAGES:
+        np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
+
+
+def test_cutting_the_work_into_parts_changes_nothing_but_rounding(monkeypatch):
+    memory = random_memory(6)
+    whole = project_torch(memory, _target(6), device="cpu")
+    monkeypatch.setitem(splat_torch.PAIRS, "cpu", 100)
+    parts = project_torch(memory, _target(6), device="cpu")
+    assert whole.coverage > 0.3
+    for name in IMAGES:
+        np.testing.assert_allclose(
+            getattr(parts, name).astype(float), getattr(whole, name).astype(float), atol=1e-5
+        )
+
+
+def test_cuda_is_refused_where_there_is_none(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(OptionError, match="no CUDA device"):
+        project_torch(random_memory(1), _target(1), device="cuda")
+    assert torch_device("auto").type == "cpu"
+    assert torch_device("cpu").type == "cpu"
+
+
+def _turned(seed: int, *, width=160, height=120):
+    rng = np.random.default_rng(seed)
+    return camera(
+        width=width, height=height, focal=130, rotation=rng.normal(0, 0.2, 3),
+        center=rng.normal(0, 0.3, 3),
+    )  # fmt: skip
+
+
+def _cloud(seed: int, count: int) -> np.ndarray:
+    """Around the camera, before and behind it."""
+    rng = np.random.default_rng(seed)
+    return rng.uniform((-3, -3, -1), (3, 3, 6), (count, 3)).astype(np.float32)
+
+
+def _brute(positions, target, depth_max=np.inf):
+    """Nearest point of each pixel in float64, one after the other."""
+    xy, z = target.project(positions)
+    depth = np.zeros((int(target.height[0]), int(target.width[0])))
+    index = np.full(depth.shape, -1)
+    for i in np.flatnonzero((z[0] > 0) & (z[0] <= depth_max)):
+        column, row = np.floor(xy[0, i]).astype(int)
+        if not (0 <= row < depth.shape[0] and 0 <= column < depth.shape[1]):
+            continue
+        if index[row, column] < 0 or z[0, i] < depth[row, column]:
+            depth[row, column], index[row, column] = z[0, i], i
+    return depth, index
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_every_pixel_holds_its_nearest_point(seed):
+    cloud, target = _cloud(seed, 20_000), _turned(seed)
+    image = project_nearest(cloud, target)
+    depth, index = _brute(cloud.astype(float), target)
+    same = image.index == index
+    assert (~same).sum() <= 4  # points whose float32 coordinates round over a pixel's border
+    np.testing.assert_allclose(image.depth[same], depth[same], rtol=1e-5)
+    assert (index >= 0).mean() > 0.1
+    assert image.index.dtype == np.int32
+    assert (image.depth[image.index < 0] == 0).all()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_open3d_finds_the_same_depth_and_winner(seed):
+    """Where the two differ, a point lies on a pixel's border, or depths tie, but for rounding."""
+    cloud, target = _cloud(seed, 200_000), _turned(seed)
+    image = project_nearest(cloud, target)
+    number = np.arange(len(cloud))
+    tags = np.stack([number // 65536, number % 65536, 0 * number], 1).astype(np.float32)
+    depth, found = project_open3d(cloud, tags, target)
+    winner = np.where(depth > 0, found[..., 0] * 65536 + found[..., 1], -1).astype(int)
+    differ = winner != image.index
+    assert (image.index >= 0).mean() > 0.5
+    assert differ.sum() <= 1e-3 * differ.size
+    np.testing.assert_allclose(image.depth[~differ], depth[~differ], rtol=1e-6)
+    xy, z = target.project(cloud.astype(float))
+    from_border = abs(xy[0] - np.round(xy[0])).min(axis=1)
+    for one, two in zip(winner[differ], image.index[differ], strict=True):
+        tie = min(one, two) >= 0 and abs(z[0, one] / z[0, two] - 1) < 1e-6
+        assert tie or min(from_border[i] for i in (one, two) if i >= 0) < 1e-3
+
+
+def test_the_number_of_threads_changes_no_nearest_image():
+    cloud, target = _cloud(9, 50_000), _turned(9)
+    threads = numba.get_num_threads()
+    try:
+        numba.set_num_threads(1)
+        one = project_nearest(cloud, target)
+    finally:
+        numba.set_num_threads(threads)
+    many = project_nearest(cloud, target)
+    np.testing.assert_array_equal(one.index, many.index)
+    np.testing.assert_array_equal(one.depth, many.depth)
+
+
+def test_what_is_beyond_the_farthest_depth_is_left_out():
+    cloud, target = _cloud(5, 20_000), _turned(5)
+    image = project_nearest(cloud, target, depth_max=2.5)
+    _, index = _brute(cloud.astype(float), target, depth_max=2.5)
+    assert (image.index != index).sum() <= 4
+    assert 0 < image.depth.max() <= 2.5
+
+
+@pytest.mark.parametrize(
+    "where", [np.zeros((0, 3)), np.array([(0, 0, -1.0)]), np.zeros((3, 3)), np.array([(1e9, 0, 1)])]
+)
+def test_nothing_in_view_gives_an_empty_image(where):
+    image = project_nearest(where.astype(np.float32), camera())
+    assert isinstance(image, NearestImage)
+    assert (image.index == -1).all()
+    assert (image.depth == 0).all()
+
+
+def test_skew_is_honoured_here_and_refused_for_open3d():
+    cloud = np.array([(0, 0.5, 2)], np.float32)
+    target = camera(skew=8.0)
+    image = project_nearest(cloud, target)
+    (xy,), _ = target.project(cloud)
+    assert image.index[tuple(np.floor(xy[0, ::-1]).astype(int))] == 0
+    with pytest.raises(OptionError, match="ignores skew and K has 8 px"):
+        project_open3d(cloud, cloud, target)
+
+
+def test_the_winners_colours_come_along():
+    rng = np.random.default_rng(5)
+    cloud = rng.uniform((-1, -1, 1), (1, 1, 3), (500, 3)).astype(np.float32)
+    colors = rng.integers(1, 255, (500, 3)).astype(np.uint8)
+    image = project_nearest(cloud, camera(), colors=colors)
+    seen = image.index >= 0
+    assert seen.any()
+    assert not seen.all()
+    assert image.colors is not None
+    np.testing.assert_array_equal(image.colors[seen], colors[image.index[seen]])
+    assert not image.colors[~seen].any()

@@ -13,7 +13,7 @@ from typing import Any
 import numba
 import numpy as np
 from numba import prange
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
 from gvtools.errors import OptionError
@@ -128,25 +128,22 @@ def project_nearest(
     camera: Cameras,
     *,
     colors: NDArray[Any] | None = None,
-    origin: ArrayLike = (0.0, 0.0, 0.0),
     depth_min: float = 0.0,
     depth_max: float = np.inf,
 ) -> NearestImage:
     """Project points (N, 3), N < 2³¹, into one camera, one pixel each; the nearest depth wins.
 
-    Positions are relative to ``origin`` in the world frame. Points at ``depth_min`` and before it,
-    and beyond ``depth_max``, are left out. ``colors`` (N, 3) are looked up for the winners.
+    Points at ``depth_min`` and before it, and beyond ``depth_max``, are left out. ``colors`` (N, 3)
+    are looked up for the winners.
     """
     height, width = int(camera.height[0]), int(camera.width[0])
-    M = camera.cam_from_world[0].copy()
-    M[:3, 3] += M[:3, :3] @ np.asarray(origin, np.float64)
     K = camera.K[0]
     parts = min(numba.get_num_threads(), max(1, len(positions) // (4 * CHUNK)))
     buffers = np.empty((parts, height * width + 1), np.int64)
     single = np.float32
     # Integer pixel centres, as Open3D counts them: column = floor(u + 0.5).
     _fill_parallel(
-        np.ascontiguousarray(positions), parts, M.astype(np.float32),
+        np.ascontiguousarray(positions), parts, camera.cam_from_world[0].astype(np.float32),
         single(K[0, 0]), single(K[0, 1]), single(K[1, 1]), single(K[0, 2] - 0.5),
         single(K[1, 2] - 0.5), single(depth_min), single(depth_max), width, height, buffers,
     )  # fmt: skip
@@ -166,7 +163,6 @@ def project_open3d(
     colors: NDArray[np.float32],
     camera: Cameras,
     *,
-    origin: ArrayLike = (0.0, 0.0, 0.0),
     depth_max: float = FARTHEST,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """(depth, rgb) of the same through Open3D's ``project_to_rgbd_image``.
@@ -186,10 +182,9 @@ def project_open3d(
     cloud.point.colors = tensor(np.ascontiguousarray(colors, np.float32))
     K = camera.K[0].copy()
     K[:2, 2] -= 0.5
-    M = camera.cam_from_world[0].copy()
-    M[:3, 3] += M[:3, :3] @ np.asarray(origin, np.float64)
+    pose = camera.cam_from_world[0].copy()
     image = cloud.project_to_rgbd_image(
-        int(camera.width[0]), int(camera.height[0]), tensor(K), tensor(M), 1.0, depth_max
+        int(camera.width[0]), int(camera.height[0]), tensor(K), tensor(pose), 1.0, depth_max
     )
     depth = image.depth.as_tensor().numpy()[..., 0].copy()
     return depth, image.color.as_tensor().numpy().copy()
@@ -201,38 +196,34 @@ def project_one_pixel(store: Store, cameras: Cameras, *, open3d: bool = False) -
     ``open3d`` takes Open3D's projection instead of our own kernel.
     """
     shape = (len(cameras), int(cameras.height[0]), int(cameras.width[0]))
-    depth = np.zeros(shape, np.float32)
-    index = np.full(shape, -1, np.int32)
-    for i, camera in enumerate(cameras):
-        if len(store):
-            depth[i], index[i] = (_open3d if open3d else _nearest)(store, camera)
+    depth, index = np.zeros(shape, np.float32), np.full(shape, -1, np.int32)
+    for i, camera in enumerate(store.frame.seen_from(cameras)):
+        if len(store) and open3d:
+            depth[i], index[i] = _open3d(store, camera)
+        elif len(store):
+            # A point within the rounding of the camera's plane is neither before nor behind it.
+            image = project_nearest(
+                store.columns.positions, camera, depth_min=NEAREST * store.voxel
+            )
+            depth[i], index[i] = image.depth, image.index
     valid = index >= 0
-    rows = index[valid]
-    rgb = np.zeros((*shape, 3), np.float32)
-    rgb[valid] = store.columns.colors[rows] / np.float32(255)
-    confidence = np.zeros(shape, np.float32)
-    confidence[valid] = store.confidence[rows]
-    generated = np.zeros(shape, np.bool_)
-    generated[valid] = store.generated[rows]
-    scanned = np.zeros(shape, np.bool_)
-    scanned[valid] = store.scanned[rows]
-    return Guidance(cameras, rgb, depth, valid, confidence, generated, scanned)
 
+    def of_winners(values: NDArray[Any]) -> NDArray[Any]:
+        out = np.zeros((*shape, *values.shape[1:]), values.dtype)
+        out[valid] = values[index[valid]]
+        return out
 
-def _nearest(store: Store, camera: Cameras) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    # A point within the rounding of the camera's plane is neither before nor behind it.
-    image = project_nearest(
-        store.columns.positions, store.frame.seen_from(camera), depth_min=NEAREST * store.voxel
-    )
-    return image.depth, image.index
+    colors = of_winners(store.columns.colors)
+    return Guidance(
+        cameras, np.divide(colors, np.float32(255), dtype=np.float32), depth, valid,
+        of_winners(store.confidence), of_winners(store.generated), of_winners(store.scanned),
+    )  # fmt: skip
 
 
 def _open3d(store: Store, camera: Cameras) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     """The winners' numbers travel through Open3D as colours."""
     number = np.arange(len(store))
     tag = np.stack([number // _SPLIT, number % _SPLIT, np.zeros_like(number)], axis=1)
-    depth, tags = project_open3d(
-        store.columns.positions, tag.astype(np.float32), store.frame.seen_from(camera)
-    )
+    depth, tags = project_open3d(store.columns.positions, tag.astype(np.float32), camera)
     index = tags[..., 0].astype(np.int32) * _SPLIT + tags[..., 1].astype(np.int32)
     return depth, np.where(depth > 0, index, -1).astype(np.int32)

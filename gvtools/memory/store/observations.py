@@ -38,15 +38,15 @@ class ColumnArrays(NamedTuple):
     ``view`` is called ``view_row``: numba takes the other for numpy's method.
     """
 
-    positions: NDArray[np.float32]
+    positions: NDArray[np.float32]  # in the memory's frame
     colors: NDArray[np.uint8]
-    confidence: NDArray[np.float32]
-    spacing: NDArray[np.float32]
+    confidence: NDArray[np.float32]  # with what later rounds added
+    spacing: NDArray[np.float32]  # scene units
     round: NDArray[np.uint16]
-    view_row: NDArray[np.int32]
+    view_row: NDArray[np.int32]  # of the view table
     generated: NDArray[np.uint8]
     level: NDArray[np.uint8]
-    next: NDArray[np.int32]
+    next: NDArray[np.int32]  # observation of the same voxel, -1 at the end
 
 
 class SplatColumns(NamedTuple):
@@ -62,22 +62,9 @@ class Columns:
     """Observations as parallel Open3D tensors with spare capacity, on "cpu" or "cuda:0".
 
     The first ``count`` rows are in use. Attributes named as in LAYOUT give these rows, (N, 3) or
-    (N,); they share the tensors' memory as long as these are on the CPU. Lengths are in scene
-    units, ``positions`` in the memory's frame. ``confidence`` includes what later rounds added,
-    ``view`` is a row of the view table, ``next`` the next observation of the same voxel, -1 at the
-    end. Positions are contiguous rows of three: of strided ones Open3D's own projection would read
-    the wrong numbers.
+    (N,); they share the tensors' memory as long as these are on the CPU. Positions are contiguous
+    rows of three: of strided ones Open3D's own projection would read the wrong numbers.
     """
-
-    positions: NDArray[np.float32]
-    colors: NDArray[np.uint8]
-    confidence: NDArray[np.float32]
-    spacing: NDArray[np.float32]
-    round: NDArray[np.uint16]
-    view: NDArray[np.int32]
-    generated: NDArray[np.uint8]
-    level: NDArray[np.uint8]
-    next: NDArray[np.int32]
 
     def __init__(self, device: str = "cpu") -> None:
         import open3d as o3d

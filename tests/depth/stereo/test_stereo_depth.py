@@ -2,18 +2,32 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from stereo_scenes import plane_scene
+import torch
+from scipy import ndimage
+from stereo_scenes import niche_depth, niche_scene, plane_scene, turning_scene
 
 from gvtools.depth.options import StereoOptions
 from gvtools.depth.source import DepthMap
-from gvtools.depth.stereo.filtering import enlarged, weighted_median, without_speckles
+from gvtools.depth.stereo.filtering import (
+    ALIKE,
+    ROUNDS,
+    enlarged,
+    regrown,
+    trimmed,
+    weighted_median,
+    without_speckles,
+)
+from gvtools.depth.stereo.geometry import DepthRange, baselines
+from gvtools.depth.stereo.matching import CLEAR, detail_of, noise_of, textured
 from gvtools.depth.stereo.plane_sweep import PlaneSweepStereo
+from gvtools.depth.stereo.single_view import enough_disparity
 from gvtools.errors import DegenerateError, OptionError, ProjectError
-from gvtools.scenes.scene import Frame, Scene
+from gvtools.scenes.scene import Frame, Scene, View
 
 OPTIONS = StereoOptions(levels=2, align=False, speckle=20)
 
@@ -173,3 +187,208 @@ def test_a_view_that_shares_nothing_is_refused_and_stops_no_other(slanted):
     assert (found.depth > 0).mean() > 0.5
     with pytest.raises(DegenerateError, match="shows what v4 does"):
         stereo.depth(scene, lost, lost.load())
+
+
+ROOF, SKY = 60, 230
+
+
+def roof(rim: int) -> tuple[np.ndarray, np.ndarray]:
+    """A dark roof under a bright sky; depth reaches ``rim`` pixels past the outline."""
+    rgb = np.full((60, 60, 3), SKY, np.uint8)
+    rgb[30:] = ROOF
+    depth = np.zeros((60, 60), np.float32)
+    depth[30 - rim :] = 2.0
+    return depth, rgb
+
+
+def plain_trimmed(depth: np.ndarray, rgb: np.ndarray, radius: int) -> np.ndarray:
+    """What ``trimmed`` is documented to do, pixel by pixel."""
+    height, width = depth.shape
+    for _ in range(ROUNDS):
+        kept = depth.copy()
+        for y, x in zip(*np.nonzero(depth > 0), strict=True):
+            balance = -1.0
+            for ny in range(max(0, y - radius), min(height, y + radius + 1)):
+                for nx in range(max(0, x - radius), min(width, x + radius + 1)):
+                    if (ny - y + nx - x) % 2 == 0:
+                        apart = np.abs(rgb[ny, nx].astype(int) - rgb[y, x].astype(int)).max()
+                        vote = np.exp(-apart / 255 / ALIKE)
+                        balance += -vote if depth[ny, nx] > 0 else vote
+            if balance > 0:
+                kept[y, x] = 0
+        depth = kept
+    return depth
+
+
+@pytest.mark.parametrize("rim", [1, 2, 3, 4])
+def test_a_rim_in_the_sky_goes_and_the_roof_stays(rim):
+    depth, rgb = roof(rim)
+    clean = trimmed(depth, rgb, 5)
+    assert (clean[:30] == 0).all()
+    assert (clean[30:] == 2).all()
+
+
+def test_depth_of_a_whole_wall_stays_round_a_hole():
+    rgb = np.full((60, 60, 3), 128, np.uint8)
+    depth = np.full((60, 60), 2.0, np.float32)
+    depth[20:30, 20:30] = 0
+    np.testing.assert_array_equal(trimmed(depth, rgb, 5), depth)
+
+
+def test_compiled_trimming_equals_the_plain_one():
+    rng = np.random.default_rng(0)
+    rgb = np.repeat(np.repeat(rng.integers(0, 80, (6, 8, 3)), 5, 0), 5, 1).astype(np.uint8)
+    depth = np.where(rng.uniform(size=(30, 40)) < 0.55, 2.0, 0.0).astype(np.float32)
+    clean = trimmed(depth, rgb, 3)
+    assert 0 < (clean > 0).sum() < (depth > 0).sum()
+    np.testing.assert_array_equal(clean, plain_trimmed(depth, rgb, 3))
+
+
+def test_growth_stops_at_colour_at_depth_and_after_its_steps():
+    _, rgb = roof(0)
+    seed = np.zeros((60, 60), np.float32)
+    seed[45, 10] = 2.0
+    candidates = np.full((60, 60), 2.0, np.float32)
+    candidates[:, 40:] = 3.0
+    grown = regrown(seed, candidates, rgb, 0.03, 1000)
+    assert (grown[30:, :40] == 2).all()
+    assert (grown[:30] == 0).all() and (grown[:, 40:] == 0).all()
+    near = regrown(seed, candidates, rgb, 0.03, 7)
+    y, x = np.mgrid[0:60, 0:60]
+    np.testing.assert_array_equal(near > 0, np.abs(y - 45) + np.abs(x - 10) <= 7)
+
+
+def test_growth_takes_candidates_only_and_changes_nothing_known():
+    rng = np.random.default_rng(1)
+    rgb = np.full((40, 40, 3), 90, np.uint8)
+    depth = np.where(rng.uniform(size=(40, 40)) < 0.2, 2.0, 0.0).astype(np.float32)
+    candidates = np.where(rng.uniform(size=(40, 40)) < 0.5, 2.02, 0.0).astype(np.float32)
+    grown = regrown(depth, candidates, rgb, 0.03, 5)
+    np.testing.assert_array_equal(grown[depth > 0], depth[depth > 0])
+    new = (grown > 0) & (depth == 0)
+    assert new.any()
+    np.testing.assert_array_equal(grown[new], candidates[new])
+
+
+def test_growth_fills_what_no_view_confirms_and_leaves_blank_surfaces_unknown():
+    made = plane_scene(blank=True)
+    scene, view = made.scene, made.scene["v2"]
+    options = StereoOptions(levels=2, align=False, speckle=20, tolerance=0.004)
+    known = {}
+    for regrow in (0, 20):
+        chosen = options.replaced(regrow=regrow)
+        stereo = PlaneSweepStereo(scene, options=chosen, views=scene.names)
+        known[regrow] = stereo.depth(scene, view, view.load()).depth
+    x = view.camera.centers[0, 0] + made.depths[2] * view.camera.rays()[..., 0]
+    textured = x < 0.15
+    assert (known[20][textured] > 0).mean() > (known[0][textured] > 0).mean()
+    assert (known[20][x > 0.45] == 0).mean() > 0.98
+    new = (known[20] > 0) & (known[0] == 0) & textured
+    error = np.abs(known[20][new] / made.depths[2][new] - 1)
+    assert np.median(error) < 0.02
+
+
+# One pair of shading and noise; the others with --runslow.
+@pytest.mark.parametrize(
+    ("shading", "noise"),
+    [("bowl", 0.006)]
+    + [
+        pytest.param(*pair, marks=pytest.mark.slow)
+        for pair in (("ramp", 0.0), ("ramp", 0.006), ("bowl", 0.0))
+    ],
+)
+def test_shaded_walls_are_not_guessed(shading, noise):
+    scene = niche_scene(shading, noise)
+    view = scene["v2"]
+    stereo = PlaneSweepStereo(scene, options=StereoOptions(align=False), views=scene.names)
+    known = stereo.depth(scene, view, view.load()).depth
+    truth, inside = niche_depth(view.camera)
+    back = ndimage.binary_erosion(inside, iterations=8)
+    assert (known[back] > 0).mean() < 0.05
+    wall = ~inside
+    assert (known[wall] > 0).mean() >= 0.9
+    assert np.median(np.abs(known[wall & (known > 0)] / 2 - 1)) < 0.005
+    assert truth[back].min() == 3
+
+
+def test_detail_is_what_a_fitted_plane_leaves():
+    rng = np.random.default_rng(0)
+    image = rng.uniform(size=(20, 24)).astype(np.float32)
+    found = detail_of(torch.from_numpy(image), 7).numpy()
+    y, x = np.mgrid[-3:4, -3:4]
+    terms = np.stack([np.ones(49), x.ravel(), y.ravel()], axis=1)
+    for row, column in ((3, 3), (9, 12), (16, 20)):
+        values = image[row - 3 : row + 4, column - 3 : column + 4].ravel().astype(np.float64)
+        left = values - terms @ np.linalg.lstsq(terms, values, rcond=None)[0]
+        assert found[row, column] == pytest.approx(np.sqrt((left**2).mean()), rel=1e-4)
+
+
+def test_a_slope_is_no_detail_and_noise_no_texture():
+    y, x = np.mgrid[0:80, 0:100]
+    rng = np.random.default_rng(1)
+    slope = 0.2 + 0.005 * x + 0.002 * y
+    for noise in (0.002, 0.006):
+        image = torch.from_numpy(slope + rng.normal(0, noise, x.shape)).float()
+        image[:, 60:] += 0.1 * ((torch.arange(40) % 4) < 2)
+        found = noise_of(image, detail_of(image, 7))
+        assert 0.7 * noise < found < noise
+        inner = textured(image, window=7, noise=0.001)[5:-5]
+        assert inner[:, 5:50].float().mean() < 0.25  # a quarter above what 2 % stay below
+        assert inner[:, 65:95].all()
+    clean = torch.from_numpy(slope).float()
+    assert not textured(clean, window=7, noise=0.003)[5:-5, 5:-5].any()
+    assert CLEAR > 1
+
+
+@pytest.mark.parametrize("align", [None, False])
+def test_a_turning_camera_is_refused(align):
+    options = OPTIONS.replaced(align=align)
+    for scene in (turning_scene(1e-7), turning_scene(1e-9, at=(4e6, 5e5, 100.0))):
+        stereo = PlaneSweepStereo(scene, options=options, views=scene.names)
+        with pytest.raises(DegenerateError, match="two viewpoints"):
+            stereo.depth(scene, scene["v1"], scene["v1"].load())
+
+
+def test_a_baseline_is_told_from_the_rounding_of_its_coordinates():
+    tiny = turning_scene(1e-7)
+    np.testing.assert_allclose(baselines(tiny, "v0"), 1e-7 * np.arange(4), rtol=1e-6)
+    far = turning_scene(1e-9, at=(4e6, 5e5, 100.0))
+    assert (baselines(far, "v0") == 0).all()
+    step = turning_scene(1e-3, at=(4e6, 5e5, 100.0))
+    np.testing.assert_allclose(baselines(step, "v0"), 1e-3 * np.arange(4), rtol=1e-4)
+
+
+def test_half_a_pixel_of_disparity_is_needed():
+    cameras = plane_scene(turns=False).scene.cameras
+    # v3 stands 0.12 beside v2: 150 pixels x 0.12 / depth.
+    for depth, enough in ((30.0, True), (44.0, False)):
+        depths = DepthRange(depth, 2 * depth, depth, 2 * depth, "points")
+        assert bool(enough_disparity(cameras[2], cameras[[3]], depths)[0]) == enough
+
+
+def test_views_at_one_place_are_no_sources_and_warn_of_nothing():
+    scene = plane_scene().scene
+    same = View("again", scene["v2"].camera, scene["v2"].load)
+    scene = Scene(scene.root, scene.kind, (*scene.views, same))
+    stereo = PlaneSweepStereo(scene, options=OPTIONS, views=scene.names)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = stereo.depth(scene, scene["v2"], scene["v2"].load())
+    assert "again" not in stereo.raw(scene["v2"]).sources
+    assert (found.depth > 0).mean() > 0.8
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1e9])
+def test_depth_follows_the_scene_units(scale):
+    made = plane_scene(slope=(0.25, -0.15), count=3)
+    views = []
+    for view in made.scene:
+        pose = view.camera.cam_from_world.copy()
+        pose[:, :3, 3] *= scale
+        views.append(replace(view, camera=replace(view.camera, cam_from_world=pose)))
+    scene = replace(made.scene, views=tuple(views))
+    stereo = PlaneSweepStereo(scene, options=OPTIONS, views=scene.names)
+    depth = stereo.depth(scene, scene["v1"], scene["v1"].load()).depth
+    known = depth > 0
+    assert known.mean() > 0.7
+    assert np.median(np.abs(depth[known] / (scale * made.depths[1][known]) - 1)) < 0.005

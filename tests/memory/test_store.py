@@ -3,18 +3,46 @@
 from __future__ import annotations
 
 import copy
+from collections import defaultdict
 
 import numpy as np
 import open3d as o3d
 import pytest
 import torch
-from memory_scenes import camera, plane_view, points, random_memory
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from memory_scenes import camera, plane_view, points, random_memory, random_points
 
 from gvtools.errors import DegenerateError, OptionError, ShapeError
-from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory
+from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory, TiledMemory
 from gvtools.memory.splat.api import SplatOptions
 from gvtools.memory.splat.torch_splatter import TorchSplatter
+from gvtools.memory.store import tile_set
 from gvtools.memory.store.observations import ATTRIBUTES, Columns
+from gvtools.memory.store.octree import (
+    FAR,
+    ROOT,
+    WHOLE,
+    Octree,
+    cell_coordinates,
+    cell_keys,
+    parent,
+)
+from gvtools.memory.store.tile import DOUBLINGS, thinned_copy
+from gvtools.memory.store.tile_set import TileSet
+from gvtools.memory.store.voxel_index import (
+    COORDINATE_OFFSET,
+    MOST_LEVEL,
+    NO_RECORD,
+    VoxelIndex,
+    VoxelLevels,
+    block_key,
+    extended,
+    find_block,
+    find_voxel,
+    insert_voxel,
+    voxel_keys,
+)
 
 SIZE = {"width": 40, "height": 30, "focal": 40}
 
@@ -238,3 +266,217 @@ def test_float_colours_are_those_of_the_photograph_and_others_are_refused():
             of_bytes.observe(wrong, depth, view, round=1)
     with pytest.raises(ShapeError, match="no depth; expected"):
         of_bytes.observe(rgb, None, view, round=1)
+
+
+def test_block_keys_are_unique_and_not_negative():
+    far = COORDINATE_OFFSET - 1
+    axis = (-far, -2, -1, 0, 1, 7, far)
+    keys = {
+        int(block_key(x, y, z, level))
+        for x in axis for y in axis for z in axis for level in (0, 1, MOST_LEVEL)
+    }  # fmt: skip
+    assert len(keys) == 3 * len(axis) ** 3
+    assert min(keys) >= 0
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), batches=st.integers(1, 5))
+def test_blocks_are_numbered_like_a_dictionary_would(seed, batches):
+    """Also across growth: the table starts with room for 512 blocks."""
+    rng = np.random.default_rng(seed)
+    index = VoxelIndex()
+    known: dict[int, int] = {}
+    for _ in range(batches):
+        keys = rng.integers(0, 900, 700) * 1_000_003
+        expected = [known.setdefault(key, len(known)) for key in keys.tolist()]
+        np.testing.assert_array_equal(index.block_numbers(keys), expected)
+    assert index.blocks == len(known)
+    for key, number in known.items():
+        assert find_block(index.keys, index.ids, np.int64(key)) == number
+    assert find_block(index.keys, index.ids, np.int64(5)) == -1
+    assert len(index.block_offset) >= index.blocks
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), blocks=st.integers(1, 30))
+def test_voxels_are_found_again_and_stay_within_the_reserve(seed, blocks):
+    """Blocks grow interleaved, so that tables that were given up are used again."""
+    rng = np.random.default_rng(seed)
+    index = VoxelIndex()
+    numbers = index.block_numbers(np.arange(blocks, dtype=np.int64))
+    known: dict[tuple[int, int], int] = {}
+    for _ in range(4):
+        count = int(rng.integers(1, 3000))
+        block = rng.integers(0, blocks, count)
+        place = rng.integers(0, 4096, count)
+        index.reserve_voxels(count, np.unique(numbers[block]))
+        arrays = index.arrays
+        for b, p in zip(block.tolist(), place.tolist(), strict=True):
+            slot = insert_voxel(arrays, np.int32(b), np.uint16(p))
+            expected = known.setdefault((b, p), len(known))
+            if expected == len(known) - 1 and index.pool_head[slot] == NO_RECORD:
+                index.pool_head[slot] = expected
+            assert index.pool_head[slot] == expected
+        assert index.pool_state[0] <= len(index.pool_head) == len(index.pool_local)
+    assert index.block_count[:blocks].sum() == len(known)
+    for (b, p), number in known.items():
+        slot = find_voxel(
+            index.pool_local, index.block_offset[b], np.int64(index.block_log2[b]), np.uint16(p)
+        )
+        assert index.pool_head[slot] == number
+    tables = sum(1 << int(log2) for log2 in index.block_log2[:blocks])
+    assert tables <= 3 * len(known) + 8 * blocks  # no table is less than three eighths full
+
+
+def test_an_empty_block_holds_nothing():
+    index = VoxelIndex()
+    index.block_numbers(np.array([3], np.int64))
+    assert find_voxel(index.pool_local, np.int64(0), np.int64(0), np.uint16(0)) == -1
+    assert index.voxels == 0
+
+
+def test_longer_arrays_keep_what_was_used():
+    array = np.arange(12).reshape(6, 2)
+    longer = extended(array, 9, 4)
+    assert longer.shape == (9, 2)
+    np.testing.assert_array_equal(longer[:4], array[:4])
+
+
+VOXEL = 0.01
+
+
+def keys_at(positions, level):
+    keys, places = np.empty(len(positions), np.int64), np.empty(len(positions), np.uint16)
+    voxel_keys(positions, np.full(len(positions), level, np.uint8), 1 / VOXEL, keys, places)
+    return list(zip(keys.tolist(), places.tolist(), strict=True))
+
+
+def test_a_voxel_of_any_level_lies_in_one_cell():
+    positions = np.random.default_rng(0).uniform(-4, 4, (4000, 3)).astype(np.float32)
+    cells = cell_keys(positions, VOXEL)
+    for level in range(8):
+        cell_of: dict[tuple[int, int], int] = {}
+        for voxel, cell in zip(keys_at(positions, level), cells.tolist(), strict=True):
+            assert cell_of.setdefault(voxel, cell) == cell
+
+
+def test_cells_have_their_coordinates():
+    edge = 128 * VOXEL
+    positions = np.array([[0.1, 0.1, 0.1], [-0.1, edge + 0.1, 2 * edge + 0.1]], np.float32)
+    found = cell_coordinates(cell_keys(positions, VOXEL)) - (1 << 19)
+    assert found.tolist() == [[0, 0, 0], [-1, 1, 2]]
+
+
+def test_tiles_follow_divisions():
+    tree, levels = Octree(), VoxelLevels(VOXEL)
+    rng = np.random.default_rng(1)
+    positions = rng.uniform(0.1, 5.0, (300, 3)).astype(np.float32)
+    spacing = np.full(300, VOXEL, np.float32)
+    numbers, made = tree.tiles_of(positions, spacing, levels, free=0)
+    assert made == [WHOLE] and not numbers.any()
+    level = 4
+    node = WHOLE
+    tree.divide(node)
+    while node[0] > level:
+        tree.divided.add(node)
+        cell = cell_coordinates(cell_keys(positions[:1], VOXEL))[0] >> (node[0] - 1)
+        node = (node[0] - 1, *cell.tolist())
+    tree.divided.add(node)
+    numbers, made = tree.tiles_of(positions, spacing, levels, free=1)
+    cells = cell_coordinates(cell_keys(positions, VOXEL)) >> (level - 1)
+    assert {n[1:] for n in made} == set(map(tuple, cells.tolist()))
+    of = {
+        tuple(cell): number for cell, number in zip(cells.tolist(), numbers.tolist(), strict=True)
+    }
+    assert of == {n[1:]: i for i, n in enumerate(made, 1)}
+    families = tree.families()
+    assert set(families) == {node} and sorted(families[node]) == sorted(made)
+    tree.join(node, made, 50)
+    numbers, made = tree.tiles_of(positions, spacing, levels, free=51)
+    assert made == [] and set(numbers.tolist()) == {50}
+
+
+def test_new_tiles_are_as_large_as_divided_ones_in_proportion_to_their_voxels():
+    tree, levels = Octree(), VoxelLevels(VOXEL, 1.0)
+    tree.divided.add(WHOLE)
+    tree.usual = 2
+    positions = np.array([[3, 3, 3], [300, 300, 300]], np.float32)
+    spacing = np.array([VOXEL, 8.5 * VOXEL], np.float32)
+    _, made = tree.tiles_of(positions, spacing, levels, free=0)
+    assert [node[0] for node in made] == [2, 5]
+    assert all(node[0] < ROOT for node in made)
+
+
+def test_points_beyond_all_cells_have_a_tile():
+    tree = Octree()
+    positions = np.array([[1e8, 0, 0]], np.float32)
+    spacing = np.full(1, 50.0, np.float32)
+    _, made = tree.tiles_of(positions, spacing, VoxelLevels(VOXEL, 1.0), free=0)
+    assert made == [FAR]
+
+
+def test_eight_parts_have_one_parent():
+    assert {parent((3, 4 + i, 6 + j, 8 + k)) for i in (0, 1) for j in (0, 1) for k in (0, 1)} == {
+        (4, 2, 3, 4)
+    }
+
+
+@pytest.mark.parametrize("doublings", DOUBLINGS)
+def test_each_segment_keeps_one_observation_a_cube(doublings):
+    memory = SpatialMemory(0.02)
+    for i in range(3):
+        memory.fuse(random_points(np.random.default_rng(i), 800, name=f"{i}"), round=0)
+    copy = thinned_copy(memory.whole, doublings)
+    columns, segments = memory.columns, memory.segments
+    assert copy.start[-1] == len(copy.rows.positions) < len(memory)
+    for s in range(segments.count):
+        first, length = segments.start[s], segments.length[s]
+        cubes = defaultdict(list)
+        for row in range(first, first + length):
+            edge = 0.02 * 2.0 ** columns.level[row]
+            voxel = np.floor(columns.positions[row].astype(float) * (1 / edge)).astype(int)
+            cubes[tuple((voxel >> doublings).tolist())].append(row)
+        rows = slice(copy.start[s], copy.start[s + 1])
+        assert rows.stop - rows.start == len(cubes)
+        for k, members in enumerate(cubes.values()):
+            weight = columns.confidence[members].astype(float)
+            mean = np.average(columns.positions[members], axis=0, weights=weight)
+            np.testing.assert_allclose(copy.rows.positions[rows][k], mean, rtol=1e-5, atol=1e-6)
+            spacing = np.average(columns.spacing[members], weights=weight)
+            edge = 0.02 * 2.0 ** columns.level[members[0]] * 2**doublings
+            assert copy.rows.spacing[rows][k] == pytest.approx(max(spacing, edge), rel=1e-5)
+            assert copy.rows.confidence[rows][k] == columns.confidence[members].max()
+
+
+def test_far_tiles_are_drawn_from_thinned_copies(tmp_path, monkeypatch):
+    monkeypatch.setattr(tile_set, "SMALLEST", 1)
+    memory = TiledMemory(0.01, options=MemoryOptions(budget="1MB"), scratch=tmp_path)
+    source = camera(width=160, height=120, focal=150)
+    color = np.zeros((120, 160, 3), np.uint8)
+    color[..., 0] = np.linspace(50, 200, 160)
+    for x in (-0.5, 0.0, 0.5):
+        near = camera(width=160, height=120, focal=150, center=(x, 0, 0))
+        memory.fuse(plane_view(near, 2.0, color=color), round=0)
+    assert not memory.in_ram
+    drawn = []
+    gathered = TileSet.gather
+
+    def counted(self, segments, chosen, **options):
+        found = gathered(self, segments, chosen, **options)
+        drawn.append(len(found.columns.positions))
+        return found
+
+    monkeypatch.setattr(TileSet, "gather", counted)
+    far = camera(width=160, height=120, focal=150, center=(0, 0, -8))
+    whole = memory.project(far)
+    every, drawn[:] = sum(drawn), []
+    thin = memory.project(far, options=SplatOptions(far_detail_px=1.0))
+    assert sum(drawn) < every / 5
+    both = whole.valid & thin.valid
+    assert both.sum() > 0.9 * whole.valid.sum() > 100
+    assert np.abs(whole.rgb - thin.rgb)[both].mean() < 0.02
+    np.testing.assert_allclose(thin.depth[both], whole.depth[both], rtol=0.01)
+    drawn[:] = []
+    memory.project(source, options=SplatOptions(far_detail_px=1.0))
+    close = memory.project(source)
+    assert close.coverage > 0.9
