@@ -84,7 +84,9 @@ class Blend:
     tolerance: float = 0.2
 
 
-def blended(shown: Float32, memory: Float32, where: NDArray[np.bool_], *, blend: Blend) -> Float32:
+def blend_colors(
+    shown: Float32, memory: Float32, where: NDArray[np.bool_], *, blend: Blend
+) -> Float32:
     """(H, W, 3) blended colours in the pixels ``where``, the memory's elsewhere; all from 0 to 1.
 
     >>> shown, everywhere = np.full((9, 9, 3), 0.5, np.float32), np.ones((9, 9), bool)
@@ -252,5 +254,5 @@ def recolor(guidance: Guidance, picture: Picture, *, blend: Blend) -> Guidance:
     Depth, and what is valid, generated and how confident, stays the memory's.
     """
     where = guidance.valid[0] & ~guidance.scanned[0] & picture.solid
-    rgb = blended(picture.rgb, guidance.rgb[0], where, blend=blend)
+    rgb = blend_colors(picture.rgb, guidance.rgb[0], where, blend=blend)
     return replace(guidance, rgb=rgb[None])

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.poses.motions import mean_near, moved
+from gvtools.poses.motions import mean_near, move_pose
 
 # Each component of a pose's correction stays below this angle [rad] and share of the typical depth.
 MOST_TURN, MOST_SHIFT = 0.035, 0.03
@@ -46,7 +46,7 @@ class CameraCorrections:
         """(4, 4) the corrected pose of a view."""
         if not self.with_poses:
             return self.given[number]
-        return moved(self.given[number], self._motion(number))
+        return move_pose(self.given[number], self._motion(number))
 
     def _motion(self, number: int) -> NDArray[np.float64]:
         twist = self.twists[number] - self.twists.mean(axis=0)
@@ -58,14 +58,14 @@ class CameraCorrections:
 
     def corrected(self, pose: NDArray[np.float64]) -> NDArray[np.float64]:
         """(4, 4) another camera's pose, moved as the views near it were moved if ``spread``."""
-        return moved(pose, self._motion_near(pose)) if self.spread else pose
+        return move_pose(pose, self._motion_near(pose)) if self.spread else pose
 
     def like_neighbours(self, number: int, *, but: Sequence[int]) -> NDArray[np.float64]:
         """(4, 4) a view's given pose, moved as the views near it; the views ``but`` do not count.
 
         A tracker's error that changes slowly along its path moves cameras near each other alike.
         """
-        return moved(self.given[number], self._motion_near(self.given[number], but=but))
+        return move_pose(self.given[number], self._motion_near(self.given[number], but=but))
 
     def start_like_neighbours(self, numbers: Sequence[int]) -> None:
         """Correct views that were not fitted so far as those near them, if ``spread``."""

@@ -30,8 +30,8 @@ from gvtools.appearance.population import Population, Sample, pixel_width
 from gvtools.appearance.splat.project_kernels import LOG_SCALE, LOGIT, QUATERNION, SH, VALUES
 from gvtools.appearance.splat.splat import Lens, Splat
 from gvtools.kernels import in_threads
-from gvtools.poses.refinement import LEAST_BETTER, compared, prediction_error
-from gvtools.poses.views import FitView, ReducedView, reduced
+from gvtools.poses.refinement import LEAST_BETTER, comparable, prediction_error
+from gvtools.poses.views import FitView, ReducedView, reduce_view
 
 # The progress of a fit runs from 0 to 1: the share of its time, not of its steps, that is over.
 # Numbers below that name a part of the fit are progress.
@@ -333,7 +333,7 @@ class Fit:
         """Restore the given poses unless refined ones predict neighbouring photographs better."""
         if self.cameras.with_poses:
             if self._compared is None:
-                self._compared = compared(self.views)
+                self._compared = comparable(self.views)
             before = prediction_error(self._compared, self.cameras.given)
             after = prediction_error(self._compared, self.cameras.poses())
             if not after < before * (1 - LEAST_BETTER):
@@ -389,7 +389,7 @@ class Fit:
             self._factor, self._reduced = factor, {}
         if number in self._reduced:
             return self._reduced[number]
-        view = reduced(self.views[number], factor)
+        view = reduce_view(self.views[number], factor)
         if len(self.views) * view.nbytes < KEPT_BYTES:
             self._reduced[number] = view
         return view

@@ -56,7 +56,7 @@ def harmonics_turned(axes: ArrayLike) -> NDArray[np.float64]:
     return np.asarray(turned, np.float64)
 
 
-def turned(values: NDArray[np.float32], axes: NDArray[np.float64]) -> NDArray[np.float32]:
+def turn_gaussians(values: NDArray[np.float32], axes: NDArray[np.float64]) -> NDArray[np.float32]:
     """Gaussians (N, VALUES) in another frame of the same origin, where the axes are ``axes``."""
     out = values.copy()
     out[:, POSITION:LOG_SCALE] = values[:, POSITION:LOG_SCALE].astype(np.float64) @ axes.T
@@ -73,7 +73,7 @@ def turned(values: NDArray[np.float32], axes: NDArray[np.float64]) -> NDArray[np
 RIDGE = 0.1
 
 
-def exposed(gaussians: Gaussians, exposures: Exposures, cameras: Cameras) -> Gaussians:
+def expose(gaussians: Gaussians, exposures: Exposures, cameras: Cameras) -> Gaussians:
     """Gaussians whose colours are, in cameras that see them, as these cameras are exposed.
 
     Each Gaussian's harmonics change by the least squares solution over the ``cameras``, such as the

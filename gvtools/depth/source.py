@@ -30,7 +30,7 @@ AGREE, THROUGH = 0.02, 0.04
 LEAST = 2
 
 
-def contradicted(
+def contradictions(
     depth: NDArray[np.float32],
     camera: Cameras,
     others: Sequence[tuple[NDArray[np.float32], Cameras]],
@@ -97,7 +97,7 @@ def compile_check() -> None:
     """Call the kernels once."""
     side, depth = np.array([4]), np.ones((4, 4), np.float32)
     camera = Cameras(np.eye(3)[None], np.eye(4)[None], side, side, ("any",))
-    contradicted(depth, camera, [(2 * depth, camera)])
+    contradictions(depth, camera, [(2 * depth, camera)])
 
 
 KERNELS = KernelSet("check of depth", compile_check, _compare)
@@ -186,7 +186,7 @@ class RecordedDepth:
 
     Args:
         views: names of the views whose recorded depth each depth map is checked against, see
-            ``contradicted``; without any, depth is taken as it is.
+            ``contradictions``; without any, depth is taken as it is.
     """
 
     name = "recorded"
@@ -214,7 +214,7 @@ class RecordedDepth:
             near = nearest_views(scene.subset(others).cameras, view.camera, CHECKING_VIEWS)
             checking = [scene[others[row]] for row in near]
             seen = [(self._kept_depth(other.load), other.camera) for other in checking]
-            wrong = contradicted(depth, view.camera, seen)
+            wrong = contradictions(depth, view.camera, seen)
             if frame.mask is not None:
                 wrong &= frame.mask
         depth = np.where(wrong, np.float32(0), depth)

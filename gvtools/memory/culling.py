@@ -72,7 +72,7 @@ def in_free_space(
     """
     out = np.zeros(len(positions), np.bool_)
     for first in range(0, len(views), VIEWS_PER_CALL):
-        grids = stacked(views[first : first + VIEWS_PER_CALL])
+        grids = stack_grids(views[first : first + VIEWS_PER_CALL])
         in_threads(_mark, len(positions), positions, *grids, tolerance, out)
     return out
 
@@ -105,7 +105,7 @@ def behind_free_space(
     return out
 
 
-def stacked(
+def stack_grids(
     grids: Sequence[FreeGrid],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float32]]:
     """K (T, 3, 3), cam_from_world (T, 4, 4) and the grids (T, h, w), padded with 0 = unknown."""
@@ -134,7 +134,7 @@ def near_to(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return cv2.dilate(mask.view(np.uint8), np.ones((side, side), np.uint8)).view(np.bool_)
 
 
-def opened(mask: NDArray[np.bool_], side: int) -> NDArray[np.bool_]:
+def open_mask(mask: NDArray[np.bool_], side: int) -> NDArray[np.bool_]:
     """``mask`` without what holds no square of ``side`` pixels (odd) inside the image."""
     square = np.ones((side, side), np.uint8)
     eroded = cv2.erode(mask.view(np.uint8), square, borderType=cv2.BORDER_CONSTANT, borderValue=0.0)

@@ -78,11 +78,11 @@ def description(memory: Store) -> dict[str, Any]:
 
 
 def load_memory(path: Path, kind: Callable[..., S], **more: Any) -> S:
-    """Read a memory of a class, see ``described``; every byte is checked."""
+    """Read a memory of a class, see ``create_empty``; every byte is checked."""
     header, arrays = _read(path)
     try:
         check_observations(arrays, len(header["names"]))
-        empty = described(header, kind, **more)
+        empty = create_empty(header, kind, **more)
         append_views(empty.views, header["names"], arrays)
         fill(empty.whole, arrays, empty.views)
         start = arrays["agreement_start"]
@@ -98,7 +98,7 @@ def load_memory(path: Path, kind: Callable[..., S], **more: Any) -> S:
     return empty
 
 
-def described(header: dict[str, Any], kind: Callable[..., S], **more: Any) -> S:
+def create_empty(header: dict[str, Any], kind: Callable[..., S], **more: Any) -> S:
     """An empty memory of a class as a header describes it; ``more``: options and arguments."""
     options = {k: more.pop(k) for k in list(more) if k in MemoryOptions.model_fields}
     return kind(
@@ -283,7 +283,7 @@ def load_tiles(
             f"{VERSION}; run the reconstruction again"
         )
     try:
-        memory = described(
+        memory = create_empty(
             meta, kind, budget=meta["budget"] if budget is None else budget, scratch=scratch
         )
         arrays = {name: index.array(name) for name in index.names}

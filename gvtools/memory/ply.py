@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gvtools.errors import MemoryFileError, OptionError
 from gvtools.memory.store.store import Store
-from gvtools.memory.thinning import thinned
+from gvtools.memory.thinning import thin
 from gvtools.ply import read_ply, write_ply
 
 if TYPE_CHECKING:
@@ -53,11 +53,11 @@ def export_memory_ply(
     if observed and not count:
         raise OptionError(f"{path}: the memory holds nothing that was observed")
     if max_points is not None and count > max_points:
-        thin = thinned(memory, max_points, among=~memory.generated if observed else None)
-        columns = {name: getattr(memory.columns, name)[thin.rows] for name in _COLUMNS}
+        points = thin(memory, max_points, among=~memory.generated if observed else None)
+        columns = {name: getattr(memory.columns, name)[points.rows] for name in _COLUMNS}
         kind = _vertex_type(memory, _reach(memory, columns["positions"]))
         write_ply(path, _vertices(memory, columns, kind), comments=_COMMENTS)
-        return len(thin.rows), thin.edge
+        return len(points.rows), points.edge
 
     def columns_of(tile: Tile) -> dict[str, NDArray[Any]]:
         columns = {name: tile.column(name) for name in _COLUMNS}

@@ -22,7 +22,7 @@ from gvtools.errors import OptionError, ShapeError
 from gvtools.guidance import IMAGES, Guidance, concatenate
 from gvtools.kernels import in_threads
 from gvtools.memory import culling
-from gvtools.memory.culling import in_free_space, stacked
+from gvtools.memory.culling import in_free_space, stack_grids
 from gvtools.memory.splat.api import ONE_PIXEL, FrameBuffers, SplatOptions, SplatRequest, Splatter
 from gvtools.memory.store.store import Store
 from gvtools.memory.store.views import FreeGrid
@@ -286,7 +286,7 @@ class Projection:
         front = zbuffer < limit
         front[front] = ~in_free_space(self._lifted(zbuffer, front), grids, tolerance=tolerance)
         # Slivers along silhouettes are what an error of a pixel in a pose looks like.
-        front = culling.opened(front, OCCLUDER_SIDE)
+        front = culling.open_mask(front, OCCLUDER_SIDE)
         if front.any():
             chosen = culling.touching(target.rect, culling.summed_area(front), chosen)
             limit = np.where(front, limit, np.float32(0))
@@ -304,7 +304,7 @@ class Projection:
             culling.may_be_in_front, len(later), later, target.rect, self.z_range,
             culling.tile_farthest(target.depth), margin, near,
         )  # fmt: skip
-        later, free = later[near], stacked(grids)
+        later, free = later[near], stack_grids(grids)
         hit = np.zeros(len(later), np.bool_)
         for part in store.tiles.split(store.segments, later):
             rows = store.tiles.gather(store.segments, later[part])

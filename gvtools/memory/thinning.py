@@ -31,7 +31,7 @@ class Thinned:
     edge: float
 
 
-def thinned(
+def thin(
     store: Store, max_points: int | None, *, among: NDArray[np.bool_] | None = None
 ) -> Thinned:
     """One point per voxel; voxels grow from the memory's own until at most ``max_points`` remain.

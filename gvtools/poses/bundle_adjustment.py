@@ -29,7 +29,7 @@ from gvtools.poses.colmap import (
     verification,
     write_pictures,
 )
-from gvtools.poses.motions import centers_of, mean_near, motions_between, moved, nearest_pairs
+from gvtools.poses.motions import centers_of, mean_near, motions_between, move_pose, nearest_pairs
 from gvtools.poses.refinement import RefinedPoses
 from gvtools.scenes.colmap_model import build_reconstruction
 from gvtools.scenes.scene import Frame, Scene
@@ -119,7 +119,7 @@ class AdjustedPoses:
         found = RefinedPoses(before, self.poses, depth, False, self.errors, True, True)
         motions = found.motions
         alike = np.stack([
-            moved(pose, mean_near(pose, before, motions, depth=depth, but=[row]))
+            move_pose(pose, mean_near(pose, before, motions, depth=depth, but=[row]))
             for row, pose in enumerate(before)
         ])  # fmt: skip
         near, away = (
@@ -214,7 +214,7 @@ def _placed(
     changes = motions_between(given, poses)
     for row in np.flatnonzero(~well_observed):
         change = mean_near(given[row], given[well_observed], changes[well_observed], depth=depth)
-        poses[row] = moved(given[row], change)
+        poses[row] = move_pose(given[row], change)
     return AdjustedPoses(poses, tracks, errors)
 
 

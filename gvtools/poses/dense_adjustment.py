@@ -80,7 +80,7 @@ def pose_equations(
     return PoseEquations(system, right, off)
 
 
-def adjusted(
+def adjust_cameras(
     cameras: Cameras,
     equations: Sequence[tuple[int, Sequence[int], PoseEquations]],
     *,

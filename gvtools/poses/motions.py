@@ -75,7 +75,7 @@ def mean_near(
     return np.asarray(weight @ values[near] / weight.sum())
 
 
-def moved(pose: Float64, motion: Float64) -> Float64:
+def move_pose(pose: Float64, motion: Float64) -> Float64:
     """A pose (4, 4) after a motion (6,), shift and turn, on the camera's side."""
     import torch
     from kornia.geometry.liegroup import Se3
@@ -102,7 +102,7 @@ def within(motion: Float64, shift: float, turn: float) -> bool:
     return bool(np.linalg.norm(motion[:3, 3]) <= shift and np.degrees(turn_of(motion)) <= turn)
 
 
-def chained(motions: Iterable[Float64]) -> Float64:
+def chain_motions(motions: Iterable[Float64]) -> Float64:
     """The product of relative poses (4, 4), the first one applied first."""
     pose = np.eye(4)
     for step in motions:
@@ -130,7 +130,7 @@ class Pair:
     agreement: float = 1.0
 
 
-def connected(count: int, pairs: Sequence[Pair]) -> list[list[int]]:
+def connected_parts(count: int, pairs: Sequence[Pair]) -> list[list[int]]:
     """Parts of the views that pairs connect, the largest first, each in order."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -166,7 +166,7 @@ def first_poses(views: Sequence[int], pairs: Sequence[Pair]) -> dict[int, Float6
     return poses
 
 
-def optimised(start: dict[int, Float64], pairs: Sequence[Pair]) -> dict[int, Float64]:
+def optimise(start: dict[int, Float64], pairs: Sequence[Pair]) -> dict[int, Float64]:
     """``world_from_cam`` by view that agree with all pairs best; the first view stays in place."""
     import open3d as o3d
 

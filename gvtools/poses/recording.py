@@ -9,7 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import invert_rigid
-from gvtools.poses.motions import Pair, chained, connected, first_poses, optimised, residual, within
+from gvtools.poses.motions import (
+    Pair,
+    chain_motions,
+    connected_parts,
+    first_poses,
+    optimise,
+    residual,
+    within,
+)
 from gvtools.poses.odometry import RgbdFrames, compare, start_from_features
 
 Float64 = NDArray[np.float64]
@@ -76,7 +84,7 @@ def find_poses(frames: RgbdFrames, *, say: Say = lambda text: None) -> Recording
     ]
     return RecordingPoses(
         poses,
-        connected(len(frames), list(pairs.values())),
+        connected_parts(len(frames), list(pairs.values())),
         list(pairs.values()),
         loops,
         _drift(loops, chain),
@@ -87,14 +95,14 @@ def find_poses(frames: RgbdFrames, *, say: Say = lambda text: None) -> Recording
 
 def _solve(count: int, pairs: list[Pair]) -> tuple[list[int], dict[int, Float64]]:
     """The largest connected part and its poses."""
-    part = connected(count, pairs)[0]
+    part = connected_parts(count, pairs)[0]
     inside = set(part)
     own = sorted(
         (pair for pair in pairs if pair.source in inside),
         key=lambda pair: (abs(pair.source - pair.target), pair.source),
     )
     poses = first_poses(part, own)
-    return part, optimised({frame: poses[frame] for frame in part}, own) if own else poses
+    return part, optimise({frame: poses[frame] for frame in part}, own) if own else poses
 
 
 def _along(frames: RgbdFrames, say: Say) -> dict[tuple[int, int], Pair]:
@@ -115,7 +123,7 @@ def _along(frames: RgbdFrames, say: Say) -> dict[tuple[int, int], Pair]:
             steps = [pairs.get((row, row - 1)) for row in range(at, at - gap, -1)]
             if at < gap or any(step is None for step in steps):
                 break
-            start = chained(step.target_from_source for step in steps if step is not None)
+            start = chain_motions(step.target_from_source for step in steps if step is not None)
             far = compare(frames, at, at - gap, start=start)
             if far is None:
                 break
@@ -218,6 +226,6 @@ def _drift(loops: list[Pair], chain: dict[int, Pair]) -> Float64:
         steps = [chain.get(at) for at in range(pair.source, pair.target, -1)]
         if any(step is None for step in steps):
             continue
-        pose = chained(step.target_from_source for step in steps if step is not None)
+        pose = chain_motions(step.target_from_source for step in steps if step is not None)
         rows.append(residual(pair, {pair.source: pose, pair.target: np.eye(4)}))
     return np.array(rows).reshape(-1, 2)

@@ -21,13 +21,13 @@ from gvtools.poses.motions import (
     Pair,
     mean_near,
     motions_between,
-    moved,
+    move_pose,
     nearest,
     nearest_pairs,
-    optimised,
+    optimise,
 )
 from gvtools.poses.odometry import BEYOND, TYPICAL_DEPTH, register
-from gvtools.poses.views import FitView, ReducedView, reduced
+from gvtools.poses.views import FitView, ReducedView, reduce_view
 from gvtools.similarity import align_poses
 
 Float64 = NDArray[np.float64]
@@ -73,7 +73,7 @@ class RefinedPoses:
         """(4, 4) another camera's pose, moved as the views near it were if ``spread``."""
         if not self.spread:
             return pose
-        return moved(pose, mean_near(pose, self.given, self.motions, depth=self.depth))
+        return move_pose(pose, mean_near(pose, self.given, self.motions, depth=self.depth))
 
     def __str__(self) -> str:
         shift = np.median(np.linalg.norm(self.motions[:, :3], axis=1))
@@ -101,7 +101,7 @@ def refined_poses(
     by_features = poses is not None
     if poses is None:
         poses = agreeing_poses(views)
-    small = compared(views)
+    small = comparable(views)
     before, after = prediction_error(small, given), prediction_error(small, poses)
     if not after < before * (1 - LEAST_BETTER):
         return None
@@ -112,7 +112,7 @@ def refined_poses(
     # where it was given, or moved as they were?
     motions = refined.motions
     alike = [
-        moved(pose, mean_near(pose, given, motions, depth=typical, but=[row]))
+        move_pose(pose, mean_near(pose, given, motions, depth=typical, but=[row]))
         for row, pose in enumerate(given)
     ]
     near = prediction_error(small, poses, at=np.stack(alike))
@@ -158,7 +158,7 @@ def _optimised(
     for row in range(len(given) - 1):
         motion = given[row + 1] @ np.linalg.inv(given[row])
         pairs.append(Pair(row, row + 1, motion, weight * np.eye(6), uncertain=False))
-    poses = optimised({row: np.linalg.inv(pose) for row, pose in enumerate(given)}, pairs)
+    poses = optimise({row: np.linalg.inv(pose) for row, pose in enumerate(given)}, pairs)
     return np.stack([np.linalg.inv(pose) for pose in poses.values()])
 
 
@@ -191,9 +191,9 @@ def _image(
     )
 
 
-def compared(views: Sequence[FitView]) -> list[ReducedView]:
+def comparable(views: Sequence[FitView]) -> list[ReducedView]:
     """Views as ``prediction_error`` compares them: smaller, without their noise."""
-    return [_blurred(reduced(view, SMALLER)) for view in views]
+    return [_blurred(reduce_view(view, SMALLER)) for view in views]
 
 
 def prediction_error(
@@ -205,7 +205,7 @@ def prediction_error(
     """Mean over pairs of neighbouring photographs of the median colour difference, 0 to 1.
 
     Each pixel with depth is looked up in the neighbour; what is hidden there is a minority that the
-    median passes over. NaN where no pair overlaps. ``small``: at least two, see ``compared``;
+    median passes over. NaN where no pair overlaps. ``small``: at least two, see ``comparable``;
     ``at`` is where each camera is when it is compared with the others; None: at its pose.
     """
     at = poses if at is None else at

@@ -51,7 +51,7 @@ class ReducedView:
         return sum(array.nbytes for array in arrays if array is not None)
 
 
-def reduced(view: FitView, factor: int) -> ReducedView:
+def reduce_view(view: FitView, factor: int) -> ReducedView:
     """A view at one over ``factor`` of its size; colours are means, depth is picked.
 
     Of colours only those that the mask lets through count.

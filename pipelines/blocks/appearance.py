@@ -18,7 +18,7 @@ from gvtools.appearance.appearance import Appearance, Blend
 from gvtools.appearance.camera_corrections import Exposures
 from gvtools.appearance.fit_options import FitOptions
 from gvtools.appearance.gaussians import Gaussians
-from gvtools.appearance.harmonics import turned
+from gvtools.appearance.harmonics import turn_gaussians
 from gvtools.appearance.splat.project_kernels import HARMONICS, LOG_SCALE, SH
 from gvtools.memory.store.local_frame import LocalFrame
 from gvtools.view_selection import evenly_spread
@@ -131,7 +131,7 @@ def _in_cell(
     inside = block.cell.holds(world)
     if not inside.any():
         return gaussians.values[:0]
-    out = turned(gaussians.values[inside], frame.axes.T @ gaussians.frame.axes)
+    out = turn_gaussians(gaussians.values[inside], frame.axes.T @ gaussians.frame.axes)
     out[:, :LOG_SCALE] = frame.from_world(world[inside])
     return scale_colors(out, -gain)
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.files import link_or_copy, write_text
-from gvtools.memory.thinning import thinned
+from gvtools.memory.thinning import thin
 from gvtools.scenes.colmap_model import write_colmap as write_model
 from gvtools.scenes.transforms import FILE as TRANSFORMS
 from gvtools.scenes.transforms import write_transforms as write_frames
@@ -39,7 +39,7 @@ def write_colmap(source: ExportSource, path: Path, options: ExportOptions) -> st
     """
     memory, distinct = source.memory, source.cameras()
     limit = MAX_POINTS if options.max_points is None else options.max_points
-    kept = thinned(memory, limit)
+    kept = thin(memory, limit)
     point, view, xy = _tracks(source, distinct, kept.group)
     lines = [
         name if picture is None else f"{name}\t{picture}"

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.appearance.harmonics import turned
+from gvtools.appearance.harmonics import turn_gaussians
 from gvtools.appearance.splat.project_kernels import (
     LOG_SCALE,
     LOGIT,
@@ -156,7 +156,7 @@ def write_spz(source: ExportSource, path: Path, options: ExportOptions) -> str:
 
 def spz_stream(splats: Splats) -> tuple[bytes, int]:
     """The stream before gzip, and how many bits of a position lie behind the point."""
-    values = turned(splats.values, TO_RUB)
+    values = turn_gaussians(splats.values, TO_RUB)
     one = replace(splats, values=values)
     reach = float(np.abs(values[:, :LOG_SCALE]).max())
     # As fine as the smallest Gaussians ask for and the farthest position allows.
@@ -219,7 +219,7 @@ def read_spz(path: Path) -> Splats:
     kept = kept[:, : VALUES - SH - 3]
     values[:, SH + 3 : SH + 3 + kept.shape[1]] = kept
     rounds = np.zeros(count, np.int32)
-    return Splats(turned(values, TO_RUB), np.zeros(3), count, 0, rounds)
+    return Splats(turn_gaussians(values, TO_RUB), np.zeros(3), count, 0, rounds)
 
 
 def _first_three(turns: NDArray[np.uint8]) -> NDArray[np.float64]:

@@ -16,7 +16,7 @@ from gvtools.appearance.appearance import (
     Appearance,
     Blend,
     best_blend,
-    blended,
+    blend_colors,
     recolor,
 )
 from gvtools.appearance.gaussians import Gaussians
@@ -65,7 +65,7 @@ def test_only_colours_of_surfaces_that_gaussians_show_change(solid, guidance):
     assert result.cameras is guidance.cameras
     np.testing.assert_array_equal(result.rgb[0][~where], guidance.rgb[0][~where])
     assert (result.rgb[0] != guidance.rgb[0]).any(axis=2)[where].mean() > 0.95
-    expected = blended(picture.rgb, guidance.rgb[0], where, blend=Blend(0.3, 0.5))
+    expected = blend_colors(picture.rgb, guidance.rgb[0], where, blend=Blend(0.3, 0.5))
     np.testing.assert_array_equal(result.rgb[0], expected)
 
 
@@ -194,7 +194,7 @@ def wrong(picture):
 
 
 def score(shown, memory, where, truth, blend):
-    off = (blended(shown, memory, where, blend=blend) - truth)[where]
+    off = (blend_colors(shown, memory, where, blend=blend) - truth)[where]
     return -10 * np.log10(np.square(off).mean())
 
 
@@ -217,7 +217,7 @@ def test_detail_is_taken_where_both_agree_and_not_where_the_memory_is_far_off(tr
     mixed = score(*sample, blend)
     assert mixed > score(*sample, Blend(0.0, 1.0)) + 0.5
     assert mixed > score(*sample, Blend(1.0, 1e6)) + 3
-    result = blended(soft(truth), memory, where, blend=blend)
+    result = blend_colors(soft(truth), memory, where, blend=blend)
     left, right = (slice(None), slice(0, 20)), (slice(None), slice(30, None))
     assert np.abs(result - truth)[left].mean() < 0.6 * np.abs(soft(truth) - truth)[left].mean()
     assert np.abs(result - soft(truth))[right][where[right]].mean() < 0.03
@@ -247,7 +247,7 @@ def test_without_pixels_that_both_know_the_default_stays(truth):
 def test_a_blend_lies_between_the_two_and_is_the_memorys_elsewhere(truth, where, blend):
     shown, memory = soft(truth), np.random.default_rng(3).uniform(0, 1, truth.shape)
     memory = memory.astype(np.float32)
-    result = blended(shown, memory, where, blend=blend)
+    result = blend_colors(shown, memory, where, blend=blend)
     assert result.dtype == np.float32
     np.testing.assert_array_equal(result[~where], memory[~where])
     least, most = np.minimum(shown, memory), np.maximum(shown, memory)
@@ -259,12 +259,12 @@ def test_what_only_one_knows_does_not_count(truth, where):
     shown, memory = soft(truth), truth.copy()
     other = memory.copy()
     other[~where] = 0
-    first = blended(shown, memory, where, blend=Blend())
-    second = blended(shown, other, where, blend=Blend())
+    first = blend_colors(shown, memory, where, blend=Blend())
+    second = blend_colors(shown, other, where, blend=Blend())
     np.testing.assert_array_equal(first[where], second[where])
 
 
 def test_a_share_of_one_with_equal_blurs_is_the_memory(truth):
     everywhere = np.ones((40, 50), bool)
-    result = blended(truth, truth + np.float32(1e-4), everywhere, blend=Blend(1.0, 4.0))
+    result = blend_colors(truth, truth + np.float32(1e-4), everywhere, blend=Blend(1.0, 4.0))
     np.testing.assert_allclose(result, truth + 1e-4, atol=1e-6)

@@ -26,8 +26,8 @@ from gvtools.appearance.population import from_depth
 from gvtools.cameras import Cameras
 from gvtools.errors import MemoryFileError
 from gvtools.memory.store.local_frame import LocalFrame
-from gvtools.poses.motions import moved
-from gvtools.poses.refinement import compared, prediction_error
+from gvtools.poses.motions import move_pose
+from gvtools.poses.refinement import comparable, prediction_error
 
 COUNT = 8
 FRAME = LocalFrame.at()
@@ -54,7 +54,7 @@ def gaussians(views):
 def given(views, motions):
     """The views with poses that are off by some motions."""
     return [
-        replace(view, cam_from_local=moved(view.cam_from_local, motion))
+        replace(view, cam_from_local=move_pose(view.cam_from_local, motion))
         for view, motion in zip(views, motions, strict=True)
     ]
 
@@ -124,8 +124,8 @@ def test_neighbours_corrections_are_taken_only_if_validation_gains(views, truth,
 
 def test_true_poses_predict_neighbours_better_than_wrong_ones(views, truth):
     rng = np.random.default_rng(0)
-    wrong = np.stack([moved(each, rng.normal(0, 0.02, 6)) for each in truth])
-    small = compared(views)
+    wrong = np.stack([move_pose(each, rng.normal(0, 0.02, 6)) for each in truth])
+    small = comparable(views)
     assert prediction_error(small, truth) < 0.7 * prediction_error(small, wrong)
 
 
@@ -134,8 +134,8 @@ def test_views_that_do_not_overlap_predict_nothing(views):
     away[1, :3, 3] = [-900, 0, 0]
     away[2, :3, 3] = [900, 0, 0]
     back_to_back = np.stack([pose(0.0), np.diag([-1.0, 1.0, -1.0, 1.0])])
-    assert np.isnan(prediction_error(compared(views[:2]), back_to_back))
-    assert np.isnan(prediction_error(compared(views[:3]), away))
+    assert np.isnan(prediction_error(comparable(views[:2]), back_to_back))
+    assert np.isnan(prediction_error(comparable(views[:3]), away))
 
 
 def test_corrections_have_mean_zero_and_a_limit(truth):
@@ -159,7 +159,7 @@ def test_the_gradient_of_a_pose_is_that_of_a_small_motion_on_the_cameras_side():
         # A loss that falls along one motion: its gradient by rotation and translation.
         start, motion = cameras.given[0], np.zeros(6)
         motion[axis] = 1e-5
-        slope = -(moved(start, motion) - start)[:3] / 1e-5
+        slope = -(move_pose(start, motion) - start)[:3] / 1e-5
         gradient = np.concatenate([slope[:, :3].ravel(), slope[:, 3]]).astype(np.float32)
         fresh = CameraCorrections(walk(2), depth=2.0, with_poses=True, exposure=False)
         fresh.step(0, gradient, share=0.0)

@@ -32,7 +32,7 @@ from gvtools.appearance.fit_options import (
 from gvtools.appearance.loss import ESTIMATE, ESTIMATE_TOLERANCE, add_depth
 from gvtools.appearance.splat.project_kernels import SH
 from gvtools.appearance.splat.splat import Lens, Splat
-from gvtools.poses.views import FitView, reduced
+from gvtools.poses.views import FitView, reduce_view
 
 # Small numbers of steps leave no room for pictures at a quarter of their size; sizes go by share.
 STEPS = 150
@@ -201,7 +201,7 @@ def test_masks_do_not_pull_at_the_pixels_beside_them():
         lens = Lens.of(view.cam_from_local, K, size=(WIDTH, HEIGHT), near=fit.near)
         splat = Splat(start.values, lens)
         splat.image[:3] /= splat.image[4]
-        gradient = fit._loss_gradient(0, splat, reduced(view, 1))
+        gradient = fit._loss_gradient(0, splat, reduce_view(view, 1))
         strongest.append(np.abs(gradient[:3]).max())
     assert strongest[1] < 2 * strongest[0]
 
@@ -258,7 +258,7 @@ def test_an_estimate_pulls_less_where_it_is_missed_by_less_than_its_tolerance():
     view = replace(photograph(pose(0.0)), depth=None)
     estimate = np.full((HEIGHT, WIDTH), 2.0, np.float32)
     estimate[:, :9] = 0
-    small = reduced(replace(view, estimate=estimate), 1)
+    small = reduce_view(replace(view, estimate=estimate), 1)
     image = np.ones((5, HEIGHT, WIDTH), np.float32)
     pulls = []
     for missed in (0.0, 0.5, 1.0, 3.0, -3.0):
@@ -270,7 +270,7 @@ def test_an_estimate_pulls_less_where_it_is_missed_by_less_than_its_tolerance():
         pulls.append(float(gradient[3, 0, 20]))
     np.testing.assert_allclose(pulls, ESTIMATE * np.array([0, 0.25, 0.5, 0.5, -0.5]), atol=1e-5)
     gradient = np.zeros_like(image)
-    add_depth(image, reduced(view, 1), gradient, weight=1.0)
+    add_depth(image, reduce_view(view, 1), gradient, weight=1.0)
     assert not gradient.any()
 
 

@@ -14,7 +14,7 @@ from splat_scene import HEIGHT, NEAR, WIDTH, K, pose, rough_gaussians, walk
 
 from gvtools.appearance.camera_corrections import Exposures
 from gvtools.appearance.gaussians import ATTRIBUTES, FIRST_OPACITY, Gaussians
-from gvtools.appearance.harmonics import exposed, harmonics, harmonics_turned, turned
+from gvtools.appearance.harmonics import expose, harmonics, harmonics_turned, turn_gaussians
 from gvtools.appearance.splat.project_kernels import HARMONICS, LOGIT, SH, VALUES
 from gvtools.appearance.splat.splat import Lens, Splat
 from gvtools.cameras import Cameras
@@ -62,7 +62,7 @@ def test_turned_gaussians_give_the_same_picture(coloured):
     turn[:3, :3] = AXES
     before = picture(coloured, camera)
     assert before[4].mean() > 0.3
-    after = picture(turned(coloured, AXES), camera @ turn.T)
+    after = picture(turn_gaussians(coloured, AXES), camera @ turn.T)
     np.testing.assert_allclose(after, before, atol=2e-4)
 
 
@@ -80,7 +80,7 @@ def test_exposed_gaussians_are_as_bright_as_each_camera_has_them(coloured):
     # Colours in the middle, which no gain drives out of range.
     values[:, SH + 3 :] *= 0.3
     given = Gaussians(values, frame=frame)
-    result = exposed(given, exposures, cameras)
+    result = expose(given, exposures, cameras)
     np.testing.assert_array_equal(result.values[:, :SH], values[:, :SH])
     assert result.frame is frame
     errors, without = [], []

@@ -20,7 +20,7 @@ from gvtools.depth.source import (
     DepthMap,
     MixedDepth,
     RecordedDepth,
-    contradicted,
+    contradictions,
     disagrees,
     is_recorded,
     scale_to_points,
@@ -58,33 +58,33 @@ OTHERS = [camera(0.1), camera(-0.1), camera(0.15)]
 
 
 def test_what_others_look_through_is_contradicted():
-    wrong = contradicted(with_blob(), camera(), [(wall(), each) for each in OTHERS])
+    wrong = contradictions(with_blob(), camera(), [(wall(), each) for each in OTHERS])
     np.testing.assert_array_equal(wrong, with_blob() < FAR)
 
 
 def test_one_view_alone_contradicts_nothing():
     witnesses = [(wall(), each) for each in OTHERS[: LEAST - 1]]
-    assert not contradicted(with_blob(), camera(), witnesses).any()
+    assert not contradictions(with_blob(), camera(), witnesses).any()
     blind = [(np.zeros_like(wall()), each) for each in OTHERS]
-    assert not contradicted(with_blob(), camera(), blind).any()
+    assert not contradictions(with_blob(), camera(), blind).any()
 
 
 def test_what_as_many_others_confirm_stays():
     near = wall(2.0)
     agreeing, piercing = [(near, each) for each in OTHERS[:2]], [(wall(), each) for each in OTHERS]
-    assert not contradicted(with_blob(), camera(), [*agreeing, *piercing[:2]])[
+    assert not contradictions(with_blob(), camera(), [*agreeing, *piercing[:2]])[
         with_blob() < FAR
     ].any()
-    assert contradicted(with_blob(), camera(), [*agreeing, *piercing])[with_blob() < FAR].all()
+    assert contradictions(with_blob(), camera(), [*agreeing, *piercing])[with_blob() < FAR].all()
 
 
 def test_what_others_do_not_see_for_something_nearer_stays():
-    assert not contradicted(wall(), camera(), [(wall(1.0), each) for each in OTHERS]).any()
+    assert not contradictions(wall(), camera(), [(wall(1.0), each) for each in OTHERS]).any()
 
 
 @pytest.mark.parametrize("off", [0.99, 0.97])
 def test_noise_is_no_contradiction(off):
-    assert not contradicted(with_blob(FAR * off), camera(), [(wall(), c) for c in OTHERS]).any()
+    assert not contradictions(with_blob(FAR * off), camera(), [(wall(), c) for c in OTHERS]).any()
 
 
 def test_a_real_object_in_front_of_a_wall_stays():
@@ -97,7 +97,7 @@ def test_a_real_object_in_front_of_a_wall_stays():
         return out
 
     others = [(seen(x), camera(x)) for x in (0.1, -0.1, 0.15, -0.15)]
-    wrong = contradicted(seen(0.0), camera(), others)
+    wrong = contradictions(seen(0.0), camera(), others)
     assert wrong.sum() <= 0.1 * (seen(0.0) < FAR).sum()
 
 
@@ -108,7 +108,7 @@ def test_beside_something_thin_a_view_does_not_look_through():
     off = wall()
     off[:, 31] = 2.0
     witnesses = [(off, camera()), (off, camera()), (off, camera())]
-    assert not contradicted(bar, camera(), witnesses).any()
+    assert not contradictions(bar, camera(), witnesses).any()
 
 
 def test_what_masks_leave_out_neither_speaks_nor_counts():
@@ -132,7 +132,7 @@ def test_what_masks_leave_out_neither_speaks_nor_counts():
 def test_views_of_another_size_are_compared_where_they_look():
     half = np.full((HEIGHT // 2, WIDTH // 2), FAR, np.float32)
     small = [(half, each.resized(WIDTH // 2, HEIGHT // 2)) for each in OTHERS]
-    np.testing.assert_array_equal(contradicted(with_blob(), camera(), small), with_blob() < FAR)
+    np.testing.assert_array_equal(contradictions(with_blob(), camera(), small), with_blob() < FAR)
 
 
 def test_recorded_depth_is_dropped_counted_and_not_trusted():

@@ -17,7 +17,7 @@ from gvtools.memory.store.voxel_index import (
     group_by_block,
     voxel_keys,
 )
-from gvtools.memory.thinning import thinned
+from gvtools.memory.thinning import thin
 from viz.viewer.colors import view_counts
 
 ONE_EDGE = MemoryOptions(voxels_per_footprint=0.0)
@@ -357,5 +357,5 @@ def test_a_voxel_of_any_level_is_one_point_and_one_place():
         source = camera(center=(x, 0, 0), name=name)
         memory.fuse(points(where, spacing=(0.9, 0.1), source=source), round=0)
     assert len(memory) == 6 and memory.voxels == 2
-    assert len(thinned(memory, None).rows) == 2
+    assert len(thin(memory, None).rows) == 2
     assert view_counts(memory).tolist() == [3] * 6

@@ -37,7 +37,7 @@ from gvtools.memory.store.voxel_index import (
     VoxelIndex,
     VoxelLevels,
     block_key,
-    extended,
+    extend,
     find_block,
     find_voxel,
     insert_voxel,
@@ -337,7 +337,7 @@ def test_an_empty_block_holds_nothing():
 
 def test_longer_arrays_keep_what_was_used():
     array = np.arange(12).reshape(6, 2)
-    longer = extended(array, 9, 4)
+    longer = extend(array, 9, 4)
     assert longer.shape == (9, 2)
     np.testing.assert_array_equal(longer[:4], array[:4])
 

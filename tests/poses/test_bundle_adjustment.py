@@ -9,7 +9,7 @@ import pytest
 
 from gvtools.poses import bundle_adjustment
 from gvtools.poses.bundle_adjustment import Tracks, adjusted_poses
-from gvtools.poses.motions import moved
+from gvtools.poses.motions import move_pose
 from gvtools.procedural.room_sample import write_room
 from gvtools.scenes.project import open_project
 
@@ -28,7 +28,7 @@ def room(tmp_path_factory):
 def off(cameras, *, by=0.02):
     """The cameras with poses as a tracker errs, by shifts and radians."""
     rng = np.random.default_rng(0)
-    poses = [moved(pose, rng.normal(0, by, 6)) for pose in cameras.cam_from_world]
+    poses = [move_pose(pose, rng.normal(0, by, 6)) for pose in cameras.cam_from_world]
     return replace(cameras, cam_from_world=np.stack(poses))
 
 
@@ -106,10 +106,10 @@ def test_known_tracks_need_no_picture(room, monkeypatch):
 def test_other_cameras_move_only_if_they_err_alike(room):
     frames, cameras = room
     turned = np.stack([
-        moved(pose, np.array([0.03, 0, 0, 0, 0.03, 0])) for pose in cameras.cam_from_world
+        move_pose(pose, np.array([0.03, 0, 0, 0, 0.03, 0])) for pose in cameras.cam_from_world
     ])  # fmt: skip
     rng = np.random.default_rng(0)
-    alike = np.stack([moved(pose, rng.normal(0, 0.001, 6)) for pose in turned])
+    alike = np.stack([move_pose(pose, rng.normal(0, 0.001, 6)) for pose in turned])
     tracks = tracks_through(cameras)
     one = replace(cameras, cam_from_world=alike)
     assert not adjusted_poses(frames, off(cameras), tracks=tracks).refined(off(cameras)).spread

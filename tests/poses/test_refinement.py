@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from splat_scene import photographs, pose_errors, walk
 
-from gvtools.poses.motions import moved, nearest_pairs
+from gvtools.poses.motions import move_pose, nearest_pairs
 from gvtools.poses.refinement import agreeing_poses, refined_poses
 from gvtools.poses.views import FitView
 from gvtools.similarity import align_poses
@@ -51,7 +51,7 @@ def off(views, *, scale: float = 1.0, seed: int = 1):
     rng = np.random.default_rng(seed)
     motions = rng.normal(0, scale * np.repeat([0.02, 0.01], 3), (len(views), 6))
     return [
-        replace(view, cam_from_local=moved(view.cam_from_local, motion))
+        replace(view, cam_from_local=move_pose(view.cam_from_local, motion))
         for view, motion in zip(views, motions, strict=True)
     ]
 
@@ -168,13 +168,13 @@ def test_other_cameras_move_only_if_neighbours_err_alike(views, truth):
     signs = np.where(np.arange(2 * COUNT) < COUNT, 1, -1)
     path = walk(2 * COUNT)
     drifting = [
-        replace(view, cam_from_local=moved(pose, sign * motion))
+        replace(view, cam_from_local=move_pose(pose, sign * motion))
         for view, pose, sign in zip(textured(path), path, signs, strict=True)
     ]
     drift = refined_poses(drifting)
     assert drift is not None and drift.spread
     for row in (3, 12):
-        other = moved(path[row], signs[row] * motion)
+        other = move_pose(path[row], signs[row] * motion)
         before = pose_errors(np.stack([other, path[8]]), path[[row, 8]])
         after = pose_errors(np.stack([drift.corrected(other), path[8]]), path[[row, 8]])
         assert after[0] < before[0]

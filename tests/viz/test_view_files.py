@@ -19,7 +19,7 @@ from PIL import Image
 from reference_gaussians import rotations
 
 from gvtools.errors import MemoryFileError, OptionError
-from gvtools.memory.thinning import thinned
+from gvtools.memory.thinning import thin
 from pipelines.cli import main
 from pipelines.export.splats import read_splat_ply, read_spz
 from pipelines.viewing.source import ViewSource
@@ -64,7 +64,7 @@ def test_points_lie_where_they_were_in_their_colours(run, exported, name, form, 
     pytest.importorskip(package)
     shown = ViewSource(exported(name, form)).read()
     assert POINTS in shown.looks and RENDERED in shown.looks
-    rows = thinned(run.memory, None).rows
+    rows = thin(run.memory, None).rows
     lie_alike(shown, run.memory.positions[rows], run.memory.voxel)
     colors = run.memory.columns.colors[rows].astype(float).mean(axis=0)
     there = shown.memory.columns.colors[: len(shown.memory)].astype(float).mean(axis=0)

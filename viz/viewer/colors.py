@@ -98,11 +98,11 @@ def view_counts(memory: SpatialMemory) -> NDArray[np.int64]:
 
     What several views agreed on counts for the one that keeps it, so this is the least number.
     """
-    from gvtools.memory.thinning import thinned
+    from gvtools.memory.thinning import thin
 
     if not len(memory):
         return np.zeros(0, np.int64)
-    voxel = thinned(memory, None).group
+    voxel = thin(memory, None).group
     views = len(memory.views)
     pairs = np.unique(voxel * views + memory.columns.view)
     return np.bincount(pairs // views, minlength=int(voxel.max(initial=-1)) + 1)[voxel]

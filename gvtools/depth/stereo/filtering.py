@@ -3,9 +3,9 @@
 A window that straddles the outline of a roof matches by the roof even where its centre lies in the
 sky, in every view alike, so depth grows past outlines by half a window and consistency confirms it.
 Such a rim is thin, looks like the unknown beyond it and unlike the surface that it hangs on. It is
-taken back from the outside (``trimmed``). What that takes from the borders of real surfaces grows
-again from what remains, wherever depth and colour run on (``regrown``); across an outline colour
-does not.
+taken back from the outside (``trim_outlines``). What that takes from the borders of real surfaces
+grows again from what remains, wherever depth and colour run on (``regrow``); across an outline
+colour does not.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ BIAS = 2.12
 LEAST, MOST = 0.02, 0.99
 
 
-def without_speckles(depth: Float32, step: float, smallest: int) -> Float32:
+def remove_speckles(depth: Float32, step: float, smallest: int) -> Float32:
     """Depth (H, W) without patches smaller than ``smallest`` pixels.
 
     Neighbours (above, below, beside) belong together up to ``step``, a relative difference.
@@ -109,7 +109,7 @@ def weighted_median(depth: Float32, guide: Float32, weight: Float32, radius: int
 
 
 @compiled(parallel=True)
-def enlarged(
+def enlarge(
     depth: Float32, guide: Float32, fine_guide: Float32, trust: Float32
 ) -> tuple[Float32, Float32]:
     """A depth map (h, w) and its trust at the size of a larger picture, with the picture's edges.
@@ -152,7 +152,7 @@ def enlarged(
     return result, passed
 
 
-def trimmed(depth: Float32, rgb: Bytes, radius: int) -> Float32:
+def trim_outlines(depth: Float32, rgb: Bytes, radius: int) -> Float32:
     """Depth without the pixels whose look-alikes nearby are mostly unknown, again and again.
 
     ``radius`` is that of the pixels that vote, a little more than half the matched window.
@@ -194,7 +194,7 @@ def _outvoted(
 
 
 @compiled()
-def regrown(
+def regrow(
     depth: Float32, candidates: Float32, rgb: Bytes, tolerance: float, steps: int
 ) -> Float32:
     """Depth continued into its candidates, pixel by pixel, where colour and depth run on.

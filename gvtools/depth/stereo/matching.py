@@ -111,14 +111,14 @@ def build_pyramid(
     for _ in range(levels):
         if images and min(width, height) < 16:
             break
-        luminance = resampled(luminance, width, height)
+        luminance = resample(luminance, width, height)
         images.append(luminance)
         cameras.append(camera.resized(width, height))
         width, height = max(1, round(width / 2)), max(1, round(height / 2))
     return Pyramid(tuple(images), tuple(cameras))
 
 
-def resampled(image: torch.Tensor, width: int, height: int) -> torch.Tensor:
+def resample(image: torch.Tensor, width: int, height: int) -> torch.Tensor:
     """(..., H, W) image resampled without aliasing; the picture's outline stays where it is."""
     if image.shape[-2:] == (height, width):
         return image
@@ -129,11 +129,11 @@ def resampled(image: torch.Tensor, width: int, height: int) -> torch.Tensor:
     return small.reshape(*image.shape[:-2], height, width).contiguous()
 
 
-def resampled_colors(rgb: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
-    """(height, width, 3) uint8 of an (H, W, 3) uint8 picture; see ``resampled``."""
+def resample_colors(rgb: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
+    """(height, width, 3) uint8 of an (H, W, 3) uint8 picture; see ``resample``."""
     if rgb.shape[:2] == (height, width):
         return np.ascontiguousarray(rgb)
-    colors = resampled(torch.from_numpy(rgb).permute(2, 0, 1).float(), width, height)
+    colors = resample(torch.from_numpy(rgb).permute(2, 0, 1).float(), width, height)
     return colors.permute(1, 2, 0).round().clamp(0, 255).to(torch.uint8).contiguous().numpy()
 
 

@@ -18,8 +18,8 @@ from gvtools.depth.stereo.matching import (
     Matcher,
     Pyramid,
     build_pyramid,
-    resampled,
-    resampled_colors,
+    resample,
+    resample_colors,
     textured,
     working_size,
 )
@@ -31,11 +31,11 @@ from gvtools.depth.stereo.single_view import (
     coarse_depth,
     enough_disparity,
     fine_depth,
-    narrowed,
+    narrow_range,
     only_turned,
 )
 from gvtools.errors import DegenerateError, OptionError
-from gvtools.poses.dense_adjustment import PoseEquations, adjusted, pose_equations
+from gvtools.poses.dense_adjustment import PoseEquations, adjust_cameras, pose_equations
 from gvtools.scenes.scene import Frame, Scene, View
 
 # Expected errors of poses that are adjusted: radians, and a share of the typical depth.
@@ -102,7 +102,7 @@ class PlaneSweepStereo:
         height, width = frame.rgb.shape[:2]
         if known.shape != (height, width):
             full = build_pyramid(frame.rgb, view.camera, max_side=max(height, width), levels=1)
-            known, trust = filtering.enlarged(known, guide, full.images[0].numpy(), trust)
+            known, trust = filtering.enlarge(known, guide, full.images[0].numpy(), trust)
         if frame.mask is not None:
             known = np.where(frame.mask, known, np.float32(0))
         return DepthMap(known, np.where(known > 0, trust, np.float32(1)), self.name)
@@ -119,16 +119,16 @@ class PlaneSweepStereo:
         options = self.options
         nothing = np.float32(0)
         known = np.where(confirmed, depth, nothing)
-        known = filtering.without_speckles(known, options.tolerance, options.speckle)
+        known = filtering.remove_speckles(known, options.tolerance, options.speckle)
         if not (options.trim or options.regrow):
             return known
-        rgb = resampled_colors(frame.rgb, depth.shape[1], depth.shape[0])
+        rgb = resample_colors(frame.rgb, depth.shape[1], depth.shape[0])
         candidates = np.where(matched, depth, known)
         if options.trim:
-            known = filtering.trimmed(known, rgb, options.window // 2 + 2)
+            known = filtering.trim_outlines(known, rgb, options.window // 2 + 2)
         if options.regrow:
-            known = filtering.regrown(known, candidates, rgb, options.tolerance, options.regrow)
-        return filtering.without_speckles(known, options.tolerance, options.speckle)
+            known = filtering.regrow(known, candidates, rgb, options.tolerance, options.regrow)
+        return filtering.remove_speckles(known, options.tolerance, options.speckle)
 
     def raw(self, view: View, frame: Frame | None = None) -> RawDepth:
         """A view's own estimate, before other views are asked; kept for the views in ``views``."""
@@ -171,7 +171,7 @@ class PlaneSweepStereo:
             if not off or not np.nanmedian(np.concatenate(off)) > EXACT_ENOUGH:
                 break
             depths = [np.sqrt(r.lower * r.upper) for r in self._ranges.values()]
-            cameras = adjusted(
+            cameras = adjust_cameras(
                 cameras, equations,
                 rotation=ROTATION_ERROR, translation=TRANSLATION_ERROR * float(np.median(depths)),
             )  # fmt: skip
@@ -234,7 +234,7 @@ class PlaneSweepStereo:
             options=self.options.replaced(window=5, planes=None),
             matcher=self._matcher, device=self._device,
         )  # fmt: skip
-        return narrowed(depths, coarse)
+        return narrow_range(depths, coarse)
 
     def _sources(self, view: View, depths: DepthRange) -> tuple[str, ...]:
         names = choose_sources(
@@ -299,4 +299,4 @@ def _halved(pyramid: Pyramid) -> Pyramid:
     """The coarsest level at half its size, alone."""
     image, camera = pyramid.images[-1], pyramid.cameras[-1]
     width, height = max(8, round(image.shape[1] / 2)), max(8, round(image.shape[0] / 2))
-    return Pyramid((resampled(image, width, height),), (camera.resized(width, height),))
+    return Pyramid((resample(image, width, height),), (camera.resized(width, height),))

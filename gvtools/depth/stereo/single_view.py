@@ -35,7 +35,7 @@ LEAST_DISPARITY = 0.5
 MATCHED, BETTER, BETTER_SHARE = 0.3, 0.02, 0.05
 
 
-def upsampled(planes: torch.Tensor, height: int, width: int) -> torch.Tensor:
+def upsample(planes: torch.Tensor, height: int, width: int) -> torch.Tensor:
     """The planes (3, h, w) of a coarser level, see Matcher.score, at the pixels of a finer one."""
     device = planes.device
     down, across = planes.shape[1] / height, planes.shape[2] / width
@@ -48,7 +48,7 @@ def upsampled(planes: torch.Tensor, height: int, width: int) -> torch.Tensor:
     return torch.stack([near[0] + near[1] * dx + near[2] * dy, near[1] * across, near[2] * down])
 
 
-def fitted(
+def fit_planes(
     inverse_depth: torch.Tensor, weight: torch.Tensor, *, radius: int = FIT_RADIUS
 ) -> torch.Tensor:
     """The plane that fits the inverse depths round each pixel best, by weighted least squares.
@@ -86,7 +86,7 @@ def fitted(
     return torch.stack([w, a, b])
 
 
-def refined(
+def refine_planes(
     planes: torch.Tensor,
     level: Level,
     matcher: Matcher,
@@ -118,7 +118,7 @@ def refined(
         reach = 1 if i % 2 == 0 else 3
         for dy, dx in ((0, reach), (reach, 0), (0, -reach), (-reach, 0)):
             offer(_shifted(planes, dy, dx))
-        offer(fitted(planes[0], (1 - cost).clamp(min=0.01)))
+        offer(fit_planes(planes[0], (1 - cost).clamp(min=0.01)))
         for change in (0.5, -0.5) if i % 2 == 0 else (0.25, -0.25):
             offer(torch.stack([planes[0] + change * step, planes[1], planes[2]]))
     return _between(planes, cost, level, matcher=matcher, step=0.4 * step)
@@ -192,7 +192,7 @@ def coarse_depth(
     return CoarseDepth(level, planes, inverse_depth, cost)
 
 
-def narrowed(depths: DepthRange, coarse: CoarseDepth) -> DepthRange:
+def narrow_range(depths: DepthRange, coarse: CoarseDepth) -> DepthRange:
     """The range that the surely matched pixels of a first sweep span; the old one without them."""
     sure = coarse.cost < SURE
     if sure.float().mean() < SURE_SHARE:
@@ -215,7 +215,7 @@ def fine_depth(
 
     Rounds of propagation double from a level to the coarser one, where they cost a quarter.
     """
-    planes = fitted(coarse.inverse_depth, (1 - coarse.cost).clamp(min=0.01))
+    planes = fit_planes(coarse.inverse_depth, (1 - coarse.cost).clamp(min=0.01))
     level, cost = coarse.level, coarse.cost
     inverse = coarse.hypotheses.inverse_depths
     bounds = (float(inverse[0]), float(inverse[-1]))
@@ -223,9 +223,9 @@ def fine_depth(
     for index in range(len(reference.images) - 1, -1, -1):
         if index < len(reference.images) - 1:
             level = level_of(reference, sources, index, window=options.window, device=device)
-            planes = upsampled(planes, *level.reference.shape)
+            planes = upsample(planes, *level.reference.shape)
             step /= 2
-        planes, cost = refined(
+        planes, cost = refine_planes(
             planes, level, matcher,
             step=step, bounds=bounds, iterations=options.iterations * 2**index,
         )  # fmt: skip

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.errors import OptionError
-from gvtools.memory.store.voxel_index import VoxelIndex, extended, link_records, voxel_keys
+from gvtools.memory.store.voxel_index import VoxelIndex, extend, link_records, voxel_keys
 
 if TYPE_CHECKING:
     import open3d as o3d
@@ -209,7 +209,7 @@ class GrowableTable:
         capacity = len(getattr(self, next(iter(self.LAYOUT))))
         for name, rows in zip(self.LAYOUT, columns, strict=True):
             if need > capacity:
-                longer = extended(getattr(self, name), max(need, 2 * capacity), self.count)
+                longer = extend(getattr(self, name), max(need, 2 * capacity), self.count)
                 setattr(self, name, longer)
             getattr(self, name)[self.count : need] = rows
         self.count = need
@@ -284,7 +284,7 @@ class Segments(GrowableTable):
         """Bring the groups' boxes from group ``first`` on up to date."""
         groups = -(-self.count // self.GROUP)
         if groups > len(self.group_box):
-            self.group_box = extended(self.group_box, max(groups, 2 * len(self.group_box)), first)
+            self.group_box = extend(self.group_box, max(groups, 2 * len(self.group_box)), first)
         self.groups = groups
         box = self.box[first * self.GROUP : self.count]
         if len(box):

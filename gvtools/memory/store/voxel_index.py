@@ -378,8 +378,8 @@ class VoxelIndex:
         need = used + 6 * (count + known) + 8 * len(touched)
         if need > len(self.pool_head):
             size = max(need, 2 * len(self.pool_head))
-            self.pool_local = extended(self.pool_local, size, used)
-            self.pool_head = extended(self.pool_head, size, used)
+            self.pool_local = extend(self.pool_local, size, used)
+            self.pool_head = extend(self.pool_head, size, used)
 
     def _grow_table(self) -> None:
         keys = np.full(2 * len(self.keys), EMPTY_KEY, np.int64)
@@ -391,9 +391,9 @@ class VoxelIndex:
         old = len(self.block_offset)
         if self.blocks > old:
             size = max(self.blocks, 2 * old)
-            self.block_offset = extended(self.block_offset, size, old)
-            self.block_log2 = extended(self.block_log2, size, old)
-            self.block_count = extended(self.block_count, size, old)
+            self.block_offset = extend(self.block_offset, size, old)
+            self.block_log2 = extend(self.block_log2, size, old)
+            self.block_count = extend(self.block_count, size, old)
             for array in (self.block_offset, self.block_log2, self.block_count):
                 array[old:] = 0
 
@@ -422,7 +422,7 @@ def rounded_origin(middle: NDArray[np.float64], voxel: float) -> NDArray[np.floa
     return np.rint(middle / step) * step
 
 
-def extended(array: NDArray, size: int, used: int) -> NDArray:
+def extend(array: NDArray, size: int, used: int) -> NDArray:
     """A longer array with the first ``used`` rows of ``array``; the rest is never touched."""
     bigger = np.empty((size, *array.shape[1:]), array.dtype)
     bigger[:used] = array[:used]

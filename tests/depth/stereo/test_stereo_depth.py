@@ -16,11 +16,11 @@ from gvtools.depth.source import DepthMap
 from gvtools.depth.stereo.filtering import (
     ALIKE,
     ROUNDS,
-    enlarged,
-    regrown,
-    trimmed,
+    enlarge,
+    regrow,
+    remove_speckles,
+    trim_outlines,
     weighted_median,
-    without_speckles,
 )
 from gvtools.depth.stereo.geometry import DepthRange, baselines
 from gvtools.depth.stereo.matching import CLEAR, detail_of, noise_of, textured
@@ -141,7 +141,7 @@ def test_speckles_go_and_surfaces_stay():
     depth = np.full((40, 40), 2.0, np.float32)
     depth[10:13, 10:13] = 1.0
     depth[:, 20] = 0
-    kept = without_speckles(depth, 0.03, 20)
+    kept = remove_speckles(depth, 0.03, 20)
     assert (kept[10:13, 10:13] == 0).all()
     kept[10:13, 10:13] = 1.0
     np.testing.assert_array_equal(kept, depth)
@@ -164,14 +164,14 @@ def test_enlarged_keeps_planes_exact_edges_sharp_and_holes_empty():
     y, x = np.mgrid[0:20, 0:30] + 0.5
     depth = (2 + 0.01 * x + 0.02 * y).astype(np.float32)
     flat, fine = np.full((20, 30), 0.5, np.float32), np.full((40, 60), 0.5, np.float32)
-    large, trust = enlarged(depth, flat, fine, np.full_like(depth, 0.7))
+    large, trust = enlarge(depth, flat, fine, np.full_like(depth, 0.7))
     yy, xx = np.mgrid[0:40, 0:60] + 0.5
     expected = 2 + 0.01 * xx / 2 + 0.02 * yy / 2
     np.testing.assert_allclose(large[2:-2, 2:-2], expected[2:-2, 2:-2], atol=1e-4)
     np.testing.assert_allclose(trust[2:-2, 2:-2], 0.7, atol=1e-5)
     depth[:, 15:] = 9.0
     depth[5:10, 5:10] = 0
-    large, _ = enlarged(depth, flat, fine, np.ones_like(depth))
+    large, _ = enlarge(depth, flat, fine, np.ones_like(depth))
     assert not ((large > 3.5) & (large < 8.9)).any()
     assert (large[10:20, 10:20] == 0).all()
 
@@ -202,7 +202,7 @@ def roof(rim: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def plain_trimmed(depth: np.ndarray, rgb: np.ndarray, radius: int) -> np.ndarray:
-    """What ``trimmed`` is documented to do, pixel by pixel."""
+    """What ``trim_outlines`` is documented to do, pixel by pixel."""
     height, width = depth.shape
     for _ in range(ROUNDS):
         kept = depth.copy()
@@ -223,7 +223,7 @@ def plain_trimmed(depth: np.ndarray, rgb: np.ndarray, radius: int) -> np.ndarray
 @pytest.mark.parametrize("rim", [1, 2, 3, 4])
 def test_a_rim_in_the_sky_goes_and_the_roof_stays(rim):
     depth, rgb = roof(rim)
-    clean = trimmed(depth, rgb, 5)
+    clean = trim_outlines(depth, rgb, 5)
     assert (clean[:30] == 0).all()
     assert (clean[30:] == 2).all()
 
@@ -232,14 +232,14 @@ def test_depth_of_a_whole_wall_stays_round_a_hole():
     rgb = np.full((60, 60, 3), 128, np.uint8)
     depth = np.full((60, 60), 2.0, np.float32)
     depth[20:30, 20:30] = 0
-    np.testing.assert_array_equal(trimmed(depth, rgb, 5), depth)
+    np.testing.assert_array_equal(trim_outlines(depth, rgb, 5), depth)
 
 
 def test_compiled_trimming_equals_the_plain_one():
     rng = np.random.default_rng(0)
     rgb = np.repeat(np.repeat(rng.integers(0, 80, (6, 8, 3)), 5, 0), 5, 1).astype(np.uint8)
     depth = np.where(rng.uniform(size=(30, 40)) < 0.55, 2.0, 0.0).astype(np.float32)
-    clean = trimmed(depth, rgb, 3)
+    clean = trim_outlines(depth, rgb, 3)
     assert 0 < (clean > 0).sum() < (depth > 0).sum()
     np.testing.assert_array_equal(clean, plain_trimmed(depth, rgb, 3))
 
@@ -250,10 +250,10 @@ def test_growth_stops_at_colour_at_depth_and_after_its_steps():
     seed[45, 10] = 2.0
     candidates = np.full((60, 60), 2.0, np.float32)
     candidates[:, 40:] = 3.0
-    grown = regrown(seed, candidates, rgb, 0.03, 1000)
+    grown = regrow(seed, candidates, rgb, 0.03, 1000)
     assert (grown[30:, :40] == 2).all()
     assert (grown[:30] == 0).all() and (grown[:, 40:] == 0).all()
-    near = regrown(seed, candidates, rgb, 0.03, 7)
+    near = regrow(seed, candidates, rgb, 0.03, 7)
     y, x = np.mgrid[0:60, 0:60]
     np.testing.assert_array_equal(near > 0, np.abs(y - 45) + np.abs(x - 10) <= 7)
 
@@ -263,7 +263,7 @@ def test_growth_takes_candidates_only_and_changes_nothing_known():
     rgb = np.full((40, 40, 3), 90, np.uint8)
     depth = np.where(rng.uniform(size=(40, 40)) < 0.2, 2.0, 0.0).astype(np.float32)
     candidates = np.where(rng.uniform(size=(40, 40)) < 0.5, 2.02, 0.0).astype(np.float32)
-    grown = regrown(depth, candidates, rgb, 0.03, 5)
+    grown = regrow(depth, candidates, rgb, 0.03, 5)
     np.testing.assert_array_equal(grown[depth > 0], depth[depth > 0])
     new = (grown > 0) & (depth == 0)
     assert new.any()
@@ -275,10 +275,10 @@ def test_growth_fills_what_no_view_confirms_and_leaves_blank_surfaces_unknown():
     scene, view = made.scene, made.scene["v2"]
     options = StereoOptions(levels=2, align=False, speckle=20, tolerance=0.004)
     known = {}
-    for regrow in (0, 20):
-        chosen = options.replaced(regrow=regrow)
+    for pixels in (0, 20):
+        chosen = options.replaced(regrow=pixels)
         stereo = PlaneSweepStereo(scene, options=chosen, views=scene.names)
-        known[regrow] = stereo.depth(scene, view, view.load()).depth
+        known[pixels] = stereo.depth(scene, view, view.load()).depth
     x = view.camera.centers[0, 0] + made.depths[2] * view.camera.rays()[..., 0]
     textured = x < 0.15
     assert (known[20][textured] > 0).mean() > (known[0][textured] > 0).mean()

@@ -23,7 +23,7 @@ from gvtools.depth.stereo.geometry import (
 from gvtools.depth.stereo.matching import build_pyramid, level_of
 from gvtools.depth.stereo.matching_torch import residual_flow
 from gvtools.errors import DegenerateError
-from gvtools.poses.dense_adjustment import adjusted, pose_equations
+from gvtools.poses.dense_adjustment import adjust_cameras, pose_equations
 from gvtools.scenes.scene import Scene, SparsePoints
 from gvtools.trajectories import look_at
 
@@ -176,7 +176,7 @@ def test_disturbed_poses_are_found_again():
         )  # fmt: skip
         assert found is not None
         equations.append((i, others, found))
-    cameras = adjusted(disturbed, equations, rotation=0.01, translation=0.01)
+    cameras = adjust_cameras(disturbed, equations, rotation=0.01, translation=0.01)
     before, after = _epipolar(disturbed, true), _epipolar(cameras, true)
     assert before > 0.3
     assert after < 0.35 * before
@@ -184,7 +184,7 @@ def test_disturbed_poses_are_found_again():
 
 def test_true_poses_stay():
     scene = plane_scene(slope=(0.3, 0.2)).scene
-    nothing = adjusted(scene.cameras, [], rotation=0.01, translation=0.01)
+    nothing = adjust_cameras(scene.cameras, [], rotation=0.01, translation=0.01)
     np.testing.assert_allclose(nothing.cam_from_world, scene.cameras.cam_from_world)
 
 

@@ -25,7 +25,7 @@ from gvtools.depth.stereo.matching import build_pyramid, level_of, window_taps, 
 from gvtools.depth.stereo.matching_cpu import CpuMatcher
 from gvtools.depth.stereo.matching_torch import TorchMatcher, bilinear, window_mean
 from gvtools.depth.stereo.plane_sweep import make_matcher
-from gvtools.depth.stereo.single_view import fitted, refined, upsampled
+from gvtools.depth.stereo.single_view import fit_planes, refine_planes, upsample
 from gvtools.errors import OptionError
 from gvtools.poses.dense_adjustment import _rigid
 
@@ -169,7 +169,7 @@ def test_refinement_reaches_sub_percent_depth_from_a_rough_start(slanted):
     start = planes.clone()
     start[0] += 0.4 / rate * torch.sign(torch.sin(torch.arange(start.shape[2]) * 0.3))
     start[1:] = 0
-    found, cost = refined(
+    found, cost = refine_planes(
         start, level, CpuMatcher(OPTIONS), step=1 / rate, bounds=(0.2, 1.0), iterations=2
     )
     error = (found[0].numpy() * made.depths[2] - 1)[10:-10, 10:-10]
@@ -180,12 +180,12 @@ def test_refinement_reaches_sub_percent_depth_from_a_rough_start(slanted):
 def test_fitted_and_upsampled_are_exact_on_a_plane():
     y, x = torch.meshgrid(torch.arange(12.0) + 0.5, torch.arange(16.0) + 0.5, indexing="ij")
     w = 0.4 + 0.01 * x - 0.02 * y
-    planes = fitted(w, torch.ones_like(w))
+    planes = fit_planes(w, torch.ones_like(w))
     inner = (slice(4, -4), slice(4, -4))
     assert float((planes[0] - w)[inner].abs().max()) < 1e-4
     assert float((planes[1] - 0.01)[inner].abs().max()) < 2e-4
     exact = torch.stack([w, torch.full_like(w, 0.01), torch.full_like(w, -0.02)])
-    fine = upsampled(exact, 24, 32)
+    fine = upsample(exact, 24, 32)
     y, x = torch.meshgrid(torch.arange(24.0) + 0.5, torch.arange(32.0) + 0.5, indexing="ij")
     torch.testing.assert_close(fine[0], 0.4 + 0.005 * x - 0.01 * y)
     torch.testing.assert_close(fine[1], torch.full((24, 32), 0.005))

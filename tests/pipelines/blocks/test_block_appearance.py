@@ -13,7 +13,7 @@ from tiny_scan import write_scan
 from gvtools.appearance.appearance import Appearance
 from gvtools.appearance.camera_corrections import Exposures
 from gvtools.appearance.gaussians import Gaussians
-from gvtools.appearance.harmonics import turned
+from gvtools.appearance.harmonics import turn_gaussians
 from gvtools.appearance.splat.project_kernels import HARMONICS, LOG_SCALE, SH
 from gvtools.cameras import Cameras
 from gvtools.memory.spatial_memory import SpatialMemory
@@ -52,7 +52,7 @@ def whole() -> Gaussians:
 
 def in_frame(some: Gaussians, frame: LocalFrame, gain: float) -> Gaussians:
     """The same Gaussians as a block has them: in its frame, brighter by a factor."""
-    values = turned(some.values, frame.axes.T)
+    values = turn_gaussians(some.values, frame.axes.T)
     values[:, :LOG_SCALE] = frame.from_world(some.values[:, :LOG_SCALE])
     sh = values[:, SH:].reshape(len(values), -1, 3) * gain
     sh[:, 0] += 0.5 * (gain - 1) / HARMONICS[0]

@@ -12,7 +12,7 @@ from plyfile import PlyData
 
 from gvtools.errors import OptionError
 from gvtools.memory.store.local_frame import LocalFrame
-from gvtools.memory.thinning import thinned
+from gvtools.memory.thinning import thin
 
 ORIGIN = (431_000.0, 5_650_000.0, 120.0)
 
@@ -21,7 +21,7 @@ ORIGIN = (431_000.0, 5_650_000.0, 120.0)
 def far(scene, tmp_path):
     """A memory in a georeferenced frame, and where its points are."""
     memory = fused(scene, [0])
-    positions = memory.positions[thinned(memory, None).rows] + ORIGIN
+    positions = memory.positions[thin(memory, None).rows] + ORIGIN
     memory.frame = memory.views.frame = LocalFrame.at(ORIGIN)
     memory.save(tmp_path / "far.npz")
     return tmp_path / "far.npz", positions
@@ -34,7 +34,7 @@ def test_laspy_reads_points_colours_and_what_is_known_of_each(bare_run, tmp_path
     out = tmp_path / f"out{suffix}"
     export_run(bare_run.folder, "las", out)
     cloud = laspy.read(out)
-    memory, rows = bare_run.memory, thinned(bare_run.memory, None).rows
+    memory, rows = bare_run.memory, thin(bare_run.memory, None).rows
     assert cloud.header.version == "1.4" and cloud.header.are_points_compressed == (
         suffix == ".laz"
     )
@@ -67,7 +67,7 @@ def test_pxr_reads_the_points(bare_run, tmp_path, suffix):
     (cloud,) = (UsdGeom.Points(prim) for prim in stage.Traverse() if prim.IsA(UsdGeom.Points))
     world = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(cloud.GetPrim()))
     local = np.array(cloud.GetPointsAttr().Get(), np.float64)
-    memory, rows = bare_run.memory, thinned(bare_run.memory, None).rows
+    memory, rows = bare_run.memory, thin(bare_run.memory, None).rows
     np.testing.assert_allclose(
         local @ world[:3, :3] + world[3, :3], memory.positions[rows], atol=1e-5
     )
@@ -156,7 +156,7 @@ def test_observed_leaves_out_what_was_generated(bare_run, tmp_path, form):
     if form == "ply":
         count, expected = len(trimesh.load(out).vertices), int((~memory.generated).sum())
     else:
-        expected = len(thinned(memory, None, among=~memory.generated).rows)
+        expected = len(thin(memory, None, among=~memory.generated).rows)
         if form == "las":
             cloud = laspy.read(out)
             assert not np.asarray(cloud.generated).any()
@@ -178,7 +178,7 @@ def test_nothing_observed_is_said(scene, tmp_path):
 def test_thinning_some_observations_counts_no_others(bare_run):
     memory = bare_run.memory
     among = memory.generated
-    kept = thinned(memory, 100, among=among)
+    kept = thin(memory, 100, among=among)
     assert among[kept.rows].all() and 10 < len(kept.rows) <= 100
     np.testing.assert_array_equal(kept.group >= 0, among)
     np.testing.assert_array_equal(kept.group[kept.rows], np.arange(len(kept.rows)))
