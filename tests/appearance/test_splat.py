@@ -292,7 +292,9 @@ def test_pictures_and_gradients_are_those_of_the_cpu():
     pytest.importorskip("gsplat", reason="gsplat is not installed")
     values, weight = flat_gaussians(), np.random.default_rng(0).normal(size=(5, *PICTURE[::-1]))
     pictures = [kind(values, lens()) for kind in (Splat, GsplatSplat)]
-    np.testing.assert_allclose(pictures[1].image, pictures[0].image, atol=0.02)
+    # Its CUDA kernels leave out what adds less than 1 / 255 of opacity: more in units of depth.
+    bounds = np.array([0.02, 0.02, 0.02, 0.02 * values[:, 2].max(), 0.02])[:, None, None]
+    assert (np.abs(pictures[1].image - pictures[0].image) <= bounds).all()
     dense = []
     for picture in pictures:
         rows, d_camera = picture.backward(weight.astype(np.float32))
