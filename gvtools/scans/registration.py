@@ -115,15 +115,9 @@ class Placement:
 
     def to_json(self) -> dict[str, Any]:
         """JSON-ready."""
-        return {
-            "world_from_scan": self.world_from_scan.tolist(),
-            "how": self.how,
-            "scale": self.scale,
-            "fitness": self.fitness,
-            "scan_fitness": self.scan_fitness,
-            "rmse": self.rmse,
-            "tolerance": self.tolerance,
-        }
+        values = {**vars(self), "world_from_scan": self.world_from_scan.tolist()}
+        first = {name: values.pop(name) for name in ("world_from_scan", "how")}
+        return {**first, "scale": self.scale, **values}
 
 
 def given_placement(text: str) -> Placement | None:
@@ -223,19 +217,17 @@ class _Task:
 
         self.seed = seed
         rng = np.random.default_rng(seed)
-        scan, photographed = known(scan, rng), known(photographed, rng)
+        scan, photographed = subsample(scan, rng), subsample(photographed, rng)
         self.scan_middle = np.median(scan.positions, axis=0)
         self.middle = np.median(photographed.positions, axis=0)
-        self.scan = moved(scan, self.scan_middle)
-        self.target = moved(photographed, self.middle)
+        self.scan = shift(scan, self.scan_middle)
+        self.target = shift(photographed, self.middle)
         self.cell = cell_of(self.target.positions)
         self.tolerance = TOLERANCE * self.cell
         self.source_sample = self.scan.positions[rows_of(self.scan, COUNTED, rng)]
         self.target_sample = self.target.positions[rows_of(self.target, COUNTED, rng)]
-        self._scan_tree, self._target_tree = (
-            KDTree(self.scan.positions),
-            KDTree(self.target.positions),
-        )
+        self._scan_tree = KDTree(self.scan.positions)
+        self._target_tree = KDTree(self.target.positions)
         self._targets = {
             level: SurfaceFeatures(self.target, level * self.cell, outward=False)
             for level in LEVELS
@@ -295,10 +287,8 @@ class _Task:
 
         if self._left <= 0:
             return None
-        source, target = (
-            SurfaceFeatures(self.scan, level * self.cell / scale, outward=outward),
-            self._targets[level],
-        )
+        target = self._targets[level]
+        source = SurfaceFeatures(self.scan, level * self.cell / scale, outward=outward)
         if not source.usable:
             return None
         self._left -= len(source.points)
@@ -409,7 +399,7 @@ def unevenness(surface: Surface) -> float:
     import open3d as o3d
 
     rng = np.random.default_rng(0)
-    positions = known(surface, rng).positions
+    positions = subsample(surface, rng).positions
     positions = positions - np.median(positions, axis=0)
     cell = cell_of(positions)
     cloud = cloud_of(positions).voxel_down_sample(cell)
@@ -467,7 +457,7 @@ class SurfaceFeatures:
         return pairs[:, 0].astype(np.int64), pairs[:, 1].astype(np.int64)
 
 
-def moved(surface: Surface, middle: Float64) -> Surface:
+def shift(surface: Surface, middle: Float64) -> Surface:
     """A surface about another origin."""
     seen = surface.seen_from
     return Surface(surface.positions - middle, None if seen is None else seen - middle)
@@ -491,7 +481,7 @@ def extent_of(positions: Float64) -> float:
     return float(np.linalg.norm(np.ptp(np.percentile(positions, [2, 98], axis=0), axis=0))) or 1.0
 
 
-def known(surface: Surface, rng: np.random.Generator) -> Surface:
+def subsample(surface: Surface, rng: np.random.Generator) -> Surface:
     """A random KNOWN of the points, or all."""
     rows, seen = rows_of(surface, KNOWN, rng), surface.seen_from
     return Surface(surface.positions[rows], None if seen is None else seen[rows])

@@ -51,14 +51,6 @@ def test_any_positive_confidence_gives_the_colour_and_the_depth(confidence, back
     np.testing.assert_allclose(seen.confidence, np.clip(known, faintest, 100), rtol=1e-5)
 
 
-@pytest.mark.parametrize("confidence", [0.0, -0.0, -1.0, np.nan, np.inf])
-def test_no_confidence_is_no_point_and_is_counted(confidence):
-    memory = SpatialMemory(0.1)
-    report = memory.fuse(points([(0, 0, 2)] * 3, confidence=confidence), round=0)
-    assert (report.added, report.out_of_reach, len(memory)) == (0, 3, 0)
-    assert memory.project(camera()).coverage == 0
-
-
 @pytest.mark.parametrize("column", ["confidence", "spacing"])
 def test_a_point_cloud_without_a_usable_point_is_refused(column, tmp_path):
     """It gave a memory of nothing, and empty pictures."""
@@ -158,26 +150,6 @@ def test_what_only_a_far_view_saw_is_neither_lost_nor_nan(depths, backend):
     np.testing.assert_allclose(seen.depth, reference.depth, rtol=1e-5)
     trust = np.where(seen.valid, np.maximum(reference.confidence, FAINTEST), 0)
     np.testing.assert_allclose(seen.confidence, trust, rtol=1e-4)
-
-
-@pytest.mark.parametrize("backend", ["cpu", "torch"])
-def test_an_occluder_that_only_a_far_view_saw_is_let_through(backend):
-    """Its weight beside the nearest view's is below every float32."""
-    near = camera(**SIZE, focal=60, center=(0.02, 0, 0))
-    witness = camera(**SIZE, focal=60, center=(0, 0, -40.0), name="witness")
-    wall = dataclasses.replace(plane_view(near, 4.0, color=(0, 0, 255)), free_depth=None)
-    grid = np.linspace(-0.3, 0.3, 40)
-    x, y = (axis.ravel() for axis in np.meshgrid(grid, grid))
-    where = np.stack([x, y, np.full(x.size, 2.0)], 1)
-    memory = SpatialMemory(0.02)
-    memory.fuse(wall, round=0)
-    memory.fuse(points(where, source=witness, colors=(255, 0, 0), spacing=0.03), round=0)
-    target = camera(**SIZE, focal=60)
-    options = SplatOptions(nearest_views=1, backend=backend)
-    seen = memory.project(target, options=options)
-    thing = (abs(2 * target.rays()[..., :2]) < 0.27).all(-1)
-    assert (seen.rgb[0, ..., 0] > 0.9)[thing].all()
-    np.testing.assert_allclose(seen.depth[0][thing], 2, rtol=1e-5)
 
 
 def test_a_million_points_of_one_view_in_one_voxel():

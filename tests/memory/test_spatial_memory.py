@@ -154,13 +154,13 @@ def test_generated_points_do_not_enter_space_that_was_seen_to_be_free():
 def test_what_cannot_be_stored_is_counted():
     memory = SpatialMemory(0.001)
     bad = points(
-        [(np.nan, 0, 1), (0, 0, 1), (0, 0, 1), (0, 0, 1), (1e9, 0, 1), (0, 0, 1)],
-        confidence=(1, 0, np.inf, 1, 1, 1),
-        spacing=(1, 1, 1, np.nan, 1, 1),
+        [(np.nan, 0, 1), (1e9, 0, 1), *[(0, 0, 1)] * 7],
+        confidence=(1, 1, 0, -0.0, -1, np.nan, np.inf, 1, 1),
+        spacing=(*[1] * 7, np.nan, 1),
     )
     report = memory.fuse(bad, round=0)
-    assert (report.points, report.added, report.out_of_reach) == (6, 1, 5)
-    assert report.rejected == 5
+    assert (report.points, report.added, report.out_of_reach) == (9, 1, 8)
+    assert report.rejected == 8
 
 
 def test_points_of_another_origin_and_earlier_rounds_are_refused():
@@ -174,10 +174,11 @@ def test_points_of_another_origin_and_earlier_rounds_are_refused():
         memory.forget(round=1)
 
 
-@pytest.mark.parametrize("voxel", [0, -1, np.nan, np.inf])
-def test_a_voxel_without_extent_is_refused(voxel):
-    with pytest.raises(OptionError, match="positive length"):
+@pytest.mark.parametrize("voxel", [0, -1, np.nan, np.inf, 9e-26, 2e25])
+def test_a_voxel_that_float32_cannot_hold_is_refused_in_a_line(voxel):
+    with pytest.raises(OptionError, match=r"positive length in scene units, 1e-25 to 1e\+25") as e:
         SpatialMemory(voxel)
+    assert "\n" not in str(e.value)
 
 
 @pytest.mark.parametrize("origin", [(0, 0), (0, np.nan, 0)])

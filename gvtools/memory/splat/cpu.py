@@ -8,7 +8,6 @@ result does not depend on how many threads share the work.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numba
@@ -253,47 +252,45 @@ class CpuSplatter:
 
     def splat(self, request: SplatRequest) -> NDArray[np.float32]:
         """See splat.api.Splatter."""
-        shape = request.target.shape
-        if self.zbuffer.shape != shape:
-            self.zbuffer = np.empty(shape, np.float32)
-            self.total = np.empty((*shape, CHANNELS), np.float32)
-        parts = list(self.store.tiles.split(self.store.segments, request.chosen))
-        if len(parts) > 1:
-            # All are asked for their depth before any is blended: the result is that of one part.
-            for part in parts:
-                self._splat(replace(request, blend=False), part)
-                request = replace(request, limit=self.zbuffer.copy())
-        if request.blend or len(parts) == 1:
-            for i, part in enumerate(parts):
-                self._splat(request, part, fresh=not i)
-        return self.zbuffer
-
-    def _splat(self, request: SplatRequest, part: slice, *, fresh: bool = True) -> None:
-        """Splat some of the segments; not ``fresh`` adds to the last splat's sums."""
         options, target, segments = self.options, request.target, self.store.segments
-        chosen = request.chosen[part]
-        detail = thinning(self.store, target, chosen, px=options.far_detail_px)
-        rows = self.store.tiles.gather(segments, chosen, doublings=detail)
-        reachable = np.empty(0, np.bool_)
-        if request.writable is not None:
-            reachable = near_to(request.writable).ravel()
-        height, width = target.shape
-        K, single = target.camera.K[0], np.float32
+        shape, K, single = target.shape, target.camera.K[0], np.float32
+        if self.zbuffer.shape != shape:
+            self.zbuffer = np.empty(shape, single)
+            self.total = np.empty((*shape, CHANNELS), single)
         lens = TargetCamera(
             target.cam_from_local.astype(single), single(K[0, 0]), single(K[1, 1]),
             single(K[0, 1]), single(K[0, 2] - 0.5), single(K[1, 2] - 0.5),
-            single(np.sqrt(K[0, 0] * K[1, 1])), target.z_near, target.unit, width, height,
+            single(np.sqrt(K[0, 0] * K[1, 1])), target.z_near, target.unit, *shape[::-1],
         )  # fmt: skip
         rules = SplatRules(
             single(options.depth_band), single(options.depth_reach),
             single(options.blend_reach), single(options.max_splat_px),
         )  # fmt: skip
-        rects = SegmentRects(rows.start, rows.length, rows.of(segments.view), rows.of(target.rect))
-        splat_segments(
-            rows.chosen, rects, rows.columns, request.weight, lens, rules,
-            request.limit.reshape(-1), reachable, numba.get_num_threads(), request.blend, fresh,
-            self.zbuffer.reshape(-1), self.total.reshape(-1, CHANNELS),
-        )  # fmt: skip
+        reachable = np.empty(0, np.bool_)
+        if request.writable is not None:
+            reachable = near_to(request.writable).ravel()
+        parts, limit = list(self.store.tiles.split(segments, request.chosen)), request.limit
+        # All are asked for their depth before any is blended: the result is that of one part.
+        passes = [(part, False) for part in parts] if len(parts) > 1 or not request.blend else []
+        passes += [(part, True) for part in parts] if request.blend else []
+        fresh = True
+        for part, blend in passes:
+            chosen = request.chosen[part]
+            detail = thinning(self.store, target, chosen, px=options.far_detail_px)
+            rows = self.store.tiles.gather(segments, chosen, doublings=detail)
+            rects = SegmentRects(
+                rows.start, rows.length, rows.of(segments.view), rows.of(target.rect)
+            )
+            splat_segments(
+                rows.chosen, rects, rows.columns, request.weight, lens, rules, limit.reshape(-1),
+                reachable, numba.get_num_threads(), blend, fresh, self.zbuffer.reshape(-1),
+                self.total.reshape(-1, CHANNELS),
+            )  # fmt: skip
+            if blend:
+                fresh = False
+            else:
+                limit = self.zbuffer.copy()
+        return self.zbuffer
 
     def resolve(self, target: FrameBuffers, open_: NDArray[np.bool_], *, generated: bool) -> None:
         """See splat.api.Splatter."""
