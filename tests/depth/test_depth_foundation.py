@@ -277,17 +277,8 @@ def test_wrong_options_and_folders_are_one_clear_line(tmp_path, weights, capsys)
     with pytest.raises(CheckpointError, match="cannot be read"):
         load_depth_anything(weights)
     scan = write_scan(tmp_path / "scan")
-    run = [
-        "reconstruct",
-        str(scan),
-        "--refine",
-        "0",
-        "--out",
-        str(tmp_path / "run"),
-        "--depth",
-        "da3",
-    ]
-    assert main([*run, "--set", f"da3.weights={tmp_path}"]) == 2
+    words = f"--refine 0 --out {tmp_path / 'run'} --depth da3 --set da3.weights={tmp_path}"
+    assert main(["reconstruct", str(scan), *words.split()]) == 2
     assert "model.safetensors" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
 

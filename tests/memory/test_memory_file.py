@@ -76,8 +76,8 @@ def _flipped(data: bytes, positions, rng):
 def _altered(kind: str, data: bytes, rng):
     if kind == "bits":
         # The directory at the end holds most of what is not covered by a checksum.
-        directory = range(len(data) - 1500, len(data), 4)
-        yield from _flipped(data, [*rng.choice(len(data), 500, replace=False), *directory], rng)
+        directory = range(len(data) - 1500, len(data), 7)
+        yield from _flipped(data, [*rng.choice(len(data), 250, replace=False), *directory], rng)
     elif kind == "every bit":
         yield from _flipped(data, range(len(data)), rng)
     elif kind == "blocks":
