@@ -14,7 +14,6 @@ from gvtools.memory.store.voxel_index import (
     EMPTY_KEY,
     MAX_VOXEL,
     VoxelLevels,
-    group_by_block,
     voxel_keys,
 )
 from gvtools.memory.thinning import thin
@@ -164,17 +163,6 @@ def test_keys_tell_voxels_apart_and_mark_what_is_out_of_reach():
     assert voxel_keys(where, np.ones(8, np.uint8), 1 / edge, above, there) == 2
     assert above[0] == above[3] and there[0] == there[3]
     assert not set(above[:6].tolist()) & set(keys[:4].tolist())
-
-
-def test_grouping_is_a_stable_sort_by_first_appearance():
-    rng = np.random.default_rng(2)
-    blocks = rng.integers(0, 40, 500).astype(np.int32)
-    touched, starts, order = group_by_block(blocks, 50)
-    first = list(dict.fromkeys(blocks.tolist()))
-    assert touched.tolist() == first
-    for rank, block in enumerate(first):
-        rows = order[starts[rank] : starts[rank + 1]]
-        np.testing.assert_array_equal(rows, np.flatnonzero(blocks == block))
 
 
 PLACE = (0.3, 0.3, 10.3)

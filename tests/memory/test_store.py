@@ -18,7 +18,7 @@ from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory, TiledMem
 from gvtools.memory.splat.api import SplatOptions
 from gvtools.memory.splat.torch_splatter import TorchSplatter
 from gvtools.memory.store import tile_set
-from gvtools.memory.store.observations import ATTRIBUTES, Columns
+from gvtools.memory.store.observations import ATTRIBUTES
 from gvtools.memory.store.octree import (
     FAR,
     ROOT,
@@ -26,7 +26,6 @@ from gvtools.memory.store.octree import (
     Octree,
     cell_coordinates,
     cell_keys,
-    parent,
 )
 from gvtools.memory.store.tile import DOUBLINGS, thinned_copy
 from gvtools.memory.store.tile_set import TileSet
@@ -37,7 +36,6 @@ from gvtools.memory.store.voxel_index import (
     VoxelIndex,
     VoxelLevels,
     block_key,
-    extend,
     find_block,
     find_voxel,
     insert_voxel,
@@ -95,14 +93,6 @@ def test_growth_keeps_what_is_there_and_a_cloud_of_before_stays_whole():
 def _frame(depth: float):
     rgb = np.full((30, 40, 3), 90, np.uint8)
     return rgb, np.full((30, 40), depth, np.float32), camera(**SIZE)
-
-
-def test_reserving_doubles_and_leaves_spare_rows():
-    columns = Columns()
-    for _ in range(100):
-        columns.reserve(7)
-        columns.count += 7
-    assert len(columns.positions) == 700 <= len(columns.arrays.positions) <= 1400
 
 
 def test_the_torch_back_end_reads_the_store_in_place():
@@ -213,15 +203,6 @@ def test_a_device_that_is_not_there_is_refused():
             random_memory(1).to("cuda:0")
 
 
-def test_a_copy_on_a_device_is_projected_and_shares_nothing():
-    memory = random_memory(1)
-    other = memory.to("cpu")
-    assert repr(other) == repr(memory)
-    assert not np.shares_memory(other.columns.positions, memory.columns.positions)
-    target = memory.views[0].camera
-    np.testing.assert_array_equal(other.project(target).rgb, memory.project(target).rgb)
-
-
 @pytest.mark.parametrize("number", [-1, 65536])
 def test_a_round_out_of_range_is_refused(number):
     with pytest.raises(OptionError, match="expected 0 to 65535"):
@@ -246,6 +227,9 @@ def test_a_copy_by_to_grows_apart_from_its_original():
     before, voxels = len(memory), memory.voxels
     own = memory.own_confidence()
     other = memory.to("cpu")
+    assert repr(other) == repr(memory)
+    target = memory.views[0].camera
+    np.testing.assert_array_equal(other.project(target).rgb, memory.project(target).rgb)
     for number in range(4, 8):
         other.observe(*_frame(2.0 + number), round=number)
     assert (len(memory), memory.voxels) == (before, voxels) and len(other) > before
@@ -328,20 +312,6 @@ def test_voxels_are_found_again_and_stay_within_the_reserve(seed, blocks):
     assert tables <= 3 * len(known) + 8 * blocks  # no table is less than three eighths full
 
 
-def test_an_empty_block_holds_nothing():
-    index = VoxelIndex()
-    index.block_numbers(np.array([3], np.int64))
-    assert find_voxel(index.pool_local, np.int64(0), np.int64(0), np.uint16(0)) == -1
-    assert index.voxels == 0
-
-
-def test_longer_arrays_keep_what_was_used():
-    array = np.arange(12).reshape(6, 2)
-    longer = extend(array, 9, 4)
-    assert longer.shape == (9, 2)
-    np.testing.assert_array_equal(longer[:4], array[:4])
-
-
 VOXEL = 0.01
 
 
@@ -358,13 +328,6 @@ def test_a_voxel_of_any_level_lies_in_one_cell():
         cell_of: dict[tuple[int, int], int] = {}
         for voxel, cell in zip(keys_at(positions, level), cells.tolist(), strict=True):
             assert cell_of.setdefault(voxel, cell) == cell
-
-
-def test_cells_have_their_coordinates():
-    edge = 128 * VOXEL
-    positions = np.array([[0.1, 0.1, 0.1], [-0.1, edge + 0.1, 2 * edge + 0.1]], np.float32)
-    found = cell_coordinates(cell_keys(positions, VOXEL)) - (1 << 19)
-    assert found.tolist() == [[0, 0, 0], [-1, 1, 2]]
 
 
 def test_tiles_follow_divisions():
@@ -413,12 +376,6 @@ def test_points_beyond_all_cells_have_a_tile():
     spacing = np.full(1, 50.0, np.float32)
     _, made = tree.tiles_of(positions, spacing, VoxelLevels(VOXEL, 1.0), free=0)
     assert made == [FAR]
-
-
-def test_eight_parts_have_one_parent():
-    assert {parent((3, 4 + i, 6 + j, 8 + k)) for i in (0, 1) for j in (0, 1) for k in (0, 1)} == {
-        (4, 2, 3, 4)
-    }
 
 
 @pytest.mark.parametrize("doublings", DOUBLINGS)
