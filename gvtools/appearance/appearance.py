@@ -92,9 +92,9 @@ def blend_colors(
     >>> shown, everywhere = np.full((9, 9, 3), 0.5, np.float32), np.ones((9, 9), bool)
     >>> alike, unlike = shown + np.float32(0.02), shown + np.float32(0.4)
     >>> blend = Blend(share=1.0, tolerance=0.1)
-    >>> round(float(blended(shown, alike, everywhere, blend=blend)[4, 4, 0]), 2)
+    >>> round(float(blend_colors(shown, alike, everywhere, blend=blend)[4, 4, 0]), 2)
     0.52
-    >>> round(float(blended(shown, unlike, everywhere, blend=blend)[4, 4, 0]), 2)
+    >>> round(float(blend_colors(shown, unlike, everywhere, blend=blend)[4, 4, 0]), 2)
     0.5
     """
     weight = blend.share * np.exp(-np.square(_difference(shown, memory, where) / blend.tolerance))
