@@ -23,7 +23,7 @@ from gvtools.errors import DegenerateError, OptionError
 from gvtools.files import replaced_when_written, write_text
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.store.local_frame import LocalFrame
-from gvtools.memory.thinning import thinned
+from gvtools.memory.thinning import thin
 from gvtools.runs.layout import RECORD
 from gvtools.runs.run import load_run
 from pipelines.export.formats import ExportOptions
@@ -186,7 +186,7 @@ def poisson_mesh(
     chosen = ~memory.generated if observed else np.ones(len(memory), np.bool_)
     if not chosen.any():
         raise DegenerateError("the memory holds nothing that was observed; leave out --observed")
-    rows = thinned(memory, None, among=chosen).rows
+    rows = thin(memory, None, among=chosen).rows
     columns = memory.columns
     positions = columns.positions[rows].astype(np.float64)
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(positions))

@@ -18,13 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.appearance.gaussians import Gaussians
-from gvtools.appearance.harmonics import turned
+from gvtools.appearance.harmonics import turn_gaussians
 from gvtools.appearance.splat.project_kernels import LOG_SCALE, LOGIT, QUATERNION, SH
 from gvtools.cameras import Cameras, concatenate
 from gvtools.errors import OptionError, ProjectError
 from gvtools.memory.store.local_frame import LocalFrame
 from gvtools.memory.store.voxel_index import levels_above
-from gvtools.memory.thinning import thinned
+from gvtools.memory.thinning import thin
 from gvtools.runs.run import load_appearance
 from gvtools.runs.target_files import completed_picture
 from pipelines.export.formats import ExportOptions
@@ -156,7 +156,7 @@ class ExportSource:
         if not chosen.any():
             raise OptionError(f"--observed: nothing in {self.path} was observed; leave it out")
         limit = most if options.max_points is None else options.max_points
-        kept = thinned(memory, limit, among=chosen)
+        kept = thin(memory, limit, among=chosen)
         columns = memory.columns
         positions = memory.frame.to_world(columns.positions[kept.rows])
         return ExportPoints(kept.rows, positions, columns.colors[kept.rows], kept.edge)
@@ -177,11 +177,11 @@ class ExportSource:
             return Splats(values, origin, 0, 0, rounds)
         first = appearance.gaussians
         if appearance.exposures is not None:
-            from gvtools.appearance.harmonics import exposed
+            from gvtools.appearance.harmonics import expose
 
             photographs = concatenate([view.camera for view in memory.views.photographed])
-            first = exposed(first, appearance.exposures, photographs)
-        fitted, rest = turned(first.values, first.frame.axes), None
+            first = expose(first, appearance.exposures, photographs)
+        fitted, rest = turn_gaussians(first.values, first.frame.axes), None
         parts = [(fitted, np.zeros(len(fitted), np.int32))]
         if options.max_points is not None:
             rest = options.max_points - len(fitted)

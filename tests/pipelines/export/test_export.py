@@ -15,7 +15,7 @@ from plyfile import PlyData
 from gvtools.errors import OptionError, ProjectError
 from gvtools.memory.ply import export_memory_ply
 from gvtools.memory.spatial_memory import SpatialMemory
-from gvtools.memory.thinning import thinned
+from gvtools.memory.thinning import thin
 from gvtools.scenes.project import open_project
 from pipelines.export.formats import FORMATS
 
@@ -39,7 +39,7 @@ def saved(memory, tmp_path):
 
 
 def test_thinning_keeps_the_most_confident_of_each_voxel(memory):
-    kept = thinned(memory, None)
+    kept = thin(memory, None)
     cells = [
         tuple(cell)
         for cell in np.floor(memory.columns.positions.astype(np.float64) * (1 / VOXEL)).astype(int)
@@ -55,7 +55,7 @@ def test_thinning_keeps_the_most_confident_of_each_voxel(memory):
 
 @pytest.mark.parametrize("limit", [1, 50, 700])
 def test_thinning_to_a_number(memory, limit):
-    kept = thinned(memory, limit)
+    kept = thin(memory, limit)
     assert limit / 6 < len(kept.rows) <= limit
     assert kept.edge > VOXEL
 
@@ -64,7 +64,7 @@ def test_thinning_to_a_number(memory, limit):
 def test_points_all_around_the_origin_are_thinned_to_few(limit):
     memory = SpatialMemory(0.1)
     memory.fuse(points(np.random.default_rng(0).uniform(-3, 3, (500, 3))), round=0)
-    kept = thinned(memory, limit)
+    kept = thin(memory, limit)
     assert 1 <= len(kept.rows) <= limit
     assert kept.edge < 12 and kept.group.max() == len(kept.rows) - 1
 
@@ -102,7 +102,7 @@ def test_colmap_reads_the_model_back(scene, memory, saved, tmp_path):
     in_order = [model.points3D[i] for i in sorted(model.points3D)]
     points = np.array([point.xyz for point in in_order])
     colors = np.array([point.color for point in in_order])
-    kept = thinned(memory, 1500)
+    kept = thin(memory, 1500)
     np.testing.assert_allclose(points, memory.positions[kept.rows])
     np.testing.assert_array_equal(colors, memory.columns.colors[kept.rows])
     # Detections are those of the observations themselves: within a thinned voxel of the point.
@@ -159,7 +159,7 @@ def test_glb_is_what_trimesh_reads(memory, saved, tmp_path):
     export_run(saved, "glb", tmp_path / "cloud.glb")
     scene = trimesh.load_scene(tmp_path / "cloud.glb")
     (cloud,) = scene.dump()
-    kept = thinned(memory, None)
+    kept = thin(memory, None)
     np.testing.assert_allclose(cloud.vertices, memory.positions[kept.rows], atol=1e-6)
     colors, material = glb_colors(tmp_path / "cloud.glb")
     np.testing.assert_array_equal(colors, memory.columns.colors[kept.rows])

@@ -9,7 +9,7 @@ import pytest
 from export_runs import export_run
 from PIL import Image
 
-from gvtools.memory.thinning import thinned
+from gvtools.memory.thinning import thin
 
 pytest.importorskip("rerun")
 
@@ -39,7 +39,7 @@ def points(path):
 def test_points_come_with_their_rounds(reconstructed_run, tmp_path):
     export_run(reconstructed_run.path, "rrd", tmp_path / "out.rrd")
     memory = reconstructed_run.memory
-    rows = thinned(memory, None).rows
+    rows = thin(memory, None).rows
     rounds, made = memory.columns.round[rows], memory.generated[rows]
     found = points(tmp_path / "out.rrd")
     expected = {}

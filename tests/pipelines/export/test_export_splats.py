@@ -14,7 +14,7 @@ from reference_gaussians import rotations
 
 from gvtools.errors import OptionError
 from gvtools.memory.splat.api import SplatOptions
-from gvtools.memory.thinning import thinned
+from gvtools.memory.thinning import thin
 from gvtools.runs.run import load_appearance
 from pipelines.rendering import render_view
 
@@ -62,7 +62,7 @@ def test_gsply_reads_fitted_and_generated_gaussians(fitted_run, tmp_path):
     gsply = pytest.importorskip("gsply")
     export_run(fitted_run.folder, "splat", tmp_path / "out.ply")
     read = gsply.plyread(tmp_path / "out.ply")
-    made = thinned(fitted_run.memory, None, among=fitted_run.memory.generated).rows
+    made = thin(fitted_run.memory, None, among=fitted_run.memory.generated).rows
     gaussians = fitted_run.appearance.gaussians
     fitted = len(gaussians)
     assert len(read.means) == fitted + len(made) and len(made) > 100
@@ -103,7 +103,7 @@ def test_a_memory_without_a_fit_shows_its_points(scene, bare_run, tmp_path):
     assert len(splats["positions"]) == bare_run.memory.voxels
     assert not splats["harmonics"][:, 1:].any()
     # More confidence, more opacity.
-    rows = thinned(bare_run.memory, None).rows
+    rows = thin(bare_run.memory, None).rows
     order = np.argsort(bare_run.memory.confidence[rows])
     assert (np.diff(splats["opacities"][order]) >= -1e-6).all()
     camera = scene.views[1].camera

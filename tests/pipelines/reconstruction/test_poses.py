@@ -11,7 +11,7 @@ from run_files import Killed, kill_after_round_0, reconstructed, results
 from tiny_scan import world_from_cam, write_scan
 
 from gvtools.errors import MemoryFileError
-from gvtools.poses.motions import moved
+from gvtools.poses.motions import move_pose
 from gvtools.procedural.noisy_room import jitter_poses
 from gvtools.runs.poses import RunPoses
 from gvtools.runs.run import load_run
@@ -91,7 +91,7 @@ def test_targets_move_with_the_context_and_are_measured_where_they_were_moved_to
     for i in range(16):
         sign = 1 if i < 8 else -1
         motion = sign * np.array([0.02, 0.01, 0, 0, 0.01, 0])
-        pose = np.linalg.inv(moved(np.linalg.inv(world_from_cam(i)), motion))
+        pose = np.linalg.inv(move_pose(np.linalg.inv(world_from_cam(i)), motion))
         np.savetxt(folder / f"frame-{i:06d}.pose.txt", pose)
     out = run(folder, tmp_path / "run", "context=every:2", "targets=every:2+1", "views_per_round=8")
     kept = RunPoses.load(out / POSES)
