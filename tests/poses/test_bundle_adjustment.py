@@ -19,7 +19,7 @@ VIEWS = 12
 @pytest.fixture(scope="module")
 def room(tmp_path_factory):
     folder = tmp_path_factory.mktemp("room") / "room"
-    write_room(folder, width=320, height=240)
+    write_room(folder)
     scene = open_project(folder)
     names = scene.names[:VIEWS]
     return [scene[name].load() for name in names], scene.subset(names).cameras
