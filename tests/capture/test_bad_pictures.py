@@ -88,6 +88,7 @@ def test_a_failure_says_what_was_met(texture: Image.Image, tmp_path: Path) -> No
     assert "1 of 5 pictures cannot be read: left out (half.jpg)" in line
     assert "1 of 5 pictures are copies of others: left out (again.png)" in line
     assert "\n" not in line
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["photos"]
 
 
 def test_a_camera_that_only_turned_is_told(texture: Image.Image, tmp_path: Path) -> None:

@@ -18,17 +18,8 @@ from gvtools.capture.photographs import copy_upright, find_photographs
 from gvtools.capture.placement import place
 from gvtools.capture.project import capture_photographs
 from gvtools.errors import OptionError, ProjectError
-from gvtools.procedural.room_sample import write_room
 from gvtools.scenes.project import open_project
 from pipelines.cli import main
-
-
-@pytest.fixture(scope="session")
-def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A room's project with true cameras: ten photographs."""
-    folder = tmp_path_factory.mktemp("capture") / "room"
-    write_room(folder, views=10, width=360, height=270)
-    return folder
 
 
 @pytest.fixture(scope="session")
@@ -141,19 +132,6 @@ def test_a_picture_of_elsewhere_is_left_out_and_named(room: Path, tmp_path: Path
     assert set(report.left_out) == {"noise.png"}
     assert len(report.registered) == 5
     assert any("noise.png" in finding.message for finding in report.findings)
-
-
-def test_pictures_that_share_nothing_give_one_line_and_no_folder(tmp_path, capsys):
-    folder = tmp_path / "photos"
-    folder.mkdir()
-    rng = np.random.default_rng(1)
-    for index in range(3):
-        noise = rng.integers(0, 255, (120, 160, 3), np.uint8)
-        Image.fromarray(noise).save(folder / f"{index}.png")
-    assert "show enough of the same" in refused(
-        capsys, "capture", folder, "--out", tmp_path / "out"
-    )
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["photos"]
 
 
 def test_wrong_inputs_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

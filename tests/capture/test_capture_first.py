@@ -13,7 +13,6 @@ from command_line import arguments, refused
 from PIL import Image
 
 from gvtools.errors import OptionError, UnposedError
-from gvtools.procedural.room_sample import write_room
 from pipelines.cli import main
 from pipelines.commands import capture
 from pipelines.commands.capture import open_or_capture
@@ -22,13 +21,6 @@ from pipelines.console import Console
 # Source, project and masks of a capture.
 Asked = tuple[Path, Path, Path | None]
 pytestmark = pytest.mark.usefixtures("unpainted")
-
-
-@pytest.fixture(scope="module")
-def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("first") / "room"
-    write_room(folder, views=8, width=320, height=240)
-    return folder
 
 
 @pytest.fixture
@@ -64,7 +56,7 @@ def test_without_a_terminal_one_line_gives_the_command(room, tmp_path, capsys):
     shutil.copytree(room / "images", photos)
     out = tmp_path / "runs" / "x"
     line = refused(capsys, "reconstruct", photos, "--out", out)
-    assert "8 pictures without cameras" in line
+    assert "10 pictures without cameras" in line
     assert f"gvtools capture '{photos}' --out {out}-project; or add --capture" in line
     assert "a run would find them first" in refused(
         capsys, "reconstruct", photos, "--out", out, "--dry-run", "--capture"
@@ -89,23 +81,13 @@ def test_capture_comes_unasked_and_once(room: Path, captures: list[Asked], tmp_p
     )
     for _ in range(2):
         scene, reading = open_or_capture(args, Console(quiet=True))
-        assert len(scene) == 8
+        assert len(scene) == 10
         assert reading == {"masks": str(masks)}
         assert scene.root == tmp_path / "run-project"
     assert captures == [(room / "images", tmp_path / "run-project", masks)]
     with pytest.raises(OptionError, match="--images: of a COLMAP project"):
-        open_or_capture(
-            arguments(
-                "reconstruct",
-                room / "images",
-                "--out",
-                tmp_path / "b",
-                "--capture",
-                "--images",
-                masks,
-            ),
-            Console(quiet=True),
-        )
+        words = ("--out", tmp_path / "b", "--capture", "--images", masks)
+        open_or_capture(arguments("reconstruct", room / "images", *words), Console(quiet=True))
 
 
 @pytest.mark.parametrize(("answer", "calls"), [("y", 1), ("Yes ", 1), ("", 0), ("n", 0)])
@@ -113,20 +95,19 @@ def test_a_user_at_a_terminal_is_asked(answer, calls, room, captures, tmp_path, 
     questions = on_terminal(monkeypatch, answer)
     args = arguments("reconstruct", room / "images", "--out", tmp_path / "run")
     if calls:
-        assert len(open_or_capture(args, Console())[0]) == 8
+        assert len(open_or_capture(args, Console())[0]) == 10
     else:
-        with pytest.raises(UnposedError, match="8 pictures without cameras"):
+        with pytest.raises(UnposedError, match="10 pictures without cameras"):
             open_or_capture(args, Console())
     assert len(captures) == calls
     (question,) = questions
-    assert "8 pictures without cameras. Capture now to" in question
+    assert "10 pictures without cameras. Capture now to" in question
     assert question.endswith("? [y/N] ")
 
 
 @pytest.mark.slow
-def test_photographs_alone_become_a_run(tmp_path: Path) -> None:
-    room, out = tmp_path / "room", tmp_path / "run"
-    write_room(room, views=10, width=360, height=270)
+def test_photographs_alone_become_a_run(room, tmp_path):
+    out = tmp_path / "run"
     options = ("--capture", "--refine", "0", "--rounds", "1", "--quiet")
     assert main(["reconstruct", str(room / "images"), "--out", str(out), *options]) == 0
     assert (out / "metrics.json").is_file()

@@ -17,7 +17,6 @@ from gvtools.capture.mapping import find_cameras
 from gvtools.capture.matching import MappingTask
 from gvtools.errors import CheckpointError, OptionError
 from gvtools.features import Features, LightGlueMatcher, SiftMatcher
-from gvtools.procedural.room_sample import write_room
 from gvtools.scenes.project import open_project
 
 
@@ -93,13 +92,6 @@ def test_keypoints_are_in_the_pictures_pixels(tmp_path: Path) -> None:
     with pycolmap.Database.open(database) as opened:
         stored = opened.read_keypoints(opened.read_all_images()[0].image_id)
     assert np.allclose(np.asarray(stored)[:, :2], whole.xy)
-
-
-@pytest.fixture(scope="module")
-def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("learned") / "room"
-    write_room(folder, views=10, width=360, height=270)
-    return folder
 
 
 def error_of(model: pycolmap.Reconstruction, room: Path, *, least: int) -> float:
