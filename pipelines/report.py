@@ -193,10 +193,10 @@ def _as_text(value: object) -> str:
     return "not set" if value is None else str(value)
 
 
-def nested(data: Mapping[str, Any] | None, *keys: str) -> Any:
-    """The value below the keys, one within the other; None where one of them is absent or null."""
+def nested(data: Mapping[str, Any] | None, path: str) -> Any:
+    """The value at a path of keys, such as ``images.mean``; None where one is absent or null."""
     value: Any = data
-    for key in keys:
+    for key in path.split("."):
         value = value.get(key) if isinstance(value, Mapping) else None
     return value
 
@@ -342,14 +342,14 @@ def _errors(probe: Mapping[str, Any] | None) -> list[tuple[str, float | None, fl
     if probe is None or not probe.get("pictures"):
         return []
     rows = (
-        ("located, share", ("success_share",)),
-        ("ATE as estimated, rmse, scene units", ("ate_none", "rmse")),
-        ("ATE after Sim(3) alignment, rmse, scene units", ("ate_sim3", "rmse")),
-        ("RPE, rmse, scene units", ("rpe_none", "rmse")),
-        ("rotation error, median, degrees", ("ate_none", "rotation_deg", "median")),
+        ("located, share", "success_share"),
+        ("ATE as estimated, rmse, scene units", "ate_none.rmse"),
+        ("ATE after Sim(3) alignment, rmse, scene units", "ate_sim3.rmse"),
+        ("RPE, rmse, scene units", "rpe_none.rmse"),
+        ("rotation error, median, degrees", "ate_none.rotation_deg.median"),
     )
     true = probe.get("true_pictures")
-    return [(label, nested(probe, *keys), nested(true, *keys)) for label, keys in rows]
+    return [(label, nested(probe, path), nested(true, path)) for label, path in rows]
 
 
 def chosen_targets(

@@ -330,7 +330,7 @@ def _summary(evaluation: Mapping[str, Any]) -> dict[str, Any]:
 
     nothing = Setting(data_set=None, resolution=None, context=None, targets=None)
     figures = dict(measured_row("", [evaluation], nothing).figures)
-    figures["psnr_observed"] = nested(evaluation, "images", "mean", "psnr_valid", "mean")
+    figures["psnr_observed"] = nested(evaluation, "images.mean.psnr_valid.mean")
     figures["coverage"] = evaluation["coverage"]
     figures |= {label: value for label, value, *_ in scalars(evaluation)}
     poses = evaluation.get("poses", {})
@@ -341,7 +341,7 @@ def _summary(evaluation: Mapping[str, Any]) -> dict[str, Any]:
         "figures": figures,
         "views": evaluation["images"]["views"],
         "poses_from": found,
-        "met3r": nested(evaluation, "consistency", "generated", "met3r", "status"),
+        "met3r": nested(evaluation, "consistency.generated.met3r.status"),
         "versions": evaluation["versions"],
         "masked_share": evaluation["images"]["settings"]["masked_share"],
         "notes": evaluation["images"]["notes"],

@@ -241,8 +241,8 @@ def _setting(
         for report in reports
         for view in report["views"]
     }
-    met3r = [nested(e, "consistency", "generated", "met3r", "status") for e in evaluations]
-    poses = [e["poses"] for e in evaluations if nested(e, "poses", "pictures")]
+    met3r = [nested(e, "consistency.generated.met3r.status") for e in evaluations]
+    poses = [e["poses"] for e in evaluations if nested(e, "poses.pictures")]
     located = sum(part["located"] for part in poses), sum(part["pictures"] for part in poses)
     masked = max(
         (e["images"]["settings"]["masked_share"] for e in evaluations if "images" in e), default=0
@@ -277,12 +277,12 @@ def _over_runs(
     """What evaluation.json holds: figures over all runs at the top, then each run's."""
     over = {}
     for name in FIGURES:
-        means = [nested(e, "images", "mean", name, "mean") for e in evaluations]
+        means = [nested(e, f"images.mean.{name}.mean") for e in evaluations]
         over[name] = mean_interval(means, seed=options.seed)
-    poses = [e["poses"] for e in evaluations if nested(e, "poses", "pictures")]
+    poses = [e["poses"] for e in evaluations if nested(e, "poses.pictures")]
     notes: dict[str, str] = {}
     for evaluation in evaluations:
-        notes |= nested(evaluation, "images", "notes") or {}
+        notes |= nested(evaluation, "images.notes") or {}
     return {
         **{name: interval.mean for name, interval in over.items()},
         "coverage": mean_known([e["coverage"] for e in evaluations]),

@@ -25,37 +25,33 @@ BETTER = {"psnr": "higher", "ssim": "higher", "lpips": "lower", "depth": "lower"
 UNITS = {"psnr": "dB"}
 DIGITS = {"psnr": 2, "ssim": 3, "lpips": 3, "depth": 4}
 # Figures of consistency and of poses: name, where evaluation.json has the value, and how many.
-CONSISTENCY: tuple[tuple[str, tuple[str, ...], tuple[str, ...]], ...] = (
-    ("depth reprojection, pixels", ("depth_reprojection", "mean_pixels"),
-     ("depth_reprojection", "pairs")),
-    ("depth reprojection, relative", ("depth_reprojection", "mean_relative_depth"),
-     ("depth_reprojection", "pairs")),
-    ("depth contradicting, share", ("depth_reprojection", "contradicting_share"),
-     ("depth_reprojection", "pairs")),
-    ("verified matches a pair", ("geometric_verification", "mean_verified"),
-     ("geometric_verification", "images")),
-    ("registered, share", ("geometric_verification", "registered_share"),
-     ("geometric_verification", "images")),
-    ("triangulated matches, share", ("geometric_verification", "triangulated_share"), ()),
-    ("reprojection at given poses, pixels", ("geometric_verification", "mean_reprojection"),
-     ("geometric_verification", "points")),
-    ("epipolar distance, pixels", ("geometric_verification", "epipolar"), ()),
+CONSISTENCY = (
+    ("depth reprojection, pixels", "depth_reprojection.mean_pixels", "depth_reprojection.pairs"),
+    ("depth reprojection, relative", "depth_reprojection.mean_relative_depth",
+     "depth_reprojection.pairs"),
+    ("depth contradicting, share", "depth_reprojection.contradicting_share",
+     "depth_reprojection.pairs"),
+    ("verified matches a pair", "geometric_verification.mean_verified",
+     "geometric_verification.images"),
+    ("registered, share", "geometric_verification.registered_share",
+     "geometric_verification.images"),
+    ("triangulated matches, share", "geometric_verification.triangulated_share", ""),
+    ("reprojection at given poses, pixels", "geometric_verification.mean_reprojection",
+     "geometric_verification.points"),
+    ("epipolar distance, pixels", "geometric_verification.epipolar", ""),
 )  # fmt: skip
-POSES: tuple[tuple[str, tuple[str, ...], tuple[str, ...]], ...] = (
-    ("located, share", ("success_share",), ("pictures",)),
-    ("rotation error, median, degrees", ("rotation_error_deg", "median"),
-     ("rotation_error_deg", "n")),
-    ("centre error, median, scene units", ("center_error", "median"), ("center_error", "n")),
-    ("ATE (Sim(3)), rmse, scene units", ("ate_sim3", "rmse"), ("ate_sim3", "n")),
-    ("ATE (Sim(3)), rmse, share of extent", ("ate_sim3", "translation_share", "rmse"),
-     ("ate_sim3", "n")),
-    ("RPE (Sim(3)), rmse, scene units", ("rpe_sim3", "rmse"), ("rpe_sim3", "n")),
-    ("RPE (Sim(3)), rmse, share of extent", ("rpe_sim3", "translation_share", "rmse"),
-     ("rpe_sim3", "n")),
-    ("RPE (Sim(3)), rmse, degrees", ("rpe_sim3", "rotation_deg", "rmse"), ("rpe_sim3", "n")),
-    ("pose AUC at 3 degrees, failures as wrong", ("auc", "3"), ("pictures",)),
-    ("pose AUC at 30 degrees, failures as wrong", ("auc", "30"), ("pictures",)),
-)  # fmt: skip
+POSES = (
+    ("located, share", "success_share", "pictures"),
+    ("rotation error, median, degrees", "rotation_error_deg.median", "rotation_error_deg.n"),
+    ("centre error, median, scene units", "center_error.median", "center_error.n"),
+    ("ATE (Sim(3)), rmse, scene units", "ate_sim3.rmse", "ate_sim3.n"),
+    ("ATE (Sim(3)), rmse, share of extent", "ate_sim3.translation_share.rmse", "ate_sim3.n"),
+    ("RPE (Sim(3)), rmse, scene units", "rpe_sim3.rmse", "rpe_sim3.n"),
+    ("RPE (Sim(3)), rmse, share of extent", "rpe_sim3.translation_share.rmse", "rpe_sim3.n"),
+    ("RPE (Sim(3)), rmse, degrees", "rpe_sim3.rotation_deg.rmse", "rpe_sim3.n"),
+    ("pose AUC at 3 degrees, failures as wrong", "auc.3", "pictures"),
+    ("pose AUC at 30 degrees, failures as wrong", "auc.30", "pictures"),
+)
 SUFFIXES = {"csv": ".csv", "markdown": ".md", "latex": ".tex"}
 
 
@@ -120,34 +116,30 @@ def scalars(evaluation: Mapping[str, Any]) -> list[Scalar]:
     consistency = evaluation.get("consistency")
     if consistency:
         ours, true = consistency["generated"], consistency.get("true_pictures")
-        for label, keys, n in CONSISTENCY:
-            out.append((label, nested(ours, *keys), None, None, _count(ours, n),
-                        nested(true, *keys)))  # fmt: skip
+        out += [_scalar(*entry, part=ours, true=true) for entry in CONSISTENCY]
         features = ours["feature_consistency"]
-        score = features["score"]
-        out.append((
-            "feature consistency", score["mean"], score["low"], score["high"], score["n"],
-            nested(true, "feature_consistency", "score", "mean"),
-        ))  # fmt: skip
+        score, path = features["score"], "feature_consistency.score.mean"
+        ends = score["mean"], score["low"], score["high"], score["n"]
+        out.append(("feature consistency", *ends, nested(true, path)))
         label = "feature consistency of unrelated content"
         out.append((label, features["unrelated"], None, None, None, None))
     poses = evaluation.get("poses", {})
     if poses.get("success_share") is not None:
         left_out, true = poses.get("context_left_out"), poses.get("true_pictures")
-        for label, keys, n in POSES:
-            if keys[0] in poses:
-                out.append((label, nested(poses, *keys), None, None, _count(poses, n),
-                            nested(true, *keys)))  # fmt: skip
-        for label, keys, n in POSES:
-            if left_out and keys[0] in left_out:
-                out.append((f"context left out: {label}", nested(left_out, *keys), None, None,
-                            _count(left_out, n), None))  # fmt: skip
+        for part, head, control in (
+            (poses, "", true),
+            (left_out or {}, "context left out: ", None),
+        ):
+            for label, path, count in POSES:
+                if path.split(".")[0] in part:
+                    out.append(_scalar(head + label, path, count, part=part, true=control))
     return out
 
 
-def _count(part: Mapping[str, Any], keys: Sequence[str]) -> int | None:
-    found = nested(part, *keys) if keys else None
-    return len(found) if isinstance(found, list | tuple) else found
+def _scalar(label: str, path: str, count: str, *, part: Figures, true: Figures | None) -> Scalar:
+    number = nested(part, count)
+    n = len(number) if isinstance(number, list | tuple) else number
+    return label, nested(part, path), None, None, n, nested(true, path)
 
 
 def _without_figures(evaluation: Mapping[str, Any]) -> list[str]:
@@ -180,20 +172,20 @@ def measured_row(
     The time is that of all rounds, as published.
     """
 
-    def mean(*keys: str) -> float | None:
-        values = [nested(evaluation, *keys) for evaluation in evaluations]
+    def mean(path: str) -> float | None:
+        values = [nested(evaluation, path) for evaluation in evaluations]
         known = [value for value in values if value is not None]
         return sum(known) / len(known) if len(known) == len(values) and known else None
 
     figures = {
-        "psnr": mean("images", "mean", "psnr", "mean"),
-        "ssim": mean("images", "mean", "ssim", "mean"),
-        "lpips": mean("images", "mean", "lpips", "mean"),
-        "ate": mean("poses", "ate_sim3", "rmse"),
-        "rpe_r": mean("poses", "rpe_sim3", "rotation_deg", "rmse"),
-        "rpe_t": mean("poses", "rpe_sim3", "rmse"),
+        "psnr": mean("images.mean.psnr.mean"),
+        "ssim": mean("images.mean.ssim.mean"),
+        "lpips": mean("images.mean.lpips.mean"),
+        "ate": mean("poses.ate_sim3.rmse"),
+        "rpe_r": mean("poses.rpe_sim3.rotation_deg.rmse"),
+        "rpe_t": mean("poses.rpe_sim3.rmse"),
         "reproj": None,
-        "met3r": mean("consistency", "generated", "met3r", "score", "mean"),
+        "met3r": mean("consistency.generated.met3r.score.mean"),
         "time": mean("seconds_of_rounds"),
     }
     return MeasuredRow(name, figures, setting)
@@ -228,19 +220,17 @@ def _column(figure: str) -> Column:
 
 
 # Heading, unit, better, decimals, and where a measured method has the figure.
-SIDE_BY_SIDE: tuple[tuple[str, str, str, int, tuple[str, ...]], ...] = (
-    ("PSNR", "dB", "higher", 2, ("images", "mean", "psnr", "mean")),
-    ("SSIM", "", "higher", 3, ("images", "mean", "ssim", "mean")),
-    ("LPIPS", "", "lower", 3, ("images", "mean", "lpips", "mean")),
-    ("PSNR, observed", "dB", "higher", 2, ("images", "mean", "psnr_valid", "mean")),
-    ("PSNR, never observed", "dB", "higher", 2,
-     ("images", "mean", "psnr_never_observed", "mean")),
-    ("feature consistency", "", "lower", 3,
-     ("consistency", "generated", "feature_consistency", "score", "mean")),
-    ("located", "share", "higher", 3, ("poses", "success_share")),
-    ("rotation error", "degrees", "lower", 3, ("poses", "rotation_error_deg", "median")),
-    ("centre error", "scene units", "lower", 4, ("poses", "center_error", "median")),
-)  # fmt: skip
+SIDE_BY_SIDE = (
+    ("PSNR", "dB", "higher", 2, "images.mean.psnr.mean"),
+    ("SSIM", "", "higher", 3, "images.mean.ssim.mean"),
+    ("LPIPS", "", "lower", 3, "images.mean.lpips.mean"),
+    ("PSNR, observed", "dB", "higher", 2, "images.mean.psnr_valid.mean"),
+    ("PSNR, never observed", "dB", "higher", 2, "images.mean.psnr_never_observed.mean"),
+    ("feature consistency", "", "lower", 3, "consistency.generated.feature_consistency.score.mean"),
+    ("located", "share", "higher", 3, "poses.success_share"),
+    ("rotation error", "degrees", "lower", 3, "poses.rotation_error_deg.median"),
+    ("centre error", "scene units", "lower", 4, "poses.center_error.median"),
+)
 
 
 def judge_tables(figures: Figures) -> dict[str, Table]:
@@ -258,14 +248,14 @@ def judge_tables(figures: Figures) -> dict[str, Table]:
 def side_by_side(figures: Figures) -> Table:
     """One row a method, and one of the true pictures where they were measured."""
     methods, total = figures["methods"], len(figures["targets"])
-    shown = [row for row in SIDE_BY_SIDE if any(nested(m, *row[4]) is not None for m in methods)]
+    shown = [row for row in SIDE_BY_SIDE if any(nested(m, row[4]) is not None for m in methods)]
     columns = [Column("method"), Column("views"), Column("matched by")]
     columns += [Column(title, unit, better, digits) for title, unit, better, digits, _ in shown]
     ranks = [_ranks(methods, path, better=better, total=total) for _, _, better, _, path in shown]
     rows: list[tuple[Value, ...]] = []
     for number, method in enumerate(methods):
         cells = [
-            Ranked(nested(method, *path), rank[number])
+            Ranked(nested(method, path), rank[number])
             for (_, _, _, _, path), rank in zip(shown, ranks, strict=True)
         ]
         views = f"{method['views']} of {total}"
@@ -276,22 +266,20 @@ def side_by_side(figures: Figures) -> Table:
     return Table(tuple(columns), tuple(rows), "Side by side", tuple(_notes(figures)))
 
 
-def _ranks(
-    methods: Sequence[Figures], path: Sequence[str], *, better: str, total: int
-) -> list[int | None]:
+def _ranks(methods: Sequence[Figures], path: str, *, better: str, total: int) -> list[int | None]:
     """Ranks of the methods that have a picture of every view, if there are two; of others None."""
-    values = [nested(m, *path) if m["views"] == total else None for m in methods]
+    values = [nested(m, path) if m["views"] == total else None for m in methods]
     known = sorted((v for v in values if v is not None), reverse=better == "higher")
     ranked = len(known) > 1
     return [known.index(v) + 1 if ranked and v is not None else None for v in values]
 
 
-def _control(method: Figures, path: Sequence[str]) -> float | None:
+def _control(method: Figures, path: str) -> float | None:
     """The figure of the true pictures."""
-    if path[0] == "images":
+    part, _, rest = path.partition(".")
+    if part == "images":
         return None
-    at = path[1:] if path[0] == "poses" else path[2:]
-    value: float | None = nested(method, path[0], "true_pictures", *at)
+    value: float | None = nested(method, f"{part}.true_pictures.{rest.removeprefix('generated.')}")
     return value
 
 
@@ -311,7 +299,7 @@ def _notes(figures: Figures) -> list[str]:
             width, height = entry["from"]
             parts.append(f"{entry['pictures']} pictures of {width}x{height} pixels resized")
         notes.append(f"{method['name']}: {'; '.join([*parts, *method['reading']])}")
-        reasons = nested(method, "images", "notes") or {}
+        reasons = nested(method, "images.notes") or {}
         notes += [f"{key}: {why}" for key, why in reasons.items() if key == "lpips"]
     if figures["poses"] != "recorded":
         notes.append(
@@ -343,7 +331,7 @@ def _views(methods: Sequence[Figures]) -> Table:
     rows = [
         (method["name"], *(view[name] for name in (*plain, *JUDGED)))
         for method in methods
-        for view in nested(method, "images", "views") or ()
+        for view in nested(method, "images.views") or ()
     ]
     return Table(tuple(columns), tuple(rows), "Views")
 
