@@ -18,7 +18,7 @@ from PIL import Image
 from training_runs import ROOT, on_two, sets
 
 from gvtools.completers.geoverse import from_pretrained
-from gvtools.training.loop import load_state
+from gvtools.training import loop
 from gvtools.training.records import read_log
 from pipelines.cli import main
 
@@ -30,8 +30,12 @@ SAMPLES: list[str] = []
 
 @pytest.fixture(scope="module", autouse=True)
 def samples(tmp_path_factory):
-    """The same few samples for every training, made once."""
-    SAMPLES[:] = sets("data.pool=24", f"data.cache={tmp_path_factory.mktemp('pool')}")
+    """The same few samples for every training, made once; a record every few steps."""
+    pool = f"data.cache={tmp_path_factory.mktemp('pool')}"
+    SAMPLES[:] = sets("data.pool=24", pool, "encoder.statistics=1")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(loop, "LOG_EVERY", 4)
+        yield
 
 
 def train(out: Path, stage: str, *more: str) -> int:
@@ -48,7 +52,7 @@ def weights_of(folder: Path) -> dict[str, torch.Tensor]:
 
 
 # Steps of each stage.
-COUNTS = {"encoder": 24, "denoiser": 6, "reflow": 3, "heads": 4, "refiner": 3}
+COUNTS = {"encoder": 10, "denoiser": 6, "reflow": 3, "heads": 4, "refiner": 3}
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +67,7 @@ def trained(tmp_path_factory) -> Path:
 
 def test_the_loss_falls_and_every_stage_leaves_weights_that_load(trained):
     records = read_log(trained / "encoder")
-    assert records[-1]["step"] == 24
+    assert records[-1]["step"] == 10
     assert records[-1]["loss"] < records[0]["loss"]
     encoder = from_pretrained(trained / "encoder" / "weights")
     assert not encoder.config.trained
@@ -150,9 +154,9 @@ def test_a_training_without_that_stage_says_so(tmp_path, capsys):
 
 def test_a_resumed_training_is_the_uninterrupted_one(trained, tmp_path):
     again = tmp_path / "again"
-    assert train(again, "encoder", *steps("encoder", 24), "--until", "9") == 0
+    assert train(again, "encoder", *steps("encoder", 10), "--until", "3") == 0
     assert not (again / "encoder" / "weights").exists()
-    assert train(again, "encoder", *steps("encoder", 24), "--resume") == 0
+    assert train(again, "encoder", *steps("encoder", 10), "--resume") == 0
     assert not moved(trained / "encoder", again / "encoder")
 
 
@@ -265,15 +269,15 @@ def test_results_that_cannot_be_written_are_refused_before_anything_is_trained(
 def test_batches_across_different_context_counts_are_refused_at_once(tmp_path, capsys):
     assert train(tmp_path, "encoder", "--set", "encoder.optimizer.batch=12") == 2
     assert "optimizer.batch = 12" in capsys.readouterr().err
-    more = ["--set", "encoder.optimizer.batch=24", "--set", "encoder.optimizer.accumulate=3"]
+    more = sets("encoder.optimizer.batch=16", "encoder.optimizer.accumulate=2")
     assert train(tmp_path, "encoder", *more, "--until", "1") == 0
 
 
 def test_a_training_is_not_mixed_with_another(trained, tmp_path, capsys):
-    assert train(trained, "encoder", *steps("encoder", 24)) == 2
+    assert train(trained, "encoder", *steps("encoder", 10)) == 2
     assert "--resume" in capsys.readouterr().err
     assert train(trained, "encoder", *steps("encoder", 25), "--resume") == 2
-    assert "options.optimizer.steps = 24, now 25" in capsys.readouterr().err
+    assert "options.optimizer.steps = 10, now 25" in capsys.readouterr().err
     assert train(tmp_path / "new", "denoiser") == 2
     assert "run --stage encoder first" in capsys.readouterr().err
     assert train(tmp_path / "new", "encoder", "--set", "encoder.optimizer.stepz=3") == 2
@@ -296,7 +300,7 @@ def test_bad_batches_are_skipped_and_counted(tmp_path):
     assert train(tmp_path, "encoder", *more) == 0
     assert read_log(tmp_path / "encoder")[-1]["skipped"] == 2
     state = torch.load(tmp_path / "encoder" / "state.pt", weights_only=True)
-    loaded = load_state(tmp_path / "encoder", state["identity"])
+    loaded = loop.load_state(tmp_path / "encoder", state["identity"])
     assert loaded is not None and loaded.progress.skipped == 2
 
 
@@ -322,7 +326,7 @@ def test_a_trained_model_is_packed_with_its_record(trained, tmp_path, capsys):
     whole = (trained / "refiner" / "weights" / "geoverse.safetensors").stat().st_size
     assert (out / "geoverse.safetensors").stat().st_size < 0.6 * whole
     settings = json.loads((out / "training_encoder.json").read_text())
-    assert settings["encoder"]["optimizer"]["steps"] == 24 and settings["data"]["cache"] is None
+    assert settings["encoder"]["optimizer"]["steps"] == 10 and settings["data"]["cache"] is None
     last = json.loads((out / "log_reflow.jsonl").read_text().splitlines()[-1])
     assert last["step"] == 3
     shutil.copytree(trained, tmp_path / "again")

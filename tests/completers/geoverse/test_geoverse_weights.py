@@ -486,5 +486,5 @@ def test_the_video_folder_is_checked_as_it_is_loaded(folder: Path) -> None:
     ):
         config = replace(CONTROL, video=video)
         assert message in report(folder, "video", config).summary
-        with pytest.raises(CheckpointError, match=message):
-            from_pretrained(folder, config=config)
+    with pytest.raises(CheckpointError, match=message):
+        from_pretrained(folder, config=config)
