@@ -122,17 +122,11 @@ def read_mask(path: Path) -> NDArray[np.bool_]:
 def read_depth(
     path: Path, *, unit: float = 1.0, maximum: float | None = None
 ) -> NDArray[np.float32]:
-    """The depth map at ``path``.
+    """(H, W) float32 z-depth, scene units, of a depth map whose stored unit is ``unit``.
 
-    Args:
-        path: 16-bit PNG, PGM or TIFF, float TIFF, ``.npy``, ``.npz`` with the key ``depth``, or
-            COLMAP's ``.bin``.
-        unit: scene units per stored unit.
-        maximum: greater depths, in scene units, count as no reading.
-
-    Returns:
-        (H, W) float32 z-depth, scene units; 0 where the file says 0, a negative number, NaN or
-        infinity, or, in 16-bit files, 65535.
+    It is a 16-bit PNG, PGM or TIFF, float TIFF, ``.npy``, ``.npz`` with the key ``depth``, or
+    COLMAP's ``.bin``. 0 stands where the file says 0, a negative number, NaN, infinity, more than
+    ``maximum``, or, in 16-bit files, 65535.
     """
     loaders = {".npy": _load_array, ".npz": _load_array, ".bin": _load_colmap}
     raw = loaders.get(path.suffix, _load_depth_image)(path)

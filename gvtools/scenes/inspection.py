@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from itertools import product
+from math import hypot
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
+from gvtools.cameras import Cameras
 from gvtools.errors import GvError
-from gvtools.scenes.pose_contradictions import GreyThumbnail, contradiction_findings, thumbnail
-from gvtools.scenes.scene import Finding, Scene
+from gvtools.scenes.scene import Finding, Frame, Scene, SparsePoints
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
 
 # Focal lengths of usual lenses, over the image's sides.
 FOCAL = (0.1, 50.0)
@@ -70,10 +78,8 @@ class _Opened(NamedTuple):
 def inspect(scene: Scene, *, probes: int | None = None) -> SceneReport:
     """Open a scene's files and sum up what a run would get.
 
-    Files that cannot be read become error findings; nothing is raised for them.
-
-    Args:
-        probes: how many views have their pixels decoded, evenly spread; None: all.
+    Files that cannot be read become error findings; nothing is raised for them. At most ``probes``
+    views, evenly spread, have their pixels decoded.
     """
     findings = list(scene.findings)
     opened = _open(scene, spread(len(scene), probes), findings)
@@ -231,3 +237,280 @@ def _depth(scene: Scene, opened: list[_Opened]) -> DepthSummary | None:
         float(np.median(ranges[:, 1])),
         float(ranges[:, 2].max()),
     )
+
+
+# --- poses that contradict each other -------------------------------------------------------------
+#
+# Structure from motion that meets an object which repeats (a label on two sides, equal facades) can
+# give pictures of one side the poses of the other. Reprojection errors stay small then, since every
+# point fits. What gives such poses away is a pair of cameras at nearly the same place, with nearly
+# the same orientation, that see different surroundings.
+#
+# The parallax between such cameras is small, so that the homography of their rotation,
+# ``K_b R K_a⁻¹``, carries one picture onto the other up to a few pixels of a small picture. Windows
+# are compared by zero-normalised cross-correlation, which no change of brightness or contrast
+# alters, at the best of a few shifts, which take up what parallax is left.
+
+# Cameras count as nearly equal below this distance, in scene depths, and this angle.
+NEAR = 0.06
+NEAR_DEGREES = 10.0
+# How many of its nearest cameras a view is compared with.
+NEIGHBORS = 6
+# Pictures are compared at this length of the longer side, in square windows, at shifts, in pixels.
+SIDE, WINDOW, SHIFT = 48, 9, 3
+# A window has contrast from this standard deviation, grey levels, and agrees from this correlation.
+CONTRAST, AGREE = 4.0, 0.5
+# Pictures can be compared when this share of them has contrast, and contradict each other when more
+# than the second share of that disagrees. On six real scenes it is at most 0.03.
+COMPARABLE, DISAGREEING = 0.3, 0.15
+# Sparse points contradict when each view has at least this many that lie in the other's picture,
+# and less than this share of them is of both. On three real scenes it is at least 0.5.
+POINTS, SHARED = 30, 0.05
+LISTED = 3  # pairs that the finding names
+# Places of the shifted window in the padded picture, unshifted first.
+_SHIFTS = sorted(
+    product(range(2 * SHIFT + 1), repeat=2), key=lambda at: hypot(at[0] - SHIFT, at[1] - SHIFT)
+)
+
+
+class GreyThumbnail(NamedTuple):
+    """A picture reduced for comparison: (h, w) float32 grey levels, and where they may be used."""
+
+    grey: Float32
+    valid: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Contradiction:
+    """Two views whose poses cannot both be right."""
+
+    names: tuple[str, str]  # of the two
+    distance: float  # between the camera centres, scene units
+    degrees: float  # between their orientations
+    # share of the comparable area in which the pictures differ; None where the pictures could
+    # not be compared
+    disagreement: float | None
+    shared_points: int | None  # sparse points of both views; None without enough points
+    points: int | None  # of those that could be shared, the smaller number of the two views
+
+    def __str__(self) -> str:
+        if self.disagreement is not None and self.disagreement > DISAGREEING:
+            evidence = f"{self.disagreement:.0%} of the picture differs"
+        else:
+            evidence = f"{self.shared_points} of {self.points} sparse points shared"
+        return f"{self.names[0]} and {self.names[1]} ({evidence})"
+
+
+@dataclass(frozen=True, eq=False)
+class _Tracks:
+    """Sparse points by the views that detected them."""
+
+    points: SparsePoints  # all
+    # for each view the points of its track elements, repeats included
+    of_view: list[NDArray[np.int32]]
+
+    @staticmethod
+    def of(points: SparsePoints, views: int) -> _Tracks:
+        return _Tracks(points, [points.point_index[rows] for rows in points.rows_of_views(views)])
+
+    def depths(self, cameras: Cameras) -> dict[int, float]:
+        """Median z-depth of the points of each view that has any, scene units."""
+        axes = cameras.cam_from_world[:, 2]
+        return {
+            view: float(np.median(self.points.positions[rows] @ axis[:3] + axis[3]))
+            for view, (rows, axis) in enumerate(zip(self.of_view, axes, strict=True))
+            if len(rows)
+        }
+
+    def shared(self, cameras: Cameras, views: tuple[int, int]) -> tuple[int, int] | None:
+        """How many points both views have, and of how many; None where too few can tell."""
+        own = [np.unique(self.of_view[view]) for view in views]
+        inside = []
+        for rows, other in zip(own, reversed(views), strict=True):
+            xy, z = cameras[other].project(self.points.positions[rows])
+            size = [cameras.width[other], cameras.height[other]]
+            with np.errstate(invalid="ignore"):
+                seen = (z[0] > 0) & (xy[0] >= 0).all(-1) & (xy[0] < size).all(-1)
+            inside.append(int(seen.sum()))
+        if min(inside) < POINTS:
+            return None
+        return len(np.intersect1d(own[0], own[1])), min(inside)
+
+
+def turn_degrees(a: Float64, b: Float64) -> Float64:
+    """(...) degrees between rotations, which (..., 3, 3) or (..., 4, 4) begin with."""
+    apart = np.linalg.norm(a[..., :3, :3] - b[..., :3, :3], axis=(-2, -1))
+    # The Frobenius distance of two rotations that differ by the angle t is sqrt(8) sin(t / 2).
+    return np.asarray(np.degrees(2 * np.arcsin(np.minimum(apart / np.sqrt(8), 1))))
+
+
+def thumbnail(frame: Frame) -> GreyThumbnail:
+    """The frame's picture reduced to ``SIDE`` pixels on its longer side."""
+    height, width = frame.rgb.shape[:2]
+    scale = SIDE / max(height, width)
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    grey = cv2.resize(
+        cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA
+    )
+    valid = np.ones(grey.shape, np.bool_)
+    if frame.mask is not None:
+        share = cv2.resize(frame.mask.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+        valid = share > 0.99
+    return GreyThumbnail(grey.astype(np.float32), valid)
+
+
+def contradiction_findings(
+    scene: Scene, thumbnails: Mapping[int, GreyThumbnail], depths: Mapping[int, float]
+) -> list[Finding]:
+    """One warning when nearly equal cameras see different things, else nothing.
+
+    By the view's number, ``thumbnails`` are of those that could be read, ``depths`` median z-depth.
+    """
+    found = contradictions(scene, thumbnails, depths)
+    if not found:
+        return []
+    more = f" and {len(found) - LISTED} more" if len(found) > LISTED else ""
+    message = (
+        f"{len(found)} pairs of views have nearly equal cameras but show different things: "
+        f"{', '.join(str(pair) for pair in found[:LISTED])}{more}; expected at most "
+        f"{DISAGREEING:.0%} of the picture to differ and at least {SHARED:.0%} of the points to be "
+        "shared: their poses contradict each other (an object that looks alike from two sides, "
+        "swapped pictures, or something large that moved); look at these pairs, then solve the "
+        "poses again or leave the wrong views out (--context)"
+    )
+    return [Finding("warning", message)]
+
+
+def contradictions(
+    scene: Scene, thumbnails: Mapping[int, GreyThumbnail], depths: Mapping[int, float]
+) -> list[Contradiction]:
+    """The pairs of views whose poses contradict each other, worst first; arguments as above."""
+    if len(scene) < 2:
+        return []
+    cameras = scene.cameras
+    tracks = None if scene.points is None else _Tracks.of(scene.points, len(scene))
+    found = []
+    for a, b, distance, degrees in _near_pairs(cameras, _reach(scene, depths, tracks)):
+        points = None if tracks is None else tracks.shared(cameras, (a, b))
+        unshared = points is not None and points[0] < SHARED * points[1]
+        differs = None
+        if a in thumbnails and b in thumbnails:
+            pair = thumbnails[a], thumbnails[b]
+            enough = 0.0 if unshared else DISAGREEING
+            differs = disagreement(*pair, homography(pair, cameras, (a, b)), enough=enough)
+        if unshared or (differs is not None and differs > DISAGREEING):
+            names = scene.views[a].name, scene.views[b].name
+            shared, of = points or (None, None)
+            found.append(Contradiction(names, distance, degrees, differs, shared, of))
+    return sorted(found, key=lambda pair: -(pair.disagreement or 1.0))
+
+
+def disagreement(
+    a: GreyThumbnail, b: GreyThumbnail, H: Float64, *, enough: float = 0.0
+) -> float | None:
+    """Share of the area with contrast in which two pictures differ, carried over by a homography.
+
+    None where less than ``COMPARABLE`` of the picture lies in both and has contrast in both. The
+    search among shifts ends once the share is at most ``enough``: each shift can lower it alone,
+    so that ending early never turns a pair into a contradiction or back. Most pairs agree at once,
+    unshifted.
+    """
+    x = a.grey - a.grey.mean()
+    y, valid = _carried(b, H, a.grey.shape)
+    mask = (valid & a.valid).astype(np.float32)
+    weight = np.maximum(_window(mask), 1e-6)
+    mean_y = _window(mask * y) / weight
+    var_y = np.maximum(_window(mask * y * y) / weight - mean_y**2, 0)
+    best = np.full(x.shape, -1.0, np.float32)
+    contrast = np.zeros(x.shape, np.bool_)
+    share = 1.0
+    padded = cv2.copyMakeBorder(x, *(SHIFT,) * 4, cv2.BORDER_REPLICATE)
+    for dy, dx in _SHIFTS:
+        moved = padded[dy : dy + x.shape[0], dx : dx + x.shape[1]]
+        weighted = mask * moved
+        mean_x = _window(weighted) / weight
+        var_x = np.maximum(_window(weighted * moved) / weight - mean_x**2, 0)
+        both = _window(weighted * y) / weight
+        correlation = (both - mean_x * mean_y) / np.sqrt(var_x * var_y + 1e-3)
+        np.maximum(best, correlation, out=best)
+        if dx == dy == SHIFT:
+            contrast = (np.minimum(var_x, var_y) > CONTRAST**2) & (weight > 0.4)
+            if contrast.mean() < COMPARABLE:
+                return None
+        share = float((best[contrast] < AGREE).mean())
+        if share <= enough:
+            break
+    return share
+
+
+def _window(values: Float32) -> Float32:
+    """Means over windows; what lies outside the picture counts as zero."""
+    return np.asarray(cv2.blur(values, (WINDOW, WINDOW), borderType=cv2.BORDER_CONSTANT))
+
+
+def homography(
+    pair: tuple[GreyThumbnail, GreyThumbnail], cameras: Cameras, views: tuple[int, int]
+) -> Float64:
+    """(3, 3) from pixels of the first picture to those of the second, as OpenCV counts them."""
+    Ks = []
+    for picture, view in zip(pair, views, strict=True):
+        height, width = picture.grey.shape
+        scale = np.array([width / cameras.width[view], height / cameras.height[view], 1])
+        Ks.append(scale[:, None] * cameras.K[view])
+    poses = cameras.cam_from_world
+    rotation = poses[views[1], :3, :3] @ poses[views[0], :3, :3].T
+    half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])  # OpenCV counts from pixel centres
+    return np.asarray(np.linalg.inv(half) @ Ks[1] @ rotation @ np.linalg.inv(Ks[0]) @ half)
+
+
+def _carried(
+    b: GreyThumbnail, H: Float64, shape: tuple[int, ...]
+) -> tuple[Float32, NDArray[np.bool_]]:
+    """The second picture seen from the first's orientation, and where it is known."""
+    size = shape[1], shape[0]
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    grey = cv2.warpPerspective(b.grey - b.grey.mean(), H, size, flags=flags)
+    valid = cv2.warpPerspective(b.valid.astype(np.float32), H, size, flags=flags)
+    return np.asarray(grey, np.float32), valid > 0.99
+
+
+def _reach(scene: Scene, depths: Mapping[int, float], tracks: _Tracks | None) -> Float64:
+    """(V,) how far another camera may stand from each, scene units.
+
+    A share of the view's depth, from its sparse points or its depth map. A scene that has neither
+    is taken to be as deep as its cameras are spread, and half the mean step from view to view is
+    the most.
+    """
+    cameras = scene.cameras
+    centers = cameras.centers
+    known = dict(depths)
+    if tracks is not None:
+        known |= tracks.depths(cameras)
+    if known:
+        middle = float(np.median(list(known.values())))
+        return NEAR * np.array([known.get(view, middle) for view in range(len(scene))])
+    step = float(np.linalg.norm(np.diff(centers, axis=0), axis=1).mean())
+    return np.full(len(scene), min(NEAR * float(np.ptp(centers, axis=0).max()), step / 2))
+
+
+def _near_pairs(cameras: Cameras, reach: Float64) -> list[tuple[int, int, float, float]]:
+    """Pairs of nearly equal cameras: numbers, distance (scene units) and angle (degrees)."""
+    from scipy.spatial import KDTree
+
+    centers, rotations = cameras.centers, cameras.cam_from_world[:, :3, :3]
+    unit = float(np.median(reach))
+    if not unit > 0:
+        return []
+    # The Frobenius distance of two rotations that differ by the angle t is sqrt(8) sin(t / 2).
+    turn = np.sqrt(8) * np.sin(np.radians(NEAR_DEGREES) / 2)
+    places = np.concatenate([centers / unit, rotations.reshape(-1, 9) / turn], axis=1)
+    count = min(NEIGHBORS + 1, len(cameras))
+    _, nearest = KDTree(places).query(places, count)
+    pairs = {(min(a, int(b)), max(a, int(b))) for a, row in enumerate(nearest) for b in row}
+    near = []
+    for a, b in sorted(pairs):
+        distance = float(np.linalg.norm(centers[a] - centers[b]))
+        degrees = float(turn_degrees(rotations[a], rotations[b]))
+        if a != b and distance < min(reach[a], reach[b]) and degrees < NEAR_DEGREES:
+            near.append((a, b, distance, degrees))
+    return near

@@ -131,12 +131,9 @@ def posed_scene(
 ) -> Scene:
     """The scene of the frames that can be used.
 
-    Args:
-        poses: which way ``PosedFrame.pose`` maps.
-        metric: whether the units of poses and depth are metres.
-        home: the folder that no file of a data set's frame may lie outside of; None: ``root``.
-        unposed: reason for which frames without a pose are left out.
-        advice: where no frame can be used, what to do.
+    ``poses`` is which way those of the frames map. No file of a data set's frame may lie outside of
+    ``home``, or else ``root``. ``unposed`` is the reason for which frames without a pose are left
+    out, ``advice`` what to do where none can be used.
     """
     sieve = _Sieve(len(frames), strict)
     lenses: dict[LensParameters, Undistortion] = {}

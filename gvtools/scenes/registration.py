@@ -28,19 +28,10 @@ def register_depth(
     width: int,
     height: int,
 ) -> NDArray[np.float32]:
-    """The depth map as the colour camera would have measured it.
+    """(height, width) float32 z-depth as the colour camera would have measured it, 0 for none.
 
-    Args:
-        depth: (h, w) z-depth of the depth camera, scene units, 0 = none.
-        depth_K: (3, 3), pixels, first pixel centre (0.5, 0.5).
-        color_K: (3, 3), pixels, first pixel centre (0.5, 0.5).
-        color_from_depth: (4, 4) rigid, scene units.
-        width: of the colour picture, pixels.
-        height: of the colour picture, pixels.
-
-    Returns:
-        (height, width) float32 z-depth of the colour camera, 0 where no surface falls on the
-        pixel's centre.
+    Intrinsics are (3, 3), pixels, first pixel centre (0.5, 0.5); ``color_from_depth`` is (4, 4)
+    rigid in scene units. A pixel has depth where a surface falls on its centre.
     """
     z = np.ascontiguousarray(depth, np.float32)
     K_depth, K_color = np.asarray(depth_K, np.float64), np.asarray(color_K, np.float64)

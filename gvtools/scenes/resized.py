@@ -19,13 +19,10 @@ SMALLEST = 64
 
 
 def reduced(scene: Scene, max_side: int | None) -> Scene:
-    """The scene with no picture's longer side above ``max_side``.
+    """The scene with no picture's longer side above ``max_side`` pixels; None keeps every size.
 
     Colours are averaged over what they stand for; depth and masks take the nearest pixel, so that
     no depth lies between two surfaces. Cameras and detections of sparse points follow.
-
-    Args:
-        max_side: pixels; None keeps every size.
     """
     check_max_side(max_side)
     sizes = np.array([(view.camera.width[0], view.camera.height[0]) for view in scene.views])
@@ -65,10 +62,6 @@ def resized(scene: Scene, width: int, height: int) -> Scene:
     The largest central window of that shape is taken and resampled: colours are averaged where
     pictures become smaller and interpolated where they grow; depth and masks take the nearest
     pixel. Cameras and detections of sparse points follow.
-
-    Args:
-        width: pixels.
-        height: pixels.
     """
     windows = [_window(view, width, height) for view in scene.views]
     views = tuple(
@@ -91,10 +84,6 @@ def seen_by(scene: Scene, names: Iterable[str]) -> Scene:
     """The scene with the sparse points alone that two of the named views detected.
 
     Their positions stay as they were solved, with the help of all views.
-
-    Args:
-        scene: left as it is; without points it comes back.
-        names: of the views, such as those of the context.
     """
     points = scene.points
     if points is None:

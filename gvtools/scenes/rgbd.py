@@ -359,11 +359,7 @@ class _Redwood(RgbdFolder):
 
 
 def read_log(path: Path) -> tuple[list[int], list[Float64]]:
-    """A ``.log`` trajectory: blocks of three integers and a 4x4 camera-to-world matrix.
-
-    Returns:
-        Each block's first integer and its (4, 4) matrix, as read.
-    """
+    """The first integers and (4, 4) matrices of a ``.log`` trajectory's blocks, as read."""
     with reading(path, "expected blocks of three integers and four lines of four numbers"):
         rows = [line.split() for line in read_text(path).splitlines()]
         rows = [row for row in rows if row]

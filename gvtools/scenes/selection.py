@@ -31,11 +31,7 @@ _FORMS = {
 
 
 def select(names: Sequence[str], spec: str) -> tuple[str, ...]:
-    """The names that ``spec`` selects, in the order of ``names``.
-
-    Args:
-        names: a scene's view names, in its order.
-    """
+    """The view names that ``spec`` selects, in the order of ``names``."""
     pictures: dict[str, list[int]] = {}
     for i, name in enumerate(names):
         pictures.setdefault(picture_of(name), []).append(i)

@@ -137,11 +137,7 @@ def transforms_frames(
 def read_transforms_cameras(path: Path) -> Cameras:
     """The cameras of a ``transforms.json`` alone, as a path has them: no picture has to be there.
 
-    Distorted cameras become the pinhole cameras that ``read_transforms`` gives them.
-
-    Returns:
-        One camera a perspective view of a frame, in the order of names that ``read_transforms``
-        has.
+    Views and their order are those of ``read_transforms``.
     """
     data = load_frames(path)
     files = _pictures(path, data["frames"])
@@ -298,12 +294,7 @@ class FrameKeys(BaseModel):
     p2: Number = 0.0
 
     def lens(self, picture: Path, *, what: str) -> LensParameters:
-        """The recorded camera.
-
-        Args:
-            picture: tells the size where no key does.
-            what: where the keys were read, for messages.
-        """
+        """The recorded camera; the ``picture`` tells the size where no key does."""
         if self.w is None or self.h is None:
             header = read_header(picture)
             size = header.width, header.height
@@ -349,12 +340,7 @@ class FrameKeys(BaseModel):
 
 
 def frame_keys(frame: Mapping[str, Any], shared: Mapping[str, Any], *, what: str) -> FrameKeys:
-    """A frame's keys, checked.
-
-    Args:
-        shared: the file's, of which those of the camera stand in for absent ones of the frame.
-        what: where they were read, for the message.
-    """
+    """A frame's keys, checked; those of the camera may stand in the file's ``shared`` ones."""
     values = {key: shared[key] for key in shared if key not in OF_A_FRAME} | dict(frame)
     if "fl_x" in values or "fl_y" in values:
         values.pop("camera_angle_x", None)  # not looked at

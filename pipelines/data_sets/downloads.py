@@ -21,8 +21,7 @@ from gvtools.scenes.data_sets.catalogue import (
     read_scene,
     spec_names,
 )
-from gvtools.scenes.inspection import SceneReport, inspect, spread
-from gvtools.scenes.pose_contradictions import turn_degrees
+from gvtools.scenes.inspection import SceneReport, inspect, spread, turn_degrees
 
 if TYPE_CHECKING:
     from gvtools.scenes.scene import Scene

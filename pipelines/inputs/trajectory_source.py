@@ -21,12 +21,9 @@ ASSOCIATIONS = ("auto", "time", "name", "index")
 def open_trajectory(path: Path, *, layout: str = "auto", root: Path | None = None) -> Trajectory:
     """Camera-to-world poses.
 
-    Args:
-        path: a TUM, KITTI or EuRoC file; a COLMAP model or workspace (its pictures need not be
-            there); a transforms.json or posed RGB-D folder; spec:NAME:SCENE; or a run, whose poses
-            are those of the views in its memory.
-        layout: of a file, see gvtools.trajectory_files.read_poses.
-        root: of the download, for spec:NAME:SCENE; not looked at for anything else.
+    ``path`` is a TUM, KITTI or EuRoC file (of a ``layout``), a COLMAP model or workspace (its
+    pictures need not be there), a transforms.json or posed RGB-D folder, spec:NAME:SCENE (below
+    ``root``), or a run, whose poses are those of the views in its memory.
     """
     from gvtools.scenes.colmap_model import find_model
     from gvtools.scenes.data_sets.catalogue import open_address
@@ -77,11 +74,8 @@ def associate(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], str]:
     """Rows of both trajectories that belong together, and how they were found.
 
-    Args:
-        how: "time", "name", "index", or "auto": names where both have them, times where both have
-            them, else the order.
-        max_difference: seconds, of an association by time.
-        offset: seconds, added to the estimate's times.
+    With "auto", names go first, then times, then the order. ``offset`` is added to the estimate's
+    times.
     """
     from gvtools.evaluation.trajectories import by_index, by_name, by_time
 

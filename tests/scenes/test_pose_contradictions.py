@@ -14,12 +14,12 @@ import skimage.data
 
 from gvtools.cameras import Cameras
 from gvtools.scenes.colmap import read_colmap
-from gvtools.scenes.inspection import inspect
-from gvtools.scenes.pose_contradictions import (
+from gvtools.scenes.inspection import (
     DISAGREEING,
     contradictions,
     disagreement,
     homography,
+    inspect,
     thumbnail,
 )
 from gvtools.scenes.project import open_project

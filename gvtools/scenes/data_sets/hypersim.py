@@ -120,12 +120,9 @@ class TurnedPinhole:
 
 
 def turned_pinhole(cam_from_uv: Float64, size: tuple[int, int]) -> TurnedPinhole:
-    """Split a projection into a rotation and a pinhole, see the top of this module.
+    """Split (3, 3), from (u, v, 1) to a ray, into a rotation and a pinhole; see the module.
 
-    Args:
-        cam_from_uv: (3, 3), from (u, v, 1) to a ray; x right, y up, z backward. u and v are from
-            -1 to 1 across the picture.
-        size: width and height of the picture, pixels.
+    Rays have x right, y up, z backward; u and v are from -1 to 1 across the picture.
     """
     width, height = size
     finite = np.isfinite(cam_from_uv).all() and min(size) >= 1

@@ -68,10 +68,7 @@ def size_of_intrinsics(
 ) -> tuple[int, int]:
     """Which pictures intrinsics are of: the first size in whose middle the principal point lies.
 
-    Args:
-        K: (3, 3), pixels.
-        picture: width and height of the picture at hand.
-        others: further sizes that the data set's files may be of.
+    ``picture`` is the size of the one at hand, ``others`` are further ones of the data set's files.
 
     >>> size_of_intrinsics([[361, 0, 82], [0, 360, 66], [0, 0, 1]], (640, 512), (160, 128))
     (160, 128)

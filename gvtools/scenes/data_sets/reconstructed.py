@@ -276,9 +276,7 @@ def _with_raw_depth(
 def read_raw_depth(path: Path, *, size: tuple[int, int], lens: Undistortion | None = None) -> Depth:
     """(H, W) float32 z-depth, metres, of 4-byte floats without head; 0 for infinity.
 
-    Args:
-        size: width and height of the original picture, pixels.
-        lens: from the original camera to that of the picture at hand; None for the original.
+    Maps are of the original picture's ``size``; ``lens`` leads to another one at hand.
     """
     width, height = size
     with reading(path, f"expected floats of the original camera's size in {ORIGINAL}; copy again"):

@@ -57,14 +57,9 @@ def numbered_frames(
     lens_of: LensOf = renderer_lens,
     numbers: Iterable[int] = (),
 ) -> list[PosedFrame]:
-    """Frames with a number each.
+    """Frames with a number each, which stands in the ``names`` of pictures.
 
-    Args:
-        cameras: of the frames that have one.
-        names: of pictures, such as "rgb_{:05d}.jpg".
-        depth: where a frame's depth map should be.
-        lens_of: makes a lens of fx, fy, cx, cy for a picture's size.
-        numbers: of the frames, where not all pictures of the folder are of the scene.
+    ``numbers`` are given where not all pictures of the folder are of the scene.
     """
     numbers = sorted(set(numbers) or numbers_in(images, names).union(cameras))
     size = first_size(images / names.format(i) for i in numbers) or (1, 1)
@@ -245,9 +240,7 @@ SAME_SURFACE = 0.05  # relative disparity between neighbours of one surface
 def spring_depth(path: Path, *, focal: float, sky: Path | None) -> Depth:
     """(H, W) float32 z-depth, metres, 0 = none, of a disparity map of (2 H, 2 W).
 
-    Args:
-        focal: horizontal focal length, pixels of the frame.
-        sky: the map of the sky, of (2 H, 2 W) or (H, W); None where there is none.
+    ``focal`` is in pixels of the frame; ``sky`` is the map of the sky, of (2 H, 2 W) or (H, W).
     """
     disparity = hdf5_array(path, "disparity").astype(np.float64)
     if disparity.ndim != 2 or disparity.shape[0] % 2 or disparity.shape[1] % 2:
