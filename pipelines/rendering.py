@@ -1,15 +1,19 @@
-"""Rendered views: their figures against pictures, and their files.
+"""Rendered views of a memory: pictures, figures and films.
 
-The files are NAME.rgb.png, NAME.depth.npz, NAME.valid.png and NAME.confidence.png. A confidence c
-is drawn as the grey level 255 c / (1 + c): 1 is mid grey, and every c has its own side of it.
-``depth.npz`` holds the key ``depth``, float32, scene units, 0 = none.
+The files of a view are NAME.rgb.png, NAME.depth.npz, NAME.valid.png and NAME.confidence.png. A
+confidence c is drawn as the grey level 255 c / (1 + c): 1 is mid grey, and every c has its own side
+of it. ``depth.npz`` holds the key ``depth``, float32, scene units, 0 = none.
 """
 
 from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from fractions import Fraction
+from functools import cached_property
+from itertools import pairwise
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -17,14 +21,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.appearance.appearance import Appearance, recolor
-from gvtools.cameras import Cameras
+from gvtools.cameras import Cameras, concatenate
+from gvtools.completers.base import create, run_completer
+from gvtools.errors import OptionError
 from gvtools.evaluation.images import FIGURES, view_figures
 from gvtools.evaluation.lpips_distance import Lpips
 from gvtools.files import replaced_when_written
 from gvtools.guidance import Guidance
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.splat.api import SplatOptions
+from gvtools.optional import require
+from gvtools.runs.run import load_appearance, load_memory
+from gvtools.runs.target_files import to_bytes, write_png
 from gvtools.scenes.scene import Frame
+from gvtools.trajectories import PATHS, named_path
+from pipelines.reconstruction.rounds import CachedProjection, Clock, complete_targets
+from pipelines.reconstruction.settings import RunSettings
+from viz.viewer.render import picture_of
 
 
 def render_view(
@@ -111,19 +124,292 @@ def _reason(key: str) -> str:
 def write_view(folder: Path, stem: PurePosixPath, guidance: Guidance) -> None:
     """Write the four files of one view; sub-folders of ``stem`` are made, too."""
     confidence = guidance.confidence[0].astype(np.float64)
-    grey = np.round(255 * confidence / (1 + confidence)).astype(np.uint8)
-    rgb = np.round(np.clip(guidance.rgb[0], 0, 1) * 255).astype(np.uint8)
+    pictures = {
+        "rgb": to_bytes(guidance.rgb[0]),
+        "valid": guidance.valid[0].astype(np.uint8) * 255,
+        "confidence": np.round(255 * confidence / (1 + confidence)).astype(np.uint8),
+    }
     base = folder / stem
-    _write_png(base.with_name(f"{base.name}.rgb.png"), rgb)
-    _write_png(base.with_name(f"{base.name}.valid.png"), guidance.valid[0].astype(np.uint8) * 255)
-    _write_png(base.with_name(f"{base.name}.confidence.png"), grey)
+    for kind, picture in pictures.items():
+        with replaced_when_written(base.with_name(f"{base.name}.{kind}.png")) as temporary:
+            write_png(temporary, picture)
     path = base.with_name(f"{base.name}.depth.npz")
     with replaced_when_written(path) as temporary, temporary.open("wb") as file:
         np.savez_compressed(file, depth=guidance.depth[0].astype(np.float32))
 
 
-def _write_png(path: Path, pixels: NDArray[np.uint8]) -> None:
+Picture = NDArray[np.uint8]
+
+CAPTURED = "cameras"
+FRAMES = 120
+FORMS = (
+    f"{', '.join(f'{name}:N' for name in PATHS)}, {CAPTURED} (the captured views in order), a "
+    "trajectory file (TUM or KITTI), a transforms.json such as 'gvtools view' saves, or a project, "
+    "the last two as PATH or PATH@SELECTION"
+)
+# memory: the whole memory. observed: without completers' points. completed: the memory, holes
+# filled by ``inpaint``. depth: of the memory, near is red, far is blue.
+PANELS = ("memory", "observed", "completed", "depth")
+# For "completed", so many frames of the path are completed and fused before the film is drawn, so
+# that filled regions look the same from all frames.
+KEY_FRAMES = 12
+# The colours of depth span these percentiles of the depth of so many frames.
+RANGE_FRAMES, RANGE = 9, (2.0, 98.0)
+SUFFIXES = (".mp4", ".gif", ".webp")
+# Number of the primaries and of the transfer of HD television (H.273).
+BT709 = 1
+# The least time that browsers show a frame of an animation for as they are told [ms].
+LEAST_SHOWN = 20
+# x264's constant rate factor: 18 is visually almost lossless, 23 is its default.
+QUALITY = 18
+WEBP_QUALITY = 80
+
+
+def film_cameras(memory: SpatialMemory, path: str, *, width: int | None = None) -> Cameras:
+    """The cameras of a film's frames, all of one even size, as video coders need it.
+
+    Args:
+        memory: ``orbit`` and the like are computed from its observed views; the first of these
+            gives intrinsics and size to paths that have none.
+        width: of the frames, pixels; None keeps the cameras' width.
+    """
+    views = [view.camera for view in memory.views.photographed]
+    if not views:
+        raise OptionError("a memory without observed views; give a run or its memory.npz")
+    cameras = _path_cameras(memory, concatenate(views), path)
+    first = cameras[0]
+    columns, rows = int(first.width[0]), int(first.height[0])
+    if (cameras.width != columns).any() or (cameras.height != rows).any():
+        # A film has one size: all frames take the first camera's intrinsics and size.
+        count = len(cameras)
+        cameras = Cameras(
+            np.repeat(first.K, count, axis=0), cameras.cam_from_world,
+            np.full(count, columns), np.full(count, rows), cameras.names,
+        )  # fmt: skip
+    if width is not None:
+        if width < 16:
+            raise OptionError(f"--width {width}; expected 16 or more")
+        columns, rows = width, max(16, round(rows * width / columns))
+        cameras = cameras.resized(columns, rows)
+    return cameras.cropped(0, 0, width=columns // 2 * 2, height=rows // 2 * 2)
+
+
+def _path_cameras(memory: SpatialMemory, captured: Cameras, path: str) -> Cameras:
+    name, _, count = path.partition(":")
+    if name in PATHS:
+        if count and not (count.isdecimal() and int(count) >= 1):
+            raise OptionError(f"--path {path!r}; expected {name}:N with N >= 1")
+
+        def depth() -> tuple[Cameras, float] | None:
+            middle = captured[len(captured) // 2]
+            guidance = memory.project(middle)
+            if not guidance.valid.any():
+                return None
+            return middle, float(np.median(guidance.depth[guidance.valid]))
+
+        return named_path(name, captured, count=int(count or FRAMES), depth=depth)
+    if path == CAPTURED:
+        return captured
+    place, at, selection = path.partition("@")
+    if not Path(place).exists():
+        raise OptionError(f"--path {path!r}; expected {FORMS}")
+    from gvtools.scenes.selection import select
+
+    if Path(place).suffix.lower() == ".json":
+        from gvtools.scenes.transforms import read_transforms_cameras
+
+        cameras = read_transforms_cameras(Path(place))
+        return cameras[list(map(cameras.names.index, select(cameras.names, selection or "all")))]
+    if Path(place).is_dir():
+        from gvtools.scenes.project import open_project
+
+        scene = open_project(Path(place))
+        return scene.subset(select(scene.names, selection if at else "all")).cameras
+    from gvtools.trajectory_files import read_trajectory
+
+    return read_trajectory(Path(place), captured[0])
+
+
+class FilmRenderer:
+    """Draws the frames of one film, of a run's folder or a memory file.
+
+    All ``cameras`` have one size; the memory is drawn as it was after round ``up_to``, None: the
+    last.
+    """
+
+    def __init__(self, path: Path, cameras: Cameras, *, up_to: int | None = None) -> None:
+        self.path, self.cameras, self.up_to = path, cameras, up_to
+        self.memory = load_memory(path, up_to=up_to)
+        self.appearance: Appearance | None = load_appearance(path)
+        # Seconds spent on projecting the memory and drawing the Gaussians.
+        self.projecting = 0.0
+
+    def frame(self, index: int, panels: Sequence[str], *, captions: bool = False) -> Picture:
+        """(H, W, 3) one frame, its panels side by side, each with its name or without."""
+        pictures = [self._panel(index, panel) for panel in panels]
+        if captions:
+            pictures = [captioned(*pair) for pair in zip(pictures, panels, strict=True)]
+        return np.concatenate(pictures, axis=1)
+
+    def _panel(self, index: int, panel: str) -> Picture:
+        camera = self.cameras[index]
+        if panel == "observed":
+            return picture_of(self._projected(self._observed, camera))
+        if panel == "completed":
+            return self._filled(self._projected(self._completed, camera))
+        guidance = self._projected(self.memory, camera)
+        return self._depth(guidance) if panel == "depth" else picture_of(guidance)
+
+    def _projected(self, memory: SpatialMemory, camera: Cameras) -> Guidance:
+        guidance, seconds = render_view(memory, camera, appearance=self.appearance)
+        self.projecting += seconds
+        return guidance
+
+    def _filled(self, guidance: Guidance) -> Picture:
+        if guidance.valid.all() or not guidance.valid.any():
+            return picture_of(guidance)
+        completion = run_completer(self._inpaint, (), guidance)
+        return picture_of(replace(guidance, rgb=completion.rgb, valid=completion.depth > 0))
+
+    def _depth(self, guidance: Guidance) -> Picture:
+        from matplotlib import colormaps
+
+        near, far = self._range
+        with np.errstate(divide="ignore"):
+            share = (1 / guidance.depth[0] - 1 / far) / (1 / near - 1 / far)
+        colors = colormaps["turbo"](np.clip(np.nan_to_num(share), 0, 1))[..., :3]
+        picture = np.rint(255 * colors).astype(np.uint8)
+        picture[~guidance.valid[0]] = 255
+        return picture
+
+    @cached_property
+    def _inpaint(self):
+        return create("inpaint")
+
+    @cached_property
+    def _observed(self) -> SpatialMemory:
+        """The memory after its first round, which holds observations only."""
+        return load_memory(self.path, up_to=self.memory.rounds[0])
+
+    @cached_property
+    def _completed(self) -> SpatialMemory:
+        """The memory with key frames of the path completed and fused."""
+        memory = load_memory(self.path, up_to=self.up_to)
+        targets = [
+            CachedProjection(memory, camera, appearance=self.appearance)
+            for camera in self._spread_cameras(KEY_FRAMES)
+        ]
+        for _ in complete_targets(
+            targets, memory.rounds[-1] + 1, memory=memory, completer=self._inpaint, context=(),
+            config=RunSettings(), clock=Clock(),
+        ):  # fmt: skip
+            pass
+        return memory
+
+    @cached_property
+    def _range(self) -> tuple[float, float]:
+        """Depths at the ends of the colour map, scene units."""
+        seen = [self.memory.project(camera) for camera in self._spread_cameras(RANGE_FRAMES)]
+        known = np.concatenate([guidance.depth[guidance.valid] for guidance in seen])
+        if not len(known):
+            raise OptionError("depth: the memory is in view of no frame; give another --path")
+        near, far = np.percentile(known, RANGE)
+        return float(near), float(max(far, near * 1.001))
+
+    def _spread_cameras(self, most: int) -> list[Cameras]:
+        """At most so many of the cameras, evenly along the path."""
+        count = len(self.cameras)
+        rows = np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(int))
+        return [self.cameras[int(row)] for row in rows]
+
+
+def captioned(picture: Picture, text: str) -> Picture:
+    """The picture with a line of text in its upper left corner."""
+    from PIL import Image, ImageDraw, ImageFont
+
+    image = Image.fromarray(picture)
+    size = max(10, picture.shape[0] // 24)
+    font = ImageFont.load_default(size)
+    draw = ImageDraw.Draw(image)
+    edge = size // 2
+    draw.text((edge, edge), text, fill="white", font=font, stroke_width=2, stroke_fill="black")
+    return np.asarray(image)
+
+
+def check_suffix(path: Path) -> None:
+    """Refuse a file name that no film can be written to, before anything is drawn."""
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise OptionError(f"--out {path}: expected a name that ends with {', '.join(SUFFIXES)}")
+    if suffix == ".mp4":
+        purpose, instead = f"--out {path}: MP4", "or write a .gif or .webp"
+        require("av", extra="film", purpose=purpose, instead=instead)
+
+
+def write_film(path: Path, frames: Iterable[NDArray[np.uint8]], *, fps: float) -> None:
+    """Write frames of one even size to a file with one of SUFFIXES; it appears when whole."""
+    with replaced_when_written(path) as temporary:
+        if path.suffix.lower() == ".mp4":
+            _write_mp4(temporary, frames, fps=fps)
+        else:
+            _write_animation(temporary, frames, form=path.suffix[1:].upper(), fps=fps)
+
+
+def _write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]], *, fps: float) -> None:
+    import av
+    from av.video.reformatter import ColorRange, Colorspace
+
+    rate = Fraction(fps).limit_denominator(1001)
+    # "faststart" moves the index to the front, so that browsers play it while it loads.
+    with av.open(str(path), "w", format="mp4", options={"movflags": "faststart"}) as container:
+        stream = container.add_stream("libx264", rate=rate, options={"crf": str(QUALITY)})
+        # The pixel format that every player can decode.
+        stream.pix_fmt = "yuv420p"
+        # Of what players otherwise guess by the picture's size.
+        coder = stream.codec_context
+        coder.color_range, coder.colorspace = ColorRange.MPEG, Colorspace.ITU709
+        coder.color_primaries, coder.color_trc = BT709, BT709
+        for number, frame in enumerate(frames):
+            if number == 0:
+                stream.height, stream.width = frame.shape[:2]
+            picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")
+            picture = picture.reformat(
+                format="yuv420p", dst_colorspace=Colorspace.ITU709, dst_color_range=ColorRange.MPEG
+            )
+            container.mux(stream.encode(picture))
+        container.mux(stream.encode())
+
+
+def _write_animation(
+    path: Path, frames: Iterable[NDArray[np.uint8]], *, form: str, fps: float
+) -> None:
     from PIL import Image
 
-    with replaced_when_written(path) as temporary:
-        Image.fromarray(pixels).save(temporary, format="PNG", compress_level=3)
+    images = [Image.fromarray(frame) for frame in frames]
+    options = {"quality": WEBP_QUALITY} if form == "WEBP" else {}
+    shown, durations = shown_frames(len(images), fps=fps, unit=10 if form == "GIF" else 1)
+    first, *others = (images[number] for number in shown)
+    with path.open("wb") as file:
+        first.save(
+            file, format=form, save_all=True, append_images=others, duration=durations, loop=0,
+            **options,
+        )  # fmt: skip
+
+
+def shown_frames(frames: int, *, fps: float, unit: int) -> tuple[list[int], list[int]]:
+    """Frames of an animation that are shown, and for how many ms each: ``frames`` / ``fps`` in all.
+
+    Browsers show what stands for less than ``LEAST_SHOWN`` ms for ten times as long, so frames are
+    left out instead. ``unit``: ms that durations are multiples of.
+
+    >>> shown_frames(6, fps=60, unit=10)
+    ([0, 2, 3, 4], [30, 20, 20, 30])
+    """
+    begins = [unit * round(1000 * number / fps / unit) for number in range(frames + 1)]
+    shown = [0]
+    for number in range(1, frames):
+        late = begins[number] - begins[shown[-1]] >= LEAST_SHOWN
+        if late and begins[frames] - begins[number] >= LEAST_SHOWN:
+            shown.append(number)
+    times = [begins[number] for number in shown] + [max(begins[frames], LEAST_SHOWN)]
+    return shown, [after - before for before, after in pairwise(times)]

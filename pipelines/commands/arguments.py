@@ -19,6 +19,10 @@ if TYPE_CHECKING:
     from pipelines.scoring.measurement import MeasureOptions
 
 
+# What commands say of a memory that they can do nothing with.
+EMPTY = "an empty memory; expected one that views were fused in"
+
+
 def _intrinsics(text: Any) -> Any:
     """K of ``FX,FY,CX,CY``."""
     if not isinstance(text, str):

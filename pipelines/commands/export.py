@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from pydantic import Field
 
 from gvtools.errors import OptionError
+from pipelines.commands.arguments import EMPTY
 from pipelines.export.formats import FORMATS, ExportOptions, FormatName
 from pipelines.options import Arguments
 
@@ -60,9 +61,7 @@ class ExportCommand(Arguments, ExportOptions):
         write = form.load()
         memory = load_memory(self.memory, up_to=self.round)
         if not len(memory):
-            raise OptionError(
-                f"{self.memory}: an empty memory; expected one that views were fused in"
-            )
+            raise OptionError(f"{self.memory}: {EMPTY}")
         if self.format != "ply" or self.max_points is not None:
             shown = memory.overview()
             if len(shown) < len(memory):

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from pydantic import Field
 
 from gvtools.errors import OptionError
-from pipelines.commands.arguments import LpipsArguments, SceneArguments
+from pipelines.commands.arguments import EMPTY, LpipsArguments, SceneArguments
 from pipelines.options import Arguments
 
 if TYPE_CHECKING:
@@ -68,9 +68,7 @@ class RenderCommand(LpipsArguments, SceneArguments):
         options = splat_options([*given, *self.set])
         memory, appearance = load_memory(self.memory), load_appearance(self.memory)
         if not len(memory.views):
-            raise OptionError(
-                f"{self.memory}: an empty memory; expected one that views were fused in"
-            )
+            raise OptionError(f"{self.memory}: {EMPTY}")
         cameras, scene = _cameras(self, memory)
         if self.against_images and scene is None:
             raise OptionError(
@@ -170,7 +168,13 @@ class FilmCommand(Arguments):
 
     def run(self, console: Console) -> None:
         from gvtools.runs.run import load_memory
-        from pipelines.film import FilmRenderer, captioned, check_suffix, film_cameras, write_film
+        from pipelines.rendering import (
+            FilmRenderer,
+            captioned,
+            check_suffix,
+            film_cameras,
+            write_film,
+        )
 
         check_suffix(self.out)
         if self.growth and self.round is not None:
@@ -178,9 +182,7 @@ class FilmCommand(Arguments):
         panels = _panels(self)
         memory = load_memory(self.memory, up_to=self.round)
         if not len(memory):
-            raise OptionError(
-                f"{self.memory}: an empty memory; expected one that views were fused in"
-            )
+            raise OptionError(f"{self.memory}: {EMPTY}")
         cameras = film_cameras(memory, self.path, width=self.width)
         rounds = memory.rounds if self.growth else (self.round,)
         del memory
@@ -209,7 +211,7 @@ class FilmCommand(Arguments):
 
 
 def _panels(args: FilmCommand) -> tuple[str, ...]:
-    from pipelines.film import PANELS
+    from pipelines.rendering import PANELS
 
     if args.complete:
         return ("completed",)

@@ -11,7 +11,7 @@ from PIL import Image, ImageSequence
 from tiny_scan import write_scan
 
 from pipelines.cli import main
-from pipelines.film import FilmRenderer, captioned, film_cameras, write_film
+from pipelines.rendering import FilmRenderer, captioned, film_cameras, write_film
 
 pytestmark = pytest.mark.usefixtures("unpainted")
 

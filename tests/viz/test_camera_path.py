@@ -15,7 +15,7 @@ from memory_scenes import camera
 from gvtools.errors import DegenerateError, OptionError
 from gvtools.memory.spatial_memory import SpatialMemory
 from pipelines.cli import main
-from pipelines.film import film_cameras
+from pipelines.rendering import film_cameras
 from pipelines.viewing.source import ViewSource
 
 pytest.importorskip("viser", reason="viser is not installed (extra web)")

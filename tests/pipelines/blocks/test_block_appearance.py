@@ -24,10 +24,8 @@ from gvtools.runs.run import load_run
 from gvtools.scenes.project import open_project
 from gvtools.settings import with_values
 from pipelines.blocks import merge as merging
-from pipelines.blocks.appearance import BlockAppearance, fit_across, join_appearances, rows_across
-from pipelines.blocks.block import BlockCell, SceneBlock
-from pipelines.blocks.merge import merge
-from pipelines.blocks.split import read_blocks, split
+from pipelines.blocks.merge import BlockAppearance, fit_across, join_appearances, merge, rows_across
+from pipelines.blocks.split import BlockCell, SceneBlock, read_blocks, split
 from pipelines.console import Console
 from pipelines.reconstruction import run
 from pipelines.reconstruction.fitting import Fitted

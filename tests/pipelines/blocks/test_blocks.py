@@ -16,9 +16,8 @@ from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.runs.run import load_run
 from gvtools.scenes.project import open_project
 from gvtools.settings import with_values
-from pipelines.blocks.block import SceneBlock, cut_cells
 from pipelines.blocks.merge import merge
-from pipelines.blocks.split import read_blocks, split
+from pipelines.blocks.split import SceneBlock, cut_cells, read_blocks, split
 from pipelines.cli import main
 from pipelines.console import Console
 from pipelines.reconstruction import run
