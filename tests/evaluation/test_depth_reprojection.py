@@ -5,14 +5,13 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from consistency_scene import HALF, SLANT, SQUARE, WALL, camera, moved, picture
+from consistency_scene import HALF, SLANT, SQUARE, WALL, camera, moved, picture, real_pictures
 
 from gvtools.evaluation.depth_reprojection import (
     depth_reprojection,
     depth_reprojection_of_views,
 )
 from gvtools.evaluation.posed_picture import PosedPicture, Seen, correspond
-from gvtools.scenes.project import open_project
 
 FIGURES = (
     "mean_pixels",
@@ -235,12 +234,7 @@ def test_too_few_views_give_a_status(pair):
 
 @pytest.mark.data
 def test_a_real_recording_agrees_until_a_pose_is_wrong(shared):
-    scene = open_project(shared / "data" / "sevenscenes_reg")
-    first, second = (
-        PosedPicture(view.name, view.camera, frame.rgb, frame.depth, frame.mask)
-        for view in scene.views[:3:2]
-        for frame in [view.load()]
-    )
+    first, second = real_pictures(shared, slice(0, 3, 2))
     good = depth_reprojection(first, second)
     bad = depth_reprojection(first, moved(second, turn=(0, 2, 0)))
     assert good.median_relative_depth < 0.01

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from consistency_scene import blurred, camera, moved, noisy, picture
+from consistency_scene import blurred, camera, moved, noisy, picture, real_pictures
 
 from gvtools.evaluation.feature_consistency import (
     DenseGradient,
@@ -18,7 +18,6 @@ from gvtools.evaluation.feature_consistency import (
     met3r_score,
 )
 from gvtools.evaluation.posed_picture import PosedPicture
-from gvtools.scenes.project import open_project
 
 WIDTH, HEIGHT = 240, 180
 
@@ -188,12 +187,7 @@ def test_dense_gradients_tell_edges_and_colours():
 
 @pytest.mark.data
 def test_a_real_recording_is_consistent_until_a_pose_is_wrong(shared):
-    scene = open_project(shared / "data" / "sevenscenes_reg")
-    first, second = (
-        PosedPicture(view.name, view.camera, frame.rgb, frame.depth, frame.mask)
-        for view in scene.views[:3:2]
-        for frame in [view.load()]
-    )
+    first, second = real_pictures(shared, slice(0, 3, 2))
     good = feature_consistency(first, second)
     bad = feature_consistency(first, moved(second, turn=(0, 2, 0)))
     assert good.score < 0.1 * good.unrelated

@@ -6,7 +6,18 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
-from consistency_scene import HALF, SLANT, SQUARE, WALL, blurred, camera, moved, noisy, picture
+from consistency_scene import (
+    HALF,
+    SLANT,
+    SQUARE,
+    WALL,
+    blurred,
+    camera,
+    moved,
+    noisy,
+    picture,
+    real_pictures,
+)
 
 from gvtools.cameras import Cameras
 from gvtools.errors import ShapeError
@@ -14,8 +25,6 @@ from gvtools.evaluation.geometric_verification import (
     epipolar_distances,
     verify_geometry,
 )
-from gvtools.evaluation.posed_picture import PosedPicture
-from gvtools.scenes.project import open_project
 
 WIDTH, HEIGHT = 240, 180
 
@@ -208,10 +217,7 @@ def test_equal_pictures_and_seed_give_equal_figures_and_print_nothing(right, vie
 @pytest.mark.data
 @pytest.mark.slow
 def test_a_real_recording_fits_until_a_pose_is_wrong(shared):
-    scene = open_project(shared / "data" / "sevenscenes_reg")
-    views = [
-        PosedPicture(view.name, view.camera, view.load().rgb, None) for view in scene.views[:9:2]
-    ]
+    views = real_pictures(shared, slice(0, 9, 2))
     good = verify_geometry(views)
     bad = verify_geometry([*views[:2], moved(views[2], turn=(0, 2, 0)), *views[3:]])
     assert (good.mean_reprojection or 9) < 1.2 and (good.triangulated_share or 0) > 0.97

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 import pytest
+from consistency_scene import real_pictures
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -314,24 +314,12 @@ def test_a_summary_counts_failures_as_failures():
     assert nothing.success_share is None and nothing.rotation_auc[5.0] is None
 
 
-def sevenscenes(folder: Path, spec: str) -> list[PosedPicture]:
-    from gvtools.scenes.project import open_project
-    from gvtools.scenes.selection import select
-
-    scene = open_project(folder)
-    pictures = []
-    for name in select(scene.names, spec):
-        frame, camera = scene[name].load(), scene[name].camera
-        pictures.append(PosedPicture(name, camera, frame.rgb, frame.depth, frame.mask))
-    return pictures
-
-
 @pytest.mark.slow
 @pytest.mark.data
 def test_held_out_photographs_from_five_views(shared):
-    folder = shared / "data" / "sevenscenes_reg"
-    probe = PoseProbe(sevenscenes(folder, "every:20"))
-    summary = summarise([probe.locate(one) for one in sevenscenes(folder, "every:20+10")])
+    probe = PoseProbe(real_pictures(shared, slice(0, None, 20)))
+    targets = real_pictures(shared, slice(10, None, 20))
+    summary = summarise([probe.locate(one) for one in targets])
     # Recorded poses of this scene agree among themselves to about half a degree and 2 cm.
     assert summary.success_share == 1, summary.failures
     assert summary.rotation_error_deg.median < 3
@@ -343,9 +331,8 @@ def test_held_out_photographs_from_five_views(shared):
 def test_held_out_photographs_and_shifted_projections(shared):
     from gvtools.memory.spatial_memory import SpatialMemory
 
-    folder = shared / "data" / "sevenscenes_reg"
-    context = sevenscenes(folder, "every:2")
-    targets = sevenscenes(folder, "every:2+1")
+    context = real_pictures(shared, slice(0, None, 2))
+    targets = real_pictures(shared, slice(1, None, 2))
     probe = PoseProbe(context)
     summary = summarise([probe.locate(one) for one in targets])
     assert summary.success_share >= 0.95, summary.failures
