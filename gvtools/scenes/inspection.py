@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
 from gvtools.errors import GvError
+from gvtools.scenes.pixel_contradictions import PixelCheck
 from gvtools.scenes.scene import Finding, Frame, Scene, SparsePoints
 
 Float32 = NDArray[np.float32]
@@ -82,7 +83,8 @@ def inspect(scene: Scene, *, probes: int | None = None) -> SceneReport:
     views, evenly spread, have their pixels decoded.
     """
     findings = list(scene.findings)
-    opened = _open(scene, spread(len(scene), probes), findings)
+    pixels = PixelCheck(scene)
+    opened = _open(scene, spread(len(scene), probes), findings, pixels=pixels)
     cameras = scene.cameras if scene.views else None
     focal = cameras.K[:, (0, 1), (0, 1)] if cameras is not None else np.zeros((1, 2))
     centers = cameras.centers if cameras is not None else np.zeros((1, 3))
@@ -96,6 +98,7 @@ def inspect(scene: Scene, *, probes: int | None = None) -> SceneReport:
     errors = reprojection_errors(scene)
     findings += _views_without_depth(scene)
     findings += _doubtful_cameras(scene, errors)
+    findings += pixels.findings()
     findings += contradiction_findings(
         scene,
         {item.view: item.thumbnail for item in opened},
@@ -148,7 +151,9 @@ def spread(count: int, probes: int | None) -> list[int]:
     return np.linspace(0, count - 1, probes).round().astype(int).tolist()
 
 
-def _open(scene: Scene, numbers: list[int], findings: list[Finding]) -> list[_Opened]:
+def _open(
+    scene: Scene, numbers: list[int], findings: list[Finding], *, pixels: PixelCheck
+) -> list[_Opened]:
     known = {finding.message for finding in findings}
     opened, empty = [], []
     for number in numbers:
@@ -159,6 +164,7 @@ def _open(scene: Scene, numbers: list[int], findings: list[Finding]) -> list[_Op
             if str(error) not in known:
                 findings.append(Finding("error", str(error)))
             continue
+        pixels.see(number, frame.rgb)
         masked = 0.0 if frame.mask is None else 1.0 - float(frame.mask.mean())
         seen = number, thumbnail(frame), masked
         if frame.depth is None:

@@ -18,6 +18,7 @@ from gvtools.runs.digests import array_digest, fingerprint
 from gvtools.runs.poses import RunPoses, posed, with_poses
 from gvtools.scenes.layout import is_address
 from gvtools.scenes.matching import natural
+from gvtools.scenes.pixel_contradictions import probed
 from gvtools.scenes.resized import reduced
 from gvtools.scenes.scene import Scene, View
 from gvtools.scenes.selection import check_disjoint, select
@@ -331,7 +332,7 @@ def describe(plan: Plan, console: Console) -> None:
             f"{', '.join(plan.ignored)} changes nothing: no plane sweep computes depth here, but "
             f"{plan.source.name}"
         )
-    for finding in plan.scene.findings:
+    for finding in (*plan.scene.findings, *probed(plan.scene, plan.context)):
         if finding.level == "warning":
             console.warn(finding.message)
 

@@ -51,6 +51,8 @@ if TYPE_CHECKING:
 
 # Figures of the table that closes a run.
 TABLE = ("psnr", "psnr_valid", "psnr_generated", "ssim", "depth_rel_valid", "depth_rel_generated")
+# Below this coverage a run warns.
+HARDLY_KNOWN = 0.1
 NO_LPIPS = "lpips is null here: gvtools evaluate measures it, where its weights are"
 # In run.json: what each call was given, the first one first.
 REFINED = "refined"
@@ -121,6 +123,13 @@ def measure_run(
         body = [[view.get(key) for key in keys] for view in views]
         mean = ["mean", None, *(summary[key] for key in keys[2:])]
         console.table(["target", "round", "coverage", "after", *TABLE], [*body, mean])
+        if summary["coverage"] < HARDLY_KNOWN:
+            console.warn(
+                f"before its round the memory knows {summary['coverage']:.1%} of a target's pixels "
+                "on average: nearly all of it is the completer's; are targets where photographs "
+                "look? 'gvtools check' tells whether pictures, poses and depth contradict each "
+                "other"
+            )
     return summary
 
 

@@ -1,0 +1,156 @@
+"""Photographs that are not what their cameras saw: renumbered, mirrored, cropped, turned.
+
+Reprojection errors do not tell, as no pixel enters them. A track's detections show one place, so
+that what photographs have there is alike: luminance at the detections of a view, freed of what
+varies slowly, is correlated with the mean of the other views' at the same tracks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.errors import GvError
+from gvtools.scenes.scene import Finding, Scene
+
+Grey = NDArray[np.float32]
+
+# A view with so many tracks in common with others is judged, and disagrees below this correlation.
+# On real scenes it is 0.92 and more; renumbered or mirrored it is 0.5 at most, and cropped by a
+# tenth at each border 0.2 to 0.6 in the middle of a scene's views.
+TRACKS, AGREE = 20, 0.7
+# Detail is what a blur over this share of the longer side takes away.
+BLUR = 1 / 40
+# How pictures come to be wrong, by what sets them right.
+CHANGES: Mapping[str, Callable[[Grey], Grey]] = {
+    "mirrored left to right": lambda grey: grey[:, ::-1],
+    "turned by half": lambda grey: grey[::-1, ::-1],
+    "turned upside down": lambda grey: grey[::-1],
+    "turned by a quarter": np.rot90,
+    "turned by three quarters": lambda grey: np.rot90(grey, -1),
+}
+# Views that a run looks at, that a reason is sought for, and that a finding names.
+PROBES, TRIED, NAMED = 8, 16, 3
+
+
+class PixelCheck:
+    """The luminance at detections, gathered view by view."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene, self.points = scene, scene.points
+        self.rows = [] if self.points is None else self.points.rows_of_views(len(scene))
+        count = 0 if self.points is None else len(self.points.point_index)
+        self.values = np.full(count, np.nan)
+
+    def see(self, number: int, rgb: NDArray[np.uint8]) -> None:
+        """Take in the photograph (H, W, 3) of a view."""
+        if self.points is not None and len(self.rows[number]):
+            self.values[self.rows[number]] = self._at_detections(number, detail(rgb))
+
+    def _at_detections(self, number: int, grey: Grey) -> NDArray[np.float64]:
+        assert self.points is not None
+        height, width = grey.shape
+        x, y = np.floor(self.points.xy[self.rows[number]]).astype(np.int64).T
+        inside = (x > 0) & (y > 0) & (x < width - 1) & (y < height - 1)
+        found = np.full(len(x), np.nan)
+        found[inside] = cv2.blur(grey, (3, 3))[y[inside], x[inside]]
+        return found
+
+    def agreement(self, number: int) -> float | None:
+        """Correlation of a view with the others; None where they have too few tracks in common."""
+        if self.points is None:
+            return None
+        rows, index = self.rows[number], self.points.point_index
+        own = self.values[rows]
+        known = np.isfinite(self.values)
+        count = len(self.points.positions)
+        total = np.bincount(index[known], self.values[known], count)[index[rows]]
+        views = np.bincount(index[known], minlength=count)[index[rows]]
+        mine = np.isfinite(own)
+        total, views = total - np.where(mine, own, 0), views - mine
+        used = mine & (views > 0)
+        if used.sum() < TRACKS or not own[used].std() > 0:
+            return None
+        return float(np.corrcoef(own[used], total[used] / views[used])[0, 1])
+
+    def findings(self) -> list[Finding]:
+        """A warning where photographs and detections disagree."""
+        scores = {number: self.agreement(number) for number in range(len(self.rows))}
+        judged = {number: score for number, score in scores.items() if score is not None}
+        wrong = sorted((n for n, s in judged.items() if s < AGREE), key=lambda n: judged[n])
+        if not wrong:
+            return []
+        names = ", ".join(
+            f"{self.scene.views[number].name} ({judged[number]:.2f})" for number in wrong[:NAMED]
+        )
+        more = f" and {len(wrong) - NAMED} more" if len(wrong) > NAMED else ""
+        message = (
+            f"{len(wrong)} of {len(judged)} photographs do not show what their cameras saw "
+            f"({len(wrong) / len(judged):.0%}; correlation at detections below {AGREE:g}): {names}"
+            f"{more}{self._reason(wrong)}; renumbered, mirrored, cropped or turned pictures give "
+            "wrong results: give the pictures that the poses were computed from"
+        )
+        return [Finding("warning", message)]
+
+    def _reason(self, wrong: Sequence[int]) -> str:
+        """What would make wrong pictures agree, "" where nothing that is tried does."""
+        chosen = wrong[:TRIED]
+        shown = {n: self._detail(n) for n in {m + step for m in chosen for step in (-1, 0, 1)}}
+        ways: dict[str, Callable[[int], Grey | None]] = {
+            f"they fit {name}": partial(lambda change, n: self._changed(shown[n], change), change)
+            for name, change in CHANGES.items()
+        }
+        ways["each fits the next picture"] = lambda n: shown[n + 1]
+        ways["each fits the picture before it"] = lambda n: shown[n - 1]
+        for reason, picture in ways.items():
+            other = PixelCheck(self.scene)
+            other.values = self.values.copy()
+            for number in wrong:
+                grey = picture(number) if number in chosen else None
+                other.values[self.rows[number]] = (
+                    np.nan if grey is None else self._at_detections(number, grey)
+                )
+            scores = [score for n in chosen if (score := other.agreement(n)) is not None]
+            if scores and np.median(scores) > AGREE:
+                return f"; {reason}"
+        return ""
+
+    def _changed(self, shown: Grey | None, change: Callable[[Grey], Grey]) -> Grey | None:
+        found = None if shown is None else np.ascontiguousarray(change(shown))
+        return None if found is None or shown is None or found.shape != shown.shape else found
+
+    def _detail(self, number: int) -> Grey | None:
+        if not 0 <= number < len(self.rows):
+            return None
+        try:
+            return detail(self.scene.views[number].load().rgb)
+        except GvError:
+            return None
+
+
+def detail(rgb: NDArray[np.uint8]) -> Grey:
+    """(H, W) luminance without what varies slowly."""
+    grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    return grey - cv2.GaussianBlur(grey, (0, 0), BLUR * max(grey.shape))
+
+
+def probed(scene: Scene, names: Sequence[str]) -> list[Finding]:
+    """The findings of a few views among ``names`` that have most tracks in common."""
+    check = PixelCheck(scene)
+    if check.points is None:
+        return []
+    numbers = [number for number, view in enumerate(scene.views) if view.name in set(names)]
+    if not numbers:
+        return []
+    index = check.points.point_index
+    seen = np.zeros(len(check.points.positions), np.bool_)
+    first = max(numbers, key=lambda number: len(check.rows[number]))
+    seen[index[check.rows[first]]] = True
+    common = sorted(numbers, key=lambda number: -int(seen[index[check.rows[number]]].sum()))
+    for number in common[:PROBES]:
+        check.see(number, scene.views[number].load().rgb)
+    return check.findings()
