@@ -9,17 +9,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from browser import free_port
 from memory_scenes import camera
+from web_page import served
 
 from gvtools.errors import DegenerateError, OptionError
 from gvtools.memory.spatial_memory import SpatialMemory
 from pipelines.cli import main
 from pipelines.rendering import film_cameras
 from pipelines.viewing.source import ViewSource
-
-pytest.importorskip("viser", reason="viser is not installed (extra web)")
-
 from viz.viewer.camera_path import FRAMES
 from viz.viewer.nodes import vertical_field_of_view
 from viz.viewer.web import WebViewer
@@ -63,9 +60,8 @@ def folder(small_run, tmp_path):
 
 @pytest.fixture
 def viewer(folder):
-    found = WebViewer(ViewSource(folder).read(), port=free_port())
-    yield found
-    found.stop()
+    with served(ViewSource(folder).read()) as found:
+        yield found
 
 
 POSES = [
@@ -164,15 +160,12 @@ def test_key_frames_at_one_place_are_no_path(viewer):
 
 
 def test_pages_from_elsewhere_get_the_file_and_write_nothing(folder):
-    viewer = WebViewer(ViewSource(folder).read(), host="0.0.0.0", port=free_port())
-    try:
+    with served(ViewSource(folder).read(), host="0.0.0.0") as viewer:
         client = with_keys(viewer)
         assert viewer.path.save(client) is None
         frames = json.loads(client.sent["path.json"])["frames"]
         assert len(frames) == FRAMES and frames[1]["file_path"] == "path/00001.png"
         assert not (folder / "paths").exists()
-    finally:
-        viewer.stop()
 
 
 def test_the_preview_leads_along_the_path(viewer):

@@ -5,19 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from box_project import write_box
-from browser import free_port, open_browser
+from browser import open_browser
 from export_runs import export_run, saved_run
 from PIL import Image
 from plain_splats import draw, read_splats
-from web_page import SCENE, close_notes, steady, wait
+from web_page import SCENE, close_notes, served, steady, wait
 
 from pipelines.viewing.source import ViewSource
-from viz.viewer.run_view import POINTS, SPLATS
-
-pytest.importorskip("viser", reason="viser is not installed (extra web)")
-
 from viz.viewer.nodes import MAGNIFIED
-from viz.viewer.web import WebViewer
+from viz.viewer.run_view import POINTS, SPLATS
 
 
 @pytest.fixture(scope="module")
@@ -32,9 +28,8 @@ def run(scene, request, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def viewer(run):
-    found = WebViewer(ViewSource(run.folder).read(), port=free_port())
-    yield found
-    found.stop()
+    with served(ViewSource(run.folder).read()) as found:
+        yield found
 
 
 def unpacked(viewer):

@@ -8,20 +8,16 @@ import sys
 from pathlib import Path
 
 import pytest
-from browser import free_port
+from web_page import served
 
 from pipelines.viewing.source import ViewSource
-
-pytest.importorskip("viser", reason="viser is not installed (extra web)")
-
-from viz.viewer.web import WebViewer, address_of, is_loopback, may_read
+from viz.viewer.web import address_of, is_loopback, may_read
 
 
 @pytest.fixture(scope="module")
 def viewer(small_run):
-    found = WebViewer(ViewSource(small_run).read(), port=free_port())
-    yield found
-    found.stop()
+    with served(ViewSource(small_run).read()) as found:
+        yield found
 
 
 @pytest.mark.parametrize(

@@ -14,29 +14,24 @@ from typing import Any
 
 import numpy as np
 import pytest
-from browser import Browser, free_port, open_browser
+from browser import Browser, open_browser
 from memory_scenes import camera
 from PIL import Image
-from web_page import PATIENCE, choose, close_notes, steady, wait
+from web_page import PATIENCE, choose, close_notes, served, steady, wait
 
 from gvtools.ply import write_ply
 from pipelines.viewing.source import ViewSource
-from viz.viewer.render import RunRenderer, picture_of
-from viz.viewer.run_view import TARGET
-
-pytest.importorskip("viser", reason="viser is not installed (extra web)")
-
 from viz.viewer.nodes import LONGEST
 from viz.viewer.panel import GAP, ROW_WIDTH
+from viz.viewer.render import RunRenderer, picture_of
+from viz.viewer.run_view import TARGET
 from viz.viewer.standpoint import FIELD_OF_VIEW, PageFrame, home
-from viz.viewer.web import WebViewer
 
 
 @pytest.fixture(scope="module")
 def viewer(small_run):
-    found = WebViewer(ViewSource(small_run).read(), port=free_port())
-    yield found
-    found.stop()
+    with served(ViewSource(small_run).read()) as found:
+        yield found
 
 
 @pytest.fixture(scope="module")
@@ -159,19 +154,15 @@ def test_a_page_follows_a_run_that_grows(small_run, tmp_path):
     # As a run at work has it: the memory after the last whole round.
     run.memory.forget(round=2)
     run.memory.save(growing / "memory.npz")
-    viewer = WebViewer(source.read(), port=free_port())
-    try:
-        with open_browser() as browser:
-            browser.driver.get(viewer.url)
-            wait(lambda: "observations after round 1" in browser.text())
-            assert "not finished: 1 of 2 rounds done" in browser.text()
-            shutil.copy(small_run / "memory.npz", growing / "memory.npz")
-            later.rename(growing / "round_002")
-            viewer.update(source.read())
-            wait(lambda: "observations after round 2" in browser.text())
-            assert "not finished" not in browser.text()
-    finally:
-        viewer.stop()
+    with served(source.read()) as viewer, open_browser() as browser:
+        browser.driver.get(viewer.url)
+        wait(lambda: "observations after round 1" in browser.text())
+        assert "not finished: 1 of 2 rounds done" in browser.text()
+        shutil.copy(small_run / "memory.npz", growing / "memory.npz")
+        later.rename(growing / "round_002")
+        viewer.update(source.read())
+        wait(lambda: "observations after round 2" in browser.text())
+        assert "not finished" not in browser.text()
 
 
 def cloud(folder, scale, size=(4.0, 5.0, 2.0)):
@@ -188,8 +179,7 @@ def cloud(folder, scale, size=(4.0, 5.0, 2.0)):
 def test_scenes_of_any_scale_are_the_same_on_the_page(tmp_path):
     sent = []
     for scale in (1.0, 1000.0, 0.001):
-        viewer = WebViewer(cloud(tmp_path, scale), port=free_port())
-        try:
+        with served(cloud(tmp_path, scale)) as viewer:
             start = viewer.server.initial_camera
             nodes = viewer._points._nodes.values()
             points = np.concatenate([node.points for node in nodes])
@@ -207,8 +197,6 @@ def test_scenes_of_any_scale_are_the_same_on_the_page(tmp_path):
             client: Any = SimpleNamespace(camera=seen)
             back = viewer.frame.client_camera(client, longest=320)
             np.testing.assert_allclose(back.cam_from_world, pose.cam_from_world, atol=1e-9 * scale)
-        finally:
-            viewer.stop()
     for other in sent[1:]:
         # The memory's voxels, not what is on the page, lie differently.
         np.testing.assert_allclose(other, sent[0], rtol=0.02, atol=0.06)
@@ -245,41 +233,37 @@ def test_of_two_cameras_selected_one_after_the_other_the_last_is_shown(small_run
             assert go_on.wait(PATIENCE)
         return run.frame_of(name)
 
-    viewer = WebViewer(replace(run, cameras=(slow, fast), frame_of=frame_of), port=free_port())
     client = SimpleNamespace(
         client_id=0, atomic=nullcontext, flush=lambda: None,
         camera=SimpleNamespace(wxyz=np.array([1.0, 0, 0, 0]), position=np.zeros(3), fov=1.0),
     )  # fmt: skip
-    try:
-        first = threading.Thread(target=viewer._clicked, args=(slow, client), name="first")
-        first.start()
-        assert asked.wait(PATIENCE)
-        second = threading.Thread(target=viewer._clicked, args=(fast, client))
-        second.start()
-        second.join()
-        go_on.set()
-        first.join()
-        panel = viewer._panel
-        assert fast.name in panel._camera.value and fast.name in panel._caption.content
-        np.testing.assert_allclose(
-            client.camera.position, viewer.frame.placement(fast.camera)[1], atol=1e-9
-        )
-    finally:
-        go_on.set()
-        viewer.stop()
+    with served(replace(run, cameras=(slow, fast), frame_of=frame_of)) as viewer:
+        try:
+            first = threading.Thread(target=viewer._clicked, args=(slow, client), name="first")
+            first.start()
+            assert asked.wait(PATIENCE)
+            second = threading.Thread(target=viewer._clicked, args=(fast, client))
+            second.start()
+            second.join()
+            go_on.set()
+            first.join()
+            panel = viewer._panel
+            assert fast.name in panel._camera.value and fast.name in panel._caption.content
+            np.testing.assert_allclose(
+                client.camera.position, viewer.frame.placement(fast.camera)[1], atol=1e-9
+            )
+        finally:
+            go_on.set()
 
 
 def test_points_cost_fifteen_bytes_and_stay_within_the_budget(small_run):
     run = ViewSource(small_run).read()
-    viewer = WebViewer(run, port=free_port(), budget=900)
-    try:
+    with served(run, budget=900) as viewer:
         nodes = viewer._points._nodes.values()
         drawn = sum(len(node.points) for node in nodes)
         assert 300 < drawn <= 900
         assert sum(n.points.nbytes + n.colors.nbytes for n in nodes) == 15 * drawn
         assert viewer._points.count(0) < viewer._points.count(2) == drawn
-    finally:
-        viewer.stop()
 
 
 EVIL = '<img src=x onerror="window.stolen=1"><script>window.stolen=1</script>&amp;](x).png'
