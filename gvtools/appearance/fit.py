@@ -145,7 +145,11 @@ class Fit:
         # Recorded depth fixes Gaussians along the ray, as photographs from more directions would.
         self._left_out = 0.0 if self.recorded else min(MOST_LEFT_OUT, LEFT_OUT / len(self.views))
         self._fading = len(self.views) < FEW and not self.recorded
-        self._free = [self._free_of(view) for view in self.views]
+        # See ``free_depth``; None without points.
+        self._free = [
+            None if surface is None else free_depth(surface, self._lens(view, view.cam_from_local))
+            for view in self.views
+        ]
         self._grown = (0, begin)
         self._order: list[int] = []
         self._reduced: dict[int, ReducedView] = {}
@@ -298,7 +302,10 @@ class Fit:
         if free is not None:
             floating = floaters(self.population.values, lens, free, rows=seen)
             self.population.fade(FLOATER_FADE, seen[floating])
-        self._note_pulls(lens, seen, rows)
+        # Gradients by the centres in the picture; half a picture is 1, see FitOptions.
+        pull = np.hypot(rows[:, VALUES] * lens.width, rows[:, VALUES + 1] * lens.height)
+        self.population.pull[seen] += pull * (0.5 / (lens.width * lens.height))
+        self.population.pulls[seen] += 1
         since = self.steps - self._grown[0]
         periods = int(share / GROWTH_SHARE) - int(self._grown[1] / GROWTH_SHARE)
         due = since >= FEWEST_BETWEEN and periods > 0
@@ -309,13 +316,9 @@ class Fit:
                 self.population.grow(self.options.growth, most, wide=WIDE, rng=self.rng)
             self.population.remove_faint()
 
-    def _lens(self, view: FitView) -> Lens:
-        size = view.rgb.shape[1::-1]
-        return Lens.of(view.cam_from_local, view.K, size=(size[0], size[1]), near=self.near)
-
-    def _free_of(self, view: FitView) -> NDArray[np.float32] | None:
-        """See ``free_depth``; None without points."""
-        return None if self.surface is None else free_depth(self.surface, self._lens(view))
+    def _lens(self, view: FitView, pose: NDArray[np.float64]) -> Lens:
+        height, width = view.rgb.shape[:2]
+        return Lens.of(pose, view.K, size=(width, height), near=self.near)
 
     def _most_gaussians(self, share: float) -> int:
         """Limit of the number of Gaussians at a progress of ``share``."""
@@ -361,9 +364,7 @@ class Fit:
         self._validation = ()
 
     def _picture(self, number: int, pose: NDArray[np.float64]) -> Picture:
-        view = self.views[number]
-        height, width = view.rgb.shape[:2]
-        lens = Lens.of(pose, view.K, size=(width, height), near=self.near)
+        lens = self._lens(self.views[number], pose)
         gain = self._exposures().at(pose)
         values, free = self.population.values, self._free[number]
         if free is not None:
@@ -420,13 +421,6 @@ class Fit:
         if view.depth is None:
             add_bending(picture.image, view.target, gradient, weight=SMOOTH)
         return gradient
-
-    def _note_pulls(self, lens: Lens, seen: NDArray[np.int64], rows: NDArray[np.float32]) -> None:
-        """Add up gradients by the centres in the picture; half a picture is 1, see FitOptions."""
-        population = self.population
-        pull = np.hypot(rows[:, VALUES] * lens.width, rows[:, VALUES + 1] * lens.height)
-        population.pull[seen] += pull * (0.5 / (lens.width * lens.height))
-        population.pulls[seen] += 1
 
 
 def validation_rows(views: int) -> tuple[int, ...]:

@@ -240,11 +240,6 @@ class _Task:
         local[:3, 3] += world_from_scan[:3, :3] @ self.scan_middle - self.middle
         return local
 
-    def _to_world(self, local: Float64) -> Float64:
-        world = local.copy()
-        world[:3, 3] += self.middle - local[:3, :3] @ self.scan_middle
-        return world
-
     def scales(self) -> tuple[float, ...]:
         """Scales to try, world units per unit of the scan."""
         ratio = extent_of(self.target.positions) / extent_of(self.scan.positions)
@@ -358,7 +353,9 @@ class _Task:
     def judged(self, placed: Float64, how: str) -> Placement:
         """A placement in world coordinates with its fitness."""
         fitness, scan_fitness, rmse = self._fitness(placed, self.tolerance)
-        return Placement(self._to_world(placed), how, fitness, scan_fitness, rmse, self.tolerance)
+        world = placed.copy()
+        world[:3, 3] += self.middle - placed[:3, :3] @ self.scan_middle
+        return Placement(world, how, fitness, scan_fitness, rmse, self.tolerance)
 
     def _fitness(self, placed: Float64, tolerance: float) -> tuple[float, float, float]:
         """Shares of the photographs' and of the scan's points that fit, and the former's RMSE."""

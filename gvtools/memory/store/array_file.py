@@ -72,7 +72,10 @@ class ArrayFile:
             self.meta: dict[str, Any] = dict(parsed["meta"])
             self._table: dict[str, list[Any]] = dict(parsed["arrays"])
             for kind, shape, at, _ in self._table.values():
-                _check_entry(kind, shape, at)
+                # Before NumPy sees it, which takes such texts for Python.
+                known = isinstance(kind, str) and KINDS.fullmatch(kind) and at % ALIGNED == 0
+                if not known or any(type(n) is not int or not 0 <= n < 2**48 for n in (at, *shape)):
+                    raise ValueError(f"array of type {kind!r}, shape {shape!r} at {at!r}")
         except (KeyError, RecursionError, TypeError, ValueError) as error:
             raise MemoryFileError(f"{path}: a header that none of gvtools is ({error})") from None
         self._data = -(-(start + length) // ALIGNED) * ALIGNED
@@ -116,15 +119,6 @@ class ArrayFile:
             f"{self.path}: {what} does not match its checksum; the file is damaged; restore it or "
             "run again"
         )
-
-
-def _check_entry(kind: Any, shape: Any, at: Any) -> None:
-    """Refuse what no array of numbers is."""
-    # Before NumPy sees it, which takes such texts for Python.
-    known = isinstance(kind, str) and KINDS.fullmatch(kind)
-    numbers = [at, *shape]
-    if not known or not all(type(n) is int and 0 <= n < 2**48 for n in numbers) or at % ALIGNED:
-        raise ValueError(f"array of type {kind!r}, shape {shape!r} at {at!r}")
 
 
 def _nbytes(kind: str, shape: list[int]) -> int:
