@@ -182,17 +182,17 @@ def test_images_of_another_size_are_refused_with_both_sizes():
     rgb = _numbered((30, 40))
     with pytest.raises(ShapeError, match=r"rgb has shape \(30, 39, 3\).*\(30, 40, 3\)"):
         back_project(rgb[:, :39], depth, source)
-    with pytest.raises(ShapeError, match="depth has shape"):
-        back_project(rgb, depth[:29], source)
-    with pytest.raises(ShapeError, match="confidence has shape"):
-        back_project(rgb, depth, source, confidence=depth[:29])
-    with pytest.raises(ShapeError, match="mask has shape"):
-        back_project(rgb, depth, source, mask=depth[:29] > 0)
+    for name in ("depth", "confidence", "mask"):
+        images: dict[str, Any] = {
+            "depth": depth,
+            name: depth[:29] > 0 if name == "mask" else depth[:29],
+        }
+        with pytest.raises(ShapeError, match=f"{name} has shape"):
+            back_project(rgb, camera=source, **images)
 
 
 def pinhole(width: int, height: int) -> Cameras:
-    K = np.array([[FOCAL, 0, width / 2], [0, FOCAL, height / 2], [0, 0, 1]])
-    return Cameras(K[None], np.eye(4)[None], np.array([width]), np.array([height]), ("view",))
+    return camera(width=width, height=height, focal=FOCAL)
 
 
 def blocks(width: float, footprints: float = 0.0) -> dict[str, Any]:

@@ -133,23 +133,6 @@ def test_open3d_works_on_the_cloud_as_on_any():
     assert copy.point.normals.shape == [len(memory), 3] and "normals" not in memory.cloud.point
 
 
-def test_open3d_projects_the_cloud_as_we_do():
-    """Its projection reads the rows one after the other, whatever their stride is."""
-    memory = random_memory(3, most=300)
-    target = camera(width=64, height=48, focal=50)
-    ours = memory.project(target, options=SplatOptions(backend="nearest"))
-    K = target.K[0].copy()
-    K[:2, 2] -= 0.5
-    seen = memory.frame.cam_from_local(target.cam_from_world)[0]
-    image = memory.cloud.project_to_depth_image(
-        int(target.width[0]), int(target.height[0]), o3d.core.Tensor(K), o3d.core.Tensor(seen),
-        1.0, 1e6,
-    )  # fmt: skip
-    depth = image.as_tensor().numpy()[..., 0]
-    assert ours.valid.any()
-    assert np.isclose(depth, ours.depth[0], rtol=1e-5).mean() > 0.99
-
-
 @pytest.mark.parametrize("kind", ["ply", "pcd"])
 def test_open3d_writes_every_attribute(kind, tmp_path):
     memory, path = random_memory(3), tmp_path / f"cloud.{kind}"
