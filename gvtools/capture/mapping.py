@@ -54,7 +54,7 @@ Pairs = Mapping[tuple[str, str], int]  # number of verified matches of pairs of 
 
 
 @dataclass(frozen=True, eq=False)
-class Mapped:
+class MappingResult:
     """What mapping found."""
 
     # The one with the most registered pictures; its scale is arbitrary.
@@ -68,7 +68,7 @@ class Mapped:
     flat: bool = False  # every pair is explained by a plane, so that intrinsics hang by little
 
 
-def find_cameras(task: MappingTask) -> Mapped:
+def find_cameras(task: MappingTask) -> MappingResult:
     """Find intrinsics and poses of pictures."""
     import pycolmap
 
@@ -101,7 +101,9 @@ def find_cameras(task: MappingTask) -> Mapped:
     if flat and _angle(largest) < STEEP:
         raise _no_depth(source, len(pairs))
     others = tuple(tuple(sorted(_names(model))) for model in rest)
-    return Mapped(largest, how, others, matching, pairs=pairs, explained=share, flat=bool(flat))
+    return MappingResult(
+        largest, how, others, matching, pairs=pairs, explained=share, flat=bool(flat)
+    )
 
 
 def _names(model: pycolmap.Reconstruction) -> set[str]:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gvtools.capture import video
-from gvtools.capture.mapping import Mapped, find_cameras
+from gvtools.capture.mapping import MappingResult, find_cameras
 from gvtools.capture.matching import MappingTask, Say
 from gvtools.capture.panoramas import (
     fisheye_params,
@@ -151,7 +151,7 @@ def _map(
     masks: Path | None,
     learned: LightGlueMatcher | None,
     say: Say,
-) -> Mapped:
+) -> MappingResult:
     """Write the pictures of the project, and find their cameras."""
     (work / "mapping").mkdir()
     task = MappingTask(
@@ -225,7 +225,7 @@ def _report(
     source: Path,
     photographs: Sequence[CapturedPhotograph],
     *,
-    mapped: Mapped,
+    mapped: MappingResult,
     placement: WorldPlacement,
     features: str,
     findings: Sequence[Finding],

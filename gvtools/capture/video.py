@@ -31,7 +31,7 @@ CORNERS = 200
 
 
 @dataclass(frozen=True)
-class Picked:
+class FrameSelection:
     """What was taken from a video."""
 
     frames: tuple[int, ...]  # numbers of the frames taken, from 0
@@ -56,7 +56,7 @@ class Picked:
 
 def pick_frames(
     path: Path, folder: Path, *, count: int | None = None, progress: Callable[[int], object]
-) -> Picked:
+) -> FrameSelection:
     """Write the chosen frames of a video to ``folder`` as ``frame_NNNNNN.jpg``.
 
     The path of the picture is cut into pieces of equal motion, and the sharpest frame of each is
@@ -83,7 +83,7 @@ def pick_frames(
         chosen.append(int(rows[np.argmax(sharp[rows])]))
     _write(path, folder, chosen)
     lost = announced - len(moved)
-    return Picked(tuple(chosen), len(moved), total, lost if lost > LOST * announced else 0)
+    return FrameSelection(tuple(chosen), len(moved), total, lost if lost > LOST * announced else 0)
 
 
 def _measure(
