@@ -110,6 +110,27 @@ def fit_similarity(
     )  # fmt: skip
 
 
+def fit_line(source: ArrayLike, target: ArrayLike, *, with_scale: bool) -> SimilarityFit:
+    """The fit of ``fit_similarity`` where either lies on a line: what its open turn leaves alone.
+
+    Scale and residuals are the same for every rotation about the line; the rotation is NaN.
+    """
+    x, y = (np.asarray(points, np.float64) for points in (source, target))
+    centers = x.mean(axis=0), y.mean(axis=0)
+    x, y = x - centers[0], y - centers[1]
+    left, d, right = np.linalg.svd(y.T @ x)
+    scale = float(d[0] / (x**2).sum()) if with_scale else 1.0
+    along, across = scale * (x @ right[0]), scale * x - scale * np.outer(x @ right[0], right[0])
+    aside = y - np.outer(y @ left[:, 0], left[:, 0])
+    parts = [y @ left[:, 0] - along, *across.T, *aside.T]
+    residuals = np.sqrt((np.square(parts)).sum(axis=0))
+    nan = np.full((3, 3), np.nan)
+    return SimilarityFit(
+        "aligned along a line", scale, nan, nan[0], residuals,
+        float(np.sqrt((residuals**2).mean())), *centers,
+    )  # fmt: skip
+
+
 def _checked(
     source: ArrayLike, target: ArrayLike, weights: ArrayLike | None
 ) -> tuple[Float64, Float64, Float64]:

@@ -1,12 +1,14 @@
 """Trajectory files: TUM (timestamped quaternions), KITTI (rows of 3x4 matrices), EuRoC (CSV).
 
-They hold poses to world, in scene units, and nothing of the camera itself: the intrinsics and the
-image size come from given cameras. TUM's and KITTI's poses are those of a camera with OpenCV axes,
-EuRoC's those of the inertial unit.
+Which column is which, and the unit of the time stamps, the names in a file's head tell, else the
+numbers; never the file's suffix. They hold poses to world, in scene units, and nothing of the
+camera itself: the intrinsics and the image size come from given cameras. TUM's and KITTI's poses
+are those of a camera with OpenCV axes, EuRoC's those of the inertial unit.
 """
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,8 +23,17 @@ Float64 = NDArray[np.float64]
 
 # A quaternion written with few digits may be this far from unit length; farther, it is none.
 QUATERNION_TOLERANCE = 1e-2
-# Numbers of a line that are read.
-_COUNTS = {"tum": 8, "kitti": 12, "euroc": 8}
+EUROC = 17  # numbers in a line of EuRoC's ground truth
+# Where time, position and quaternion (x, y, z, w) stand, and what the columns are called.
+_COLUMNS = {"tum": (0, 1, 2, 3, 4, 5, 6, 7), "euroc": (0, 1, 2, 3, 5, 6, 7, 4)}
+_NAMES = {"tum": "timestamp tx ty tz qx qy qz qw", "euroc": "nanoseconds, x, y, z, qw, qx, qy, qz"}
+_UNIT = re.compile(r"\s*[\[(]\s*([^\])]*?)\s*[\])]")
+_TIME = re.compile(r"(?:\w+_)?(?:time|(?:time_?)?stamps?|n?secs?|seconds|t)(?:_(ns|us|ms|s))?")
+_TURN = re.compile(r"(?:q|quat\w*?|rot\w*?|ori\w*?)(?:[._]\w+)??[._]?([xyzw])(?:_world\w*)?")
+_PLACE = re.compile(r"(?:t|p|pos\w*?|trans\w*?)?(?:[._]\w+)??[._]?([xyz])(?:_world\w*)?")
+# Of a unit of time: seconds, the size of stamps since 1970, and the least median step from one pose
+# to the next by which stamps of another beginning are known.
+_UNITS = {"ns": (1e-9, 1e18, 1e6), "us": (1e-6, 1e15, 1e3), "ms": (1e-3, 1e12, np.inf)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +44,7 @@ class Trajectory:
     # N names; empty when poses are told apart by time or by order alone
     names: tuple[str, ...] = ()
     stamps: Float64 | None = None  # (N,) float64, seconds; None where there are no times
+    notes: tuple[str, ...] = ()  # what was recognised, put in order or left out
 
     def __len__(self) -> int:
         return len(self.poses)
@@ -44,12 +56,12 @@ def read_poses(path: str | Path, *, layout: str = "auto") -> Trajectory:
     Args:
         path: a text file; blank lines and lines that start with # are passed over.
         layout: "tum" (timestamp tx ty tz qx qy qz qw), "kitti" (12 numbers, a 3x4 matrix by rows),
-            "euroc" (CSV: nanoseconds, x, y, z, qw, qx, qy, qz, and more that is not read) or "auto"
-            (a .csv file is EuRoC's; else by the count of numbers in the first line: 8 or 12).
+            "euroc" (CSV: nanoseconds, x, y, z, qw, qx, qy, qz, and more that is not read) or
+            "auto": the columns that the head names, else what the numbers tell.
 
     Returns:
-        N poses, with stamps for TUM and EuRoC. Rotations that are off by more than rounded digits
-        are replaced by the nearest ones.
+        N poses in the order of the file, with stamps for TUM and EuRoC. Rotations that are off by
+        more than rounded digits are replaced by the nearest ones.
 
     Raises:
         ProjectError: unreadable or empty; a line with another count of numbers, something that is
@@ -65,36 +77,148 @@ def read_poses(path: str | Path, *, layout: str = "auto") -> Trajectory:
     (array([1., 2., 4.]), array([0. , 0.1]))
     """
     path = Path(path)
-    rows = _rows(path)
-    if layout == "auto":
-        counted = {8: "tum", 12: "kitti"}
-        layout = "euroc" if path.suffix.lower() == ".csv" else counted.get(len(rows[0][1]), layout)
-    if layout not in _COUNTS:
-        raise ProjectError(
-            f"{path}:{rows[0][0]}: {len(rows[0][1])} numbers with layout {layout!r}; expected 8 "
-            "(tum: timestamp tx ty tz qx qy qz qw) or 12 (kitti: a 3x4 matrix), or euroc's .csv"
-        )
+    form, rows = _form(path, layout)
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     stamps = np.empty(len(rows))
     for i, (number, words) in enumerate(rows):
         where = f"{path}:{number}"
-        if layout == "euroc":
-            words = words[: _COUNTS[layout]]
-        values = _numbers(words, _COUNTS[layout], where=where)
-        if layout == "kitti":
-            poses[i, :3] = values.reshape(3, 4)
+        if form.columns is None:
+            poses[i, :3] = _numbers(words, 12, where=where).reshape(3, 4)
         else:
-            quaternion = values[4:] if layout == "tum" else values[[5, 6, 7, 4]]
-            poses[i, :3, :3] = _rotation(quaternion, where=where)
-            poses[i, :3, 3] = values[1:4]
-            stamps[i] = values[0] if layout == "tum" else values[0] * 1e-9
+            if len(words) > max(form.columns) and (len(words) == 8 or form.more):
+                words = [words[column] for column in form.columns]
+            values = _numbers(words, 8, where=where)
+            poses[i, :3, :3] = _rotation(values[4:], where=where)
+            stamps[i], poses[i, :3, 3] = values[0], values[1:4]
         try:
             nearest, defect = rigid_transform(poses[i], what=where)
         except ShapeError as error:
             raise ProjectError(str(error)) from None
         if defect > ROTATION_ROUNDING:
             poses[i] = nearest
-    return Trajectory(poses, (), None if layout == "kitti" else stamps)
+    if form.columns is None:
+        return Trajectory(poses)
+    unit = form.unit or unit_of(stamps)
+    seconds = stamps * _UNITS.get(unit, (1.0,))[0]
+    if form.unit and not (np.abs(seconds).max() < 1e11 and 1e-6 < (_step(seconds) or 1) < 1e6):
+        raise ProjectError(
+            f"{path}: its head gives time stamps in {form.unit}, which {stamps[-1]:.17g} cannot "
+            "be; mend the head"
+        )
+    notes = form.notes
+    if unit and not form.unit and not form.more:
+        notes = (*notes, f"time stamps read as {unit}")
+    return Trajectory(poses, (), seconds, notes)
+
+
+@dataclass(frozen=True)
+class _Form:
+    """How the lines of a file are read."""
+
+    columns: tuple[int, ...] | None  # of time, position and quaternion (x, y, z, w); None: KITTI's
+    more: bool = False  # whether there may be more columns
+    unit: str = ""  # of the time stamps, as the head names it
+    notes: tuple[str, ...] = ()
+
+
+def _form(path: Path, layout: str) -> tuple[_Form, list[tuple[int, list[str]]]]:
+    """The layout of a file, and its rows of data."""
+    head, rows, commas = _rows(path)
+    if layout not in ("auto", "kitti", *_COLUMNS):
+        raise ProjectError(f"{path}: layout {layout!r}; expected auto, tum, kitti or euroc")
+    count = len(rows[0][1])
+    if head is not None and layout != "kitti":
+        columns, unit = head
+        order = "euroc" if columns[7] < columns[4] else "tum"
+        if layout not in ("auto", order):
+            raise ProjectError(
+                f"{path}: layout {layout!r}, and its head names the columns as {order} has them "
+                f"({_NAMES[order]}); leave --layout out, or mend the head"
+            )
+        return _Form(columns, True, unit), rows
+    if layout == "kitti" or (layout == "auto" and count == 12 and not commas):
+        return _Form(None), rows
+    if layout != "auto":
+        return _Form(_COLUMNS[layout], layout == "euroc"), rows
+    if count < 8 or (count not in (8, EUROC) and not commas):
+        raise ProjectError(
+            f"{path}:{rows[0][0]}: {count} numbers; expected 8 (tum: {_NAMES['tum']}), 12 (kitti: "
+            f"a 3x4 matrix), or 8 and more with commas (euroc: {_NAMES['euroc']})"
+        )
+    return _by_numbers(path, rows, commas=commas), rows
+
+
+def _by_numbers(path: Path, rows: list[tuple[int, list[str]]], *, commas: bool) -> _Form:
+    """Whether lines without names are TUM's or EuRoC's."""
+    try:
+        numbers = np.array([words[:8] for _, words in rows], np.float64)
+    except ValueError:
+        numbers = np.zeros((1, 8))  # some line is wrong, which is said where it is read
+    more = len(rows[0][1]) > 8
+    if len(rows[0][1]) == 12 and np.abs(numbers[:, 0]).max() < 1 + QUATERNION_TOLERANCE:
+        return _Form(None)
+    fine = unit_of(numbers[:, 0]) == "ns"
+    # A walk that starts at the identity, and real parts that are never negative, tell where those
+    # stand; so do commas and nanoseconds together.
+    turn = numbers[:, 4:]
+    first, last = (bool((turn[:, at] >= 0).all() or (turn[:, at] <= 0).all()) for at in (0, 3))
+    said = [order for order, at in (("euroc", 0), ("tum", 3)) if abs(turn[0, at]) > 1 - 1e-6]
+    said = said or (["euroc"] if first and not last else ["tum"] if last and not first else [])
+    order = "euroc" if more or (commas and fine) else "tum"
+    mixed = commas != fine and not more
+    if mixed and said:
+        order = said[0]
+    elif said and abs(turn[0]).max() > 1 - 1e-6 and said[0] != order:
+        raise ProjectError(
+            f"{path}: the columns look like {order}'s ({_NAMES[order]}), but its first pose is the "
+            f"identity by those of {said[0]}; give --layout {order} or {said[0]}, or name the "
+            "columns in a first line"
+        )
+    note = f"columns taken as {_NAMES[order]}; if they are not, give --layout"
+    return _Form(_COLUMNS[order], more, "", (note,) if mixed else ())
+
+
+def unit_of(stamps: Float64) -> str:
+    """The unit of time stamps that are none in seconds, by their size or their steps; else "".
+
+    >>> unit_of(np.array([0, 33e6, 66e6])), unit_of(np.array([1.4e9, 1.4e9 + 1]))
+    ('ns', '')
+    """
+    size = float(np.abs(stamps).max(initial=0))
+    for unit, (_, since, _) in _UNITS.items():
+        if 0.9 * since < size < 5 * since:
+            return unit
+    return next((unit for unit, (*_, step) in _UNITS.items() if _step(stamps) >= step), "")
+
+
+def in_seconds(stamps: Float64) -> Float64:
+    """Time stamps of the unit that ``unit_of`` tells, in seconds."""
+    return stamps * _UNITS.get(unit_of(stamps), (1.0,))[0]
+
+
+def _step(stamps: Float64) -> float:
+    """The median step between time stamps that differ; 0 where all are one."""
+    steps = np.diff(np.unique(stamps))
+    return float(np.median(steps)) if len(steps) else 0.0
+
+
+def in_time(track: Trajectory) -> Trajectory:
+    """A trajectory in the order of its stamps, each once: the first pose of a repeated one.
+
+    >>> track = Trajectory(np.tile(np.eye(4), (3, 1, 1)), (), np.array([2.0, 1.0, 2.0]))
+    >>> in_time(track).stamps, in_time(track).notes
+    (array([1., 2.]), ('1 of 3 time stamps not in order, sorted', '1 repeated, merged'))
+    """
+    if track.stamps is None:
+        return track
+    stamps, rows = np.unique(track.stamps, return_index=True)
+    notes = list(track.notes)
+    if late := int((np.diff(track.stamps) < 0).sum()):
+        notes.append(f"{late} of {len(track)} time stamps not in order, sorted")
+    if left := len(track) - len(rows):
+        notes.append(f"{left} repeated, merged")
+    names = tuple(track.names[row] for row in rows) if track.names else ()
+    return Trajectory(track.poses[rows], names, stamps, tuple(notes))
 
 
 def read_trajectory(path: str | Path, like: Cameras, *, layout: str = "auto") -> Cameras:
@@ -114,8 +238,9 @@ def read_trajectory(path: str | Path, like: Cameras, *, layout: str = "auto") ->
     track = read_poses(path, layout=layout)
     names: list[str] = []
     repeats: dict[str, int] = {}
-    for _, words in _rows(path):
-        name = words[0] if track.stamps is not None else f"{len(names):06d}"
+    form, rows = _form(path, layout)
+    for _, words in rows:
+        name = words[form.columns[0]] if form.columns else f"{len(names):06d}"
         # Published ground truth holds repeated timestamps; names have to differ.
         repeats[name] = repeats.get(name, -1) + 1
         if repeats[name]:
@@ -124,21 +249,45 @@ def read_trajectory(path: str | Path, like: Cameras, *, layout: str = "auto") ->
     return _with_intrinsics(track.poses, like, names, path=path)
 
 
-def _rows(path: Path) -> list[tuple[int, list[str]]]:
-    """Line numbers and words of the lines that hold data."""
+def _rows(
+    path: Path,
+) -> tuple[tuple[tuple[int, ...], str] | None, list[tuple[int, list[str]]], bool]:
+    """Columns and unit that a head names, line numbers and words, whether commas part them."""
     try:
         text = read_text(path)
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "not a text file"
         raise ProjectError(f"{path}: cannot be read as a trajectory ({reason})") from error
-    rows = [
-        (number, line.replace(",", " ").split())
-        for number, line in enumerate(text.splitlines(), start=1)
-        if line.strip() and not line.lstrip().startswith("#")
-    ]
-    if not rows:
+    lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
+    data = next((i for i, (_, line) in enumerate(lines) if not line.lstrip().startswith("#")), 0)
+    named = next(filter(None, (_head(line) for _, line in reversed(lines[: data + 1]))), None)
+    if named is not None and _head(lines[data][1]) is not None:
+        data += 1
+    kept = [(number, line) for number, line in lines[data:] if not line.lstrip().startswith("#")]
+    if not kept:
         raise ProjectError(f"{path}: no poses; expected one line for each camera")
-    return rows
+    rows = [(number, re.split(r"[,;\s]+", line.strip(" \t,;"))) for number, line in kept]
+    return named, rows, bool(re.search("[,;]", kept[0][1]))
+
+
+def _head(line: str) -> tuple[tuple[int, ...], str] | None:
+    """Columns of time, position and quaternion (x, y, z, w), and the time's unit."""
+    line = _UNIT.sub(r"[\1]", line.strip().lstrip("#%").strip().lower())
+    found: dict[str, int] = {}
+    unit = ""
+    for column, word in enumerate(re.split(r"\s*[,;]\s*|\s+", line)):
+        name, _, given = word.rstrip("]").partition("[")
+        name = "_".join(name.split(".")[-2:])
+        if (match := _TURN.fullmatch(name)) and "q" + match[1] not in found:
+            found["q" + match[1]] = column
+        elif (match := _TIME.fullmatch(name)) and "time" not in found:
+            found["time"] = column
+            given = match[1] or given
+            unit = {"n": "ns", "u": "us", "µ": "us", "m": "ms", "s": "s"}.get(given[:1], "")
+        elif (match := _PLACE.fullmatch(name)) and match[1] not in found:
+            found[match[1]] = column
+    keys = ("time", "x", "y", "z", "qx", "qy", "qz", "qw")
+    return (tuple(found[key] for key in keys), unit) if set(keys) <= set(found) else None
 
 
 def _numbers(words: list[str], count: int, *, where: str) -> Float64:

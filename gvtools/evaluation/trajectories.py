@@ -9,10 +9,10 @@ number.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
-from pathlib import PurePosixPath
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,7 +20,8 @@ from numpy.typing import ArrayLike, NDArray
 from gvtools.cameras import ROTATION_TOLERANCE
 from gvtools.errors import DegenerateError, OptionError, ShapeError
 from gvtools.evaluation.statistics import ErrorStatistics
-from gvtools.similarity import COINCIDENT, SimilarityFit, fit_similarity
+from gvtools.scenes.matching import paired
+from gvtools.similarity import COINCIDENT, SimilarityFit, fit_line, fit_similarity
 
 Float64 = NDArray[np.float64]
 
@@ -29,6 +30,7 @@ AUC_THRESHOLDS = (3.0, 5.0, 10.0, 30.0)
 AUC_BINS = 1000
 ALIGNED = "aligned"
 UNALIGNED = "not aligned"
+ON_LINE = "aligned along a line"
 # A step below this share of the extent is none.
 STILL = 1e-12
 
@@ -37,8 +39,8 @@ STILL = 1e-12
 class PoseErrors:
     """Errors of an estimated trajectory; without figures they are None."""
 
-    # "aligned", "not aligned" (none was asked for), or "degenerate: ..." with the reason why there
-    # are no figures.
+    # "aligned", "not aligned" (none was asked for or needed), "aligned along a line" (whose
+    # rotation is open, so that ATE has none), or "degenerate: ..." with why there are no figures.
     status: str
     translation: ErrorStatistics | None = None  # scene units of the reference
     # The same, divided by ``extent``; None also when the extent is 0.
@@ -87,15 +89,18 @@ def absolute_errors(
     first, second = _poses(reference, estimate)
     status, fit = _aligned(first, second, align, refuse_mirrored=refuse_mirrored)
     extent = center_extent(first)
-    if not (status in (ALIGNED, UNALIGNED) and len(first)):
+    if not (status in (ALIGNED, UNALIGNED, ON_LINE) and len(first)):
         return PoseErrors(status=status, extent=extent)
     centers, rotations = second[:, :3, 3], second[:, :3, :3]
-    if fit is not None:
+    if fit is not None and status == ON_LINE:
+        translation = fit.residuals
+    elif fit is not None:
         # Residuals are taken about the centroids, so that great offsets keep their digits.
         translation, rotations = fit.residuals, fit.rotation @ rotations
     else:
         translation = np.linalg.norm(centers - first[:, :3, 3], axis=1)
     rotation = _angles_deg(np.swapaxes(first[:, :3, :3], 1, 2) @ rotations)
+    rotation = np.zeros(0) if status == ON_LINE else rotation
     return _figures(status, translation, rotation, extent=extent, fit=fit)
 
 
@@ -137,9 +142,11 @@ def relative_errors(
         raise OptionError(f"RPE delta {delta}; expected 1 frame or more")
     first, second = _poses(reference, estimate)
     status, fit = _aligned(first, second, align, refuse_mirrored=refuse_mirrored)
+    if align == "se3" and "mirror image of" not in status and len(first):
+        status, fit = (status, fit) if status == ALIGNED else (UNALIGNED, None)
     extent = center_extent(first)
     start = np.arange(0, max(len(first) - delta, 0), 1 if all_pairs else delta)
-    if status not in (ALIGNED, UNALIGNED):
+    if status not in (ALIGNED, UNALIGNED, ON_LINE):
         return PoseErrors(status=status, extent=extent)
     if not len(start):
         status = f"degenerate: {len(first)} poses, no pair is {delta} frames apart"
@@ -246,6 +253,10 @@ def _aligned(
     fit = fit_similarity(estimate[:, :3, 3], reference[:, :3, 3], with_scale=align == "sim3")
     if fit.ok and fit.mirrored and refuse_mirrored:
         return "degenerate: the estimate fits the mirror image of the reference", None
+    if "collinear" in fit.status:
+        return ON_LINE, fit_line(
+            estimate[:, :3, 3], reference[:, :3, 3], with_scale=align == "sim3"
+        )
     return (ALIGNED, fit) if fit.ok else (fit.status, None)
 
 
@@ -297,7 +308,7 @@ def _figures(
         status=status,
         translation=ErrorStatistics.of(translation),
         translation_share=ErrorStatistics.of(translation / extent) if extent > 0 else None,
-        rotation_deg=ErrorStatistics.of(rotation),
+        rotation_deg=ErrorStatistics.of(rotation) if len(rotation) else None,
         scale=1.0 if fit is None else fit.scale,
         extent=extent,
         translation_errors=translation,
@@ -338,32 +349,35 @@ def by_time(
     right = np.minimum(right, len(long) - 1)
     nearer = np.abs(long[order[left]] - short) <= np.abs(long[order[right]] - short)
     match = order[np.where(nearer, left, right)]
-    kept = np.flatnonzero(np.abs(long[match] - short) <= max_difference)
+    gaps = np.abs(long[match] - short)
+    # Of those that are nearest to one, the nearest has it.
+    nearest = np.lexsort((gaps, match))
+    once = nearest[np.unique(match[nearest], return_index=True)[1]]
+    kept = np.sort(once[gaps[once] <= max_difference])
     if not len(kept):
-        gap = np.abs(long[match] - short).min()
+        step = float(np.median(np.diff(np.sort(long)))) if len(long) > 1 else 0.0
+        near = "or a greater largest difference" if gaps.min() < step / 2 else "if clocks differ"
+        spans = " and ".join(f"{times.min():.6g} to {times.max():.6g}" for times in (first, second))
         raise DegenerateError(
-            f"association by time: no pair within {max_difference:g} s, the nearest are {gap:.3g} "
-            "s apart; give a greater largest difference, or an offset"
+            f"association by time: no pair within {max_difference:g} s, the nearest are "
+            f"{gaps.min():.3g} s apart ({spans} s); give an offset, {near}"
         )
     return (match[kept], kept) if swapped else (kept, match[kept])
 
 
 def by_name(reference: Sequence[str], estimate: Sequence[str]) -> tuple[Rows, Rows]:
-    """Rows of equal names, in the reference's order; without any, of equal stems of files."""
-    for form in (str, lambda name: PurePosixPath(name.replace("\\", "/")).stem.split(".")[0]):
-        first, second = [form(name) for name in reference], [form(name) for name in estimate]
-        row = {name: i for i, name in enumerate(second)}
-        pairs = [(i, row[name]) for i, name in enumerate(first) if name in row]
-        if not pairs:
-            continue
-        if len(row) < len(second) or len(set(first)) < len(first):
-            raise DegenerateError("association by name: a name occurs twice in one trajectory")
-        rows = np.array(pairs, np.int64)
-        return rows[:, 0], rows[:, 1]
-    raise DegenerateError(
-        f"association by name: none of {len(reference)} and {len(estimate)} names is equal (such "
-        f"as {next(iter(reference), '')!r} and {next(iter(estimate), '')!r})"
-    )
+    """Rows of equal names, in the reference's order; see ``gvtools.scenes.matching.paired``."""
+    for names in (reference, estimate):
+        if len(set(names)) < len(names):
+            twice = next(name for name, count in Counter(names).items() if count > 1)
+            raise DegenerateError(f"association by name: {twice!r} occurs twice in one trajectory")
+    rows = np.array(paired(reference, estimate), np.int64).reshape(-1, 2)
+    if not len(rows):
+        raise DegenerateError(
+            f"association by name: none of {len(reference)} and {len(estimate)} names is equal "
+            f"(such as {next(iter(reference), '')!r} and {next(iter(estimate), '')!r})"
+        )
+    return rows[:, 0], rows[:, 1]
 
 
 def by_index(reference: int, estimate: int) -> tuple[Rows, Rows]:

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import os
 import re
+import unicodedata
 from collections.abc import Iterable, Sequence
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.errors import ProjectError
+from gvtools.errors import DegenerateError, ProjectError
+from gvtools.scenes.images import IMAGE_SUFFIXES
 from gvtools.scenes.scene import natural_key
+from gvtools.trajectory_files import in_seconds
 from gvtools.untrusted import is_file, named_file
 
 Float64 = NDArray[np.float64]
@@ -92,6 +95,70 @@ def pair_by_name(pictures: Sequence[Path], depths: Sequence[Path]) -> dict[Path,
 def _leading_number(path: Path) -> int | str:
     match = re.match(r"\D*(\d+)", path.stem)
     return int(match.group(1)) if match else path.stem
+
+
+STAMP = re.compile(r"\d+\.\d+|\d{13,19}")
+# What else than a picture's suffix the same frame's files end in, as 7-Scenes has them.
+_KINDS = (".color", ".rgb")
+
+
+def stem(name: str) -> str:
+    """A picture's name without the suffixes that pictures have; other dots are part of it.
+
+    >>> stem("cam0/1403.25.png"), stem("1403.5"), stem("frame-000001.color.png")
+    ('cam0/1403.25', '1403.5', 'frame-000001')
+    """
+    name = unicodedata.normalize("NFC", name.replace("\\", "/"))
+    for endings in (IMAGE_SUFFIXES, _KINDS):
+        ending = next((end for end in endings if name.lower().endswith(end)), "")
+        name = name[: len(name) - len(ending)]
+    return name
+
+
+def times_in(names: Sequence[str]) -> Float64 | None:
+    """(N,) seconds, where every picture is named by a time of its own; else None.
+
+    >>> times_in(["cam0/1403636579763555584.png", "cam0/1403636579813555456.png"]).round(2)
+    array([1.40363658e+09, 1.40363658e+09])
+    """
+    stems = [PurePosixPath(stem(name)).name for name in names]
+    if not len(names) == len(set(stems)) > 0 or not all(map(STAMP.fullmatch, stems)):
+        return None
+    return in_seconds(np.array(stems, np.float64))
+
+
+def paired(first: Sequence[str], second: Sequence[str]) -> list[tuple[int, int]]:
+    """Rows of one name in both, whole or without suffixes and with the folders of only one.
+
+    >>> paired(["images/a.jpg", "images/b.jpg"], ["b.png", "c.png"])
+    [(1, 0)]
+    """
+    other = {name: row for row, name in enumerate(second)}
+    pairs = {row: other[name] for row, name in enumerate(first) if name in other}
+    tails: dict[tuple[str, ...], list[int]] = {}
+    wholes = [PurePosixPath(stem(name)).parts for name in second]
+    for row, parts in enumerate(wholes):
+        for start in range(len(parts)):
+            tails.setdefault(parts[start:], []).append(row)
+    taken: dict[int, int] = {row: i for i, row in pairs.items()}
+    for i, name in enumerate(first):
+        if i in pairs:
+            continue
+        parts = PurePosixPath(stem(name)).parts
+        found = set(tails.get(parts, []))
+        found |= {row for start in range(len(parts)) for row in tails.get(parts[start:], [])
+                  if wholes[row] == parts[start:]}  # fmt: skip
+        for row in found:
+            if len(found) > 1 or taken.setdefault(row, i) != i:
+                both = [second[r] for r in sorted(found)[:2]] if len(found) > 1 else [
+                    first[taken[row]], name
+                ]  # fmt: skip
+                raise DegenerateError(
+                    f"association by name: {both[0]!r} and {both[1]!r} are one name; expected each "
+                    "once; give folders of one camera"
+                )
+            pairs[i] = row
+    return sorted(pairs.items())
 
 
 def listed_file(folder: Path, name: str, *, where: str) -> Path:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field
 
-from gvtools.errors import OptionError
+from gvtools.errors import DegenerateError, OptionError
 from pipelines.commands.arguments import (
     MeasurementArguments,
     RootArguments,
@@ -295,12 +295,16 @@ class TrajectoryCommand(RootArguments):
         }
         if self.metric == "ate" and auc is None:
             figures["notes"]["auc"] = f"not measured over more than {MOST_FOR_AUC} poses"
+        for path, track in ((self.reference, reference), (self.estimate, estimate)):
+            for note in track.notes:
+                console.warn(f"{path}: {note}")
+                figures["notes"].setdefault("reading", []).append(f"{path}: {note}")
         if self.json_ is not None:
             write_json(self.json_, figures)
-        else:
+        elif errors.ok:
             _print(figures, errors, console)
         if not errors.ok:
-            console.warn(f"no figures: {errors.status}")
+            raise DegenerateError(f"no figures: {errors.status}")
 
 
 def _print(figures: dict[str, Any], errors: PoseErrors, console: Console) -> None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gvtools.errors import OptionError, ProjectError
+from gvtools.errors import DegenerateError, OptionError, ProjectError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -19,12 +21,28 @@ ASSOCIATIONS = ("auto", "time", "name", "index")
 
 
 def open_trajectory(path: Path, *, layout: str = "auto", root: Path | None = None) -> Trajectory:
-    """Camera-to-world poses.
+    """Camera-to-world poses: in the order of their times where all have one, else of their names.
 
     ``path`` is a TUM, KITTI or EuRoC file (of a ``layout``), a COLMAP model or workspace (its
     pictures need not be there), a transforms.json or posed RGB-D folder, spec:NAME:SCENE (below
     ``root``), or a run, whose poses are those of the views in its memory.
     """
+    from gvtools.scenes.matching import times_in
+    from gvtools.scenes.scene import natural_key
+    from gvtools.trajectory_files import Trajectory, in_time
+
+    track = _opened(path, layout, root)
+    if not track.names:
+        return in_time(track)
+    stamps = times_in(track.names)
+    if stamps is not None:
+        return in_time(Trajectory(track.poses, track.names, stamps))
+    order = sorted(range(len(track)), key=lambda row: natural_key(track.names[row]))
+    return Trajectory(track.poses[order], tuple(track.names[row] for row in order))
+
+
+def _opened(path: Path, layout: str, root: Path | None) -> Trajectory:
+    """The poses as they stand in a file or project."""
     from gvtools.scenes.colmap_model import find_model
     from gvtools.scenes.data_sets.catalogue import open_address
     from gvtools.scenes.layout import is_address
@@ -74,8 +92,8 @@ def associate(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], str]:
     """Rows of both trajectories that belong together, and how they were found.
 
-    With "auto", names go first, then times, then the order. ``offset`` is added to the estimate's
-    times.
+    With "auto", times go first (pictures' names may be times), then names, then the order.
+    ``offset`` is added to the estimate's times.
     """
     from gvtools.evaluation.trajectories import by_index, by_name, by_time
 
@@ -84,7 +102,7 @@ def associate(
     timed = reference.stamps is not None and estimate.stamps is not None
     if how == "auto":
         named = bool(reference.names and estimate.names)
-        how = "name" if named else "time" if timed else "index"
+        how = "time" if timed else "name" if named else "index"
     if how == "index":
         return (*by_index(len(reference), len(estimate)), how)
     if how == "name":
@@ -95,5 +113,32 @@ def associate(
         return (*by_name(reference.names, estimate.names), how)
     if reference.stamps is None or estimate.stamps is None:
         raise OptionError("association by time: a trajectory has no times; use name or index")
-    found = by_time(reference.stamps, estimate.stamps, max_difference=max_difference, offset=offset)
-    return (*found, how)
+    times, unit = estimate.stamps, ""
+    match = partial(by_time, max_difference=max_difference, offset=offset)
+    if found := _other_unit(reference.stamps, times, match):
+        times, unit = (
+            times * found[0],
+            f" (the estimate's stamps are {found[1]} of the reference's)",
+        )
+    return (*match(reference.stamps, times), how + unit)
+
+
+def _other_unit(
+    reference: NDArray[np.float64], estimate: NDArray[np.float64], match: Callable[..., Any]
+) -> tuple[float, str] | None:
+    """The factor under which most times find partners, where without it hardly any does."""
+
+    def pairs(factor: float) -> int:
+        try:
+            return len(match(reference, estimate * factor)[0])
+        except DegenerateError:
+            return 0
+
+    as_given, least = pairs(1), max(3, min(len(reference), len(estimate)) / 2)
+    powers = {3: "thousandths", 6: "millionths", 9: "billionths"}
+    names = {10.0**-n: name for n, name in powers.items()}
+    names |= {10.0**n: f"10^{n} fold" for n in powers}
+    for factor, name in names.items():
+        if (count := pairs(factor)) >= least and count > 2 * as_given:
+            return factor, name
+    return None

@@ -342,6 +342,8 @@ def pose_figures(errors: PoseErrors, auc: PoseAuc | None = None) -> dict[str, An
         notes["rmse"] = errors.status
     elif errors.translation_share is None:
         notes["translation_share"] = "the reference's centres have no extent"
+    if errors.ok and errors.rotation_deg is None:
+        notes["rotation_deg"] = errors.status
     out: dict[str, Any] = {
         "status": errors.status,
         **statistics_figures(errors.translation),

@@ -63,7 +63,6 @@ def test_millimetres_at_a_million_metres_are_kept():
     ("reference", "reason"),
     [
         (path()[:2], "at least 3"),
-        (line(), "collinear"),
         (np.tile(np.eye(4), (9, 1, 1)), "coincident"),
         (path()[:0], "no poses"),
     ],
@@ -77,6 +76,25 @@ def test_what_determines_no_alignment_has_no_number(reference, reason):
         assert errors.rotation_deg is None
         assert errors.scale is None
         assert not errors.ok
+
+
+def test_a_straight_line_has_the_figures_that_it_determines():
+    reference, turn = line(), Rotation.from_euler("z", 40, degrees=True).as_matrix()
+    estimate = moved(reference, scale=2)
+    estimate[:, :3, :3] = estimate[:, :3, :3] @ turn
+    absolute = absolute_errors(reference, estimate)
+    assert absolute.status == "aligned along a line"
+    assert absolute.scale == pytest.approx(0.5)
+    assert absolute.translation.max < 1e-12
+    assert absolute.rotation_deg is None
+    bent = disturbed(estimate, metres=0.2)
+    free = absolute_errors(reference, bent)
+    assert absolute_errors(reference, moved(bent, seed=5)).translation.rmse == pytest.approx(
+        free.translation.rmse, rel=1e-9
+    )
+    assert relative_errors(reference, moved(reference, scale=2)).translation.max < 1e-12
+    # Motions need no alignment but for the scale.
+    assert relative_errors(reference[:2], reference[:2], align="se3").translation.n == 1
 
 
 def test_a_mirrored_path_is_refused_unless_asked_for():
@@ -148,8 +166,12 @@ def test_times_are_paired_with_the_nearest():
     assert (first.tolist(), second.tolist()) == ([0, 1, 3], [0, 10, 99])
     first, _ = by_time(reference, estimate - 100, offset=100, max_difference=1)
     assert len(first) == 4
-    with pytest.raises(DegenerateError, match="offset"):
+    with pytest.raises(DegenerateError, match="offset, if clocks differ"):
         by_time(reference, estimate + 1000)
+    with pytest.raises(DegenerateError, match="greater largest difference"):
+        by_time(reference[::10], estimate[:1] + 0.4)
+    # However large the difference may be, each time is used once.
+    assert len(by_time(reference, estimate + 1000, max_difference=1e18)[0]) == 1
     with pytest.raises(DegenerateError, match="without poses"):
         by_time(reference, [])
 
@@ -159,10 +181,13 @@ def test_names_are_paired_whole_or_without_folder_and_suffix():
     assert (first.tolist(), second.tolist()) == ([0, 2], [1, 0])
     first, second = by_name(["images/0001.jpg", "images/0002.jpg"], ["0002.png"])
     assert (first.tolist(), second.tolist()) == ([1], [0])
-    with pytest.raises(DegenerateError, match="none of 1 and 1"):
-        by_name(["a"], ["b"])
-    with pytest.raises(DegenerateError, match="twice"):
+    for one, other in (("a", "b"), ("1403.25.png", "1403.65.png"), ("left/1.png", "right/1.png")):
+        with pytest.raises(DegenerateError, match="none of 1 and 1"):
+            by_name([one], [other])
+    with pytest.raises(DegenerateError, match=r"'left/1\.jpg' and 'right/1\.jpg' are one"):
         by_name(["left/1.jpg", "right/1.jpg"], ["1.png"])
+    with pytest.raises(DegenerateError, match=r"'1\.jpg' occurs twice"):
+        by_name(["1.jpg", "1.jpg"], ["1.png"])
 
 
 def test_rows_are_paired_where_there_are_as_many():

@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 from command_line import refused
+from scipy.spatial.transform import Rotation
 from trajectory_writers import write_kitti, write_tum
 from walks import disturbed, line, moved, path
 
@@ -43,8 +44,6 @@ def test_files_of_one_layout(tmp_path):
 
 
 def test_an_euroc_file_against_a_tum_file(tmp_path):
-    from scipy.spatial.transform import Rotation
-
     reference = path()
     write_tum(tmp_path / "tum.txt", cameras(reference))
     rows = ["#timestamp, p_x, p_y, p_z, q_w, q_x, q_y, q_z, v_x, v_y, v_z"]
@@ -72,15 +71,104 @@ def test_a_colmap_model_without_pictures_is_paired_by_name(tmp_path):
 
 
 def test_degenerate_paths_are_null_with_the_reason(tmp_path, capsys):
-    write_tum(tmp_path / "line.txt", cameras(line()))
-    file = tmp_path / "line.txt"
+    file, out = tmp_path / "line.txt", tmp_path / "out.json"
+    write_tum(file, cameras(line()))
     figures = measured(tmp_path, "ate", file, file)
-    assert figures["rmse"] is None
+    assert figures["rmse"] < 1e-12
     assert figures["rotation_deg"]["rmse"] is None
-    assert "collinear" in figures["status"]
-    assert "collinear" in figures["notes"]["rmse"]
-    assert "collinear" in capsys.readouterr().err
+    assert "line" in figures["notes"]["rotation_deg"]
+    write_tum(file, cameras(path(2)))
+    assert "no figures" in refused(capsys, "trajectory", "ate", file, file, "--json", out)
+    assert "at least 3" in json.loads(out.read_text())["notes"]["rmse"]
     assert measured(tmp_path, "ate", file, file, "--align", "none")["rmse"] == 0
+
+
+def rows(poses: np.ndarray, order: str = "xyzw", unit: float = 1.0) -> list[list[str]]:
+    """Lines of a file: a time every 0.1 s, the position, the quaternion in an order."""
+    turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat()[:, ["xyzw".index(k) for k in order]]
+    values = np.column_stack([poses[:, :3, 3], turns])
+    stamps = [
+        f"{round((100 + i / 10) / unit) if unit < 1 else 100 + i / 10}" for i in range(len(poses))
+    ]
+    return [[time, *(f"{v:.17g}" for v in row)] for time, row in zip(stamps, values, strict=True)]
+
+
+EUROC_HEAD = "#timestamp [ns], p_RS_R_x [m], p_y [m], p_z [m], q_RS_w [], q_x [], q_y [], q_z []\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "head", "order", "unit", "comma", "said"),
+    [
+        ("a.txt", EUROC_HEAD, "wxyz", 1e-9, ",", ""),
+        ("a.txt", "", "wxyz", 1e-9, ",", ""),
+        ("a.csv", "", "xyzw", 1, " ", ""),
+        ("a.csv", "", "xyzw", 1, ",", "columns taken as timestamp tx"),
+        ("a.csv", "num,t,x,y,z,qx,qy,qz,qw\n", "xyzw", 1, ",", ""),
+        ("a.txt", "# time_us tx ty tz qw qx qy qz\n", "wxyz", 1e-6, " ", ""),
+        ("a.txt", "", "xyzw", 1e-9, " ", "read as ns"),
+        ("a.txt", "", "xyzw", 1e-6, " ", "read as us"),
+        ("a.txt", "", "xyzw", 1e-3, " ", ""),
+    ],
+)
+def test_heads_and_numbers_decide_columns_and_units(
+    tmp_path, capsys, name, head, order, unit, comma, said
+):
+    reference = path()
+    (tmp_path / "tum.txt").write_text("\n".join(" ".join(row) for row in rows(reference)))
+    lines = rows(reference, order, unit)
+    if head.startswith("num"):
+        lines = [[str(i), *row] for i, row in enumerate(lines)]
+    (tmp_path / name).write_text(head + "\n".join(comma.join(row) for row in lines))
+    figures = measured(tmp_path, "ate", tmp_path / "tum.txt", tmp_path / name)
+    assert figures["associated"] == 40
+    assert figures["rotation_deg"]["max"] < 1e-5
+    assert said in capsys.readouterr().err
+    assert ("thousandths" in figures["association"]) == (unit == 1e-3)
+
+
+def test_contradictions_are_refused_with_the_layout(tmp_path, capsys):
+    file = tmp_path / "a.txt"
+    file.write_text(EUROC_HEAD + "\n".join(",".join(row) for row in rows(path(), "wxyz", 1e-9)))
+    assert "leave --layout out" in refused(
+        capsys, "trajectory", "ate", file, file, "--layout", "tum"
+    )
+    file.write_text(EUROC_HEAD + "\n".join(",".join(row) for row in rows(path(), "wxyz")))
+    assert "mend the head" in refused(capsys, "trajectory", "ate", file, file)
+    start = path() @ np.linalg.inv(path()[0])
+    file.write_text("\n".join(" ".join(row) for row in rows(start, "wxyz")))
+    assert "--layout" in refused(capsys, "trajectory", "ate", file, file)
+    assert measured(tmp_path, "ate", file, file, "--layout", "euroc")["rmse"] < 1e-9
+
+
+def test_shuffled_and_repeated_stamps_change_no_figure(tmp_path, capsys):
+    reference, estimate = path(), disturbed(path(), metres=0.05)
+    one, two = tmp_path / "a.txt", tmp_path / "b.txt"
+    one.write_text("\n".join(" ".join(row) for row in rows(reference)))
+    lines = [" ".join(row) for row in rows(estimate)]
+    two.write_text("\n".join(lines))
+    pairs = ((one, two), (two, one))
+    right = [measured(tmp_path, "rpe", *pair)["rmse"] for pair in pairs]
+    two.write_text("\n".join([*lines[20:], *lines[:25]]))
+    assert [measured(tmp_path, "rpe", *pair)["rmse"] for pair in pairs] == right
+    assert "1 of 45 time stamps not in order, sorted" in (text := capsys.readouterr().err)
+    assert "5 repeated, merged" in text
+
+
+def test_pictures_named_by_their_time_are_paired_as_stamps(tmp_path, capsys):
+    reference = path()
+    a, b, tum = tmp_path / "a", tmp_path / "b", tmp_path / "tum.txt"
+    write_colmap(a, cameras(reference, tuple(f"{100 + i / 10:.2f}.png" for i in range(40))))
+    write_colmap(b, cameras(reference, tuple(f"{100.04 + i / 10:.2f}.png" for i in range(40))))
+    assert "no pair within 0.01 s" in refused(capsys, "trajectory", "ate", a, b)
+    tum.write_text("\n".join(" ".join(row) for row in rows(reference)))
+    (tmp_path / "data.csv").write_text(
+        "\n".join(",".join(row) for row in rows(reference, "wxyz", 1e-9))
+    )
+    write_colmap(b, cameras(reference, tuple(f"cam0/{100 + i / 10:.1f}.jpg" for i in range(40))))
+    for file in (tum, tmp_path / "data.csv", b):
+        figures = measured(tmp_path, "ate", a, file)
+        assert (figures["association"], figures["associated"]) == ("time", 40)
+        assert figures["rmse"] < 1e-9
 
 
 def test_the_table_is_printed_without_json(tmp_path, capsys):
