@@ -41,6 +41,8 @@ Depth = NDArray[np.float32]
 DEPTH_SATURATED = 65535  # "no reading" of Kinect-like 16-bit depth, besides 0
 # What a folder of pictures may hold.
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".ppm")
+# Pillow's layouts of pixels with an alpha channel.
+WITH_ALPHA = ("RGBA", "LA", "PA", "RGBa", "La")
 OPAQUE_FROM = 128  # an alpha at or above this counts as part of the picture
 
 _EXIF_ORIENTATION = 0x0112
@@ -61,7 +63,7 @@ class ImageHeader:
     @property
     def has_alpha(self) -> bool:
         """Whether the picture carries an alpha channel, which is read as a mask."""
-        return self.mode in ("RGBA", "LA", "PA", "RGBa", "La")
+        return self.mode in WITH_ALPHA
 
 
 def read_header(path: Path) -> ImageHeader:
@@ -105,7 +107,7 @@ def _decode(image: Image.Image, path: Path | str) -> Frame:
     if image.mode.startswith("I;16"):
         grey = (np.asarray(image) >> 8).astype(np.uint8)
         return Frame(np.repeat(grey[..., None], 3, axis=-1))
-    if image.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info:
+    if image.mode in WITH_ALPHA or "transparency" in image.info:
         rgba = np.array(image.convert("RGBA"))
         mask = rgba[..., 3] >= OPAQUE_FROM
         rgb = np.ascontiguousarray(rgba[..., :3])
@@ -114,9 +116,18 @@ def _decode(image: Image.Image, path: Path | str) -> Frame:
 
 
 def read_mask(path: Path) -> NDArray[np.bool_]:
-    """(H, W) bool mask at ``path``: black is ignored (False), everything else used (True)."""
+    """(H, W) bool mask at ``path``: black or transparent is ignored (False), all else used (True).
+
+    Of one colour, the picture tells nothing where its alpha does.
+    """
     with _picture(path) as image:
-        return np.asarray(image if image.mode.startswith("I") else image.convert("L")) > 0
+        used = np.asarray(image if image.mode.startswith("I") else image.convert("L")) > 0
+        if image.mode not in WITH_ALPHA and "transparency" not in image.info:
+            return used
+        opaque = np.asarray(image.convert("RGBA"))[..., 3] >= OPAQUE_FROM
+    if opaque.all():
+        return used
+    return opaque if used.all() or not used.any() else used & opaque
 
 
 def read_depth(

@@ -41,6 +41,8 @@ from gvtools.untrusted import named_file
 Depth = NDArray[np.float32]
 
 # Reasons for which a frame is left out, as findings have them.
+# Masks that a scene opens to see whether they tell anything.
+MASKS = 8
 NO_PICTURE = "have no picture"
 NO_POSE = "have no pose"
 LOST = "were lost by the tracker"
@@ -173,12 +175,31 @@ def posed_scene(
             report.append(Finding("warning", line))
     photographs.sort(key=lambda item: natural_key(item.name))
     report += lens_findings([item.lens for item in photographs])
+    report += mask_findings([item.frame.mask for item in photographs if item.frame.mask])
     if strict:
         files = [item for item in photographs if item.frame.read is None]
         report += header_findings([(item.frame.image, item.lens.source_size) for item in files])
         report += depth_findings(photographs)
     views_of_scene = tuple(item.view() for item in photographs)
     return Scene(Path(root), kind, views_of_scene, None, tuple(report), metric=metric)
+
+
+def mask_findings(files: Sequence[Path]) -> list[Finding]:
+    """A warning where a few of the masks, evenly spread, all leave everything in or out."""
+    shares = []
+    for file in files[:: -(-len(files) // MASKS) or 1]:
+        try:
+            shares.append(float(read_mask(file).mean()))
+        except GvError:  # said where its view is read
+            continue
+    if not shares or 0 < min(shares) < 1 or 0 < max(shares) < 1 or min(shares) != max(shares):
+        return []
+    what = "take everything out" if max(shares) == 0 else "leave everything in"
+    line = (
+        f"masks {what} in all of {len(shares)} that were opened, first {files[0].name}; expected "
+        "black or transparent pixels where a picture is to be ignored, and others elsewhere"
+    )
+    return [Finding("warning", line)]
 
 
 def _rigid(frame: PosedFrame, sieve: _Sieve, *, unposed: str) -> Float64:

@@ -81,6 +81,17 @@ def test_mask_is_black_or_not(tmp_path):
     np.testing.assert_array_equal(read_mask(save(tmp_path / "w.png", wide)), mask > 0)
 
 
+@pytest.mark.parametrize("color", [0, 255, None])
+def test_a_mask_may_tell_it_by_its_alpha(tmp_path, color):
+    pixels = np.full((2, 2, 4), color or 0, np.uint8)
+    pixels[..., 3] = [[0, 255], [255, 255]]
+    expected = pixels[..., 3] > 0
+    if color is None:  # both tell something
+        pixels[0, :, :3] = 255
+        expected = np.array([[False, True], [False, False]])
+    np.testing.assert_array_equal(read_mask(save(tmp_path / "m.png", pixels)), expected)
+
+
 def test_depth_units_and_invalid_codes(tmp_path):
     stored = np.array([[0, 1500, 65535, 65534]], np.uint16)
     np.testing.assert_allclose(

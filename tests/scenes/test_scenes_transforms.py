@@ -137,6 +137,20 @@ def test_images_and_masks_may_be_given(tmp_path):
     assert not scene.views[0].load().mask.any()
 
 
+@pytest.mark.parametrize(
+    ("value", "said"), [(0, "take everything out"), (1, "leave everything in"), (None, "")]
+)
+def test_masks_that_tell_nothing_are_said(tmp_path, value, said):
+    mask = np.full((HEIGHT, WIDTH), value or 0, np.uint8)
+    mask[:3] = 1 if value is None else value
+    for name in ("a.png", "b.png"):
+        save(tmp_path / "images" / name, ramp())
+        save(tmp_path / "masks" / f"{name}.png", mask)
+    frames = [frame(f"images/{name}") for name in ("a.png", "b.png")]
+    scene = read_transforms(transforms(tmp_path, frames, **PINHOLE), masks=tmp_path / "masks")
+    assert ("masks " in messages(scene)) == bool(said) and said in messages(scene)
+
+
 def test_masks_are_given_and_missed_as_those_of_colmap(tmp_path):
     names = ("a.png", "b.png", "c.png", "d.png")
     black = np.zeros((HEIGHT, WIDTH), np.uint8)
