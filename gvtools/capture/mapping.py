@@ -101,9 +101,7 @@ def find_cameras(task: MappingTask) -> MappingResult:
     if flat and _angle(largest) < STEEP:
         raise _no_depth(source, len(pairs))
     others = tuple(tuple(sorted(_names(model))) for model in rest)
-    return MappingResult(
-        largest, how, others, matching, pairs=pairs, explained=share, flat=bool(flat)
-    )
+    return MappingResult(largest, how, others, matching, pairs, share, flat=bool(flat))
 
 
 def _names(model: pycolmap.Reconstruction) -> set[str]:

@@ -142,13 +142,7 @@ def fisheye_params(photographs: Sequence[CapturedPhotograph]) -> str:
 def write_faces(
     photographs: Sequence[CapturedPhotograph], images: Path, *, masks: Path | None, face_masks: Path
 ) -> list[FaceRig]:
-    """Cut panoramas into faces.
-
-    Args:
-        images: folder for the faces, see ``FaceRig.names``.
-        masks: folder of ``NAME.png`` of the panoramas; None for none.
-        face_masks: folder for ``NAME.png`` of the faces.
-    """
+    """Cut panoramas into faces, see ``FaceRig.names``, and their masks ``NAME.png`` likewise."""
     import pycolmap
 
     sizes: dict[tuple[int, int], list[CapturedPhotograph]] = {}

@@ -104,12 +104,9 @@ def _look_at(path: Path, name: str) -> CapturedPhotograph:
     lens = (exif.get(MAKE, ""), exif.get(MODEL, ""), more.get(FOCAL, ""), more.get(FOCAL_35MM, ""))
     camera = "/".join(str(part).strip("\0 ") for part in (*lens, *upright.size))
     height = min(JUDGED_HEIGHT, grey.height)
-    small = grey.resize(
-        (max(1, round(grey.width * height / grey.height)), height), Image.Resampling.BOX
-    )
-    return CapturedPhotograph(
-        path, name, upright.size, camera, turned, sharpness(np.asarray(small)), _location(gps)
-    )
+    width = max(1, round(grey.width * height / grey.height))
+    sharp = sharpness(np.asarray(grey.resize((width, height), Image.Resampling.BOX)))
+    return CapturedPhotograph(path, name, upright.size, camera, turned, sharp, _location(gps))
 
 
 def sharpness(grey: np.ndarray) -> float:

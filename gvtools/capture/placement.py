@@ -46,9 +46,8 @@ def place(
 ) -> tuple[WorldPlacement, list[Finding]]:
     """Move, rotate and scale a model in place.
 
-    Args:
-        locations: latitude and longitude [degrees] and height [m] of pictures by name.
-        distance: two pictures and the distance of the places where they were taken, metres.
+    Locations are latitude and longitude [degrees] and height [m] of pictures by name; the distance
+    is that of the places where two pictures were taken, metres.
     """
     import pycolmap
 

@@ -86,11 +86,8 @@ def capture_rgbd(
 ) -> RgbdCaptureReport:
     """Find the poses of an RGB-D recording, and write a project.
 
-    Args:
-        source: a folder of colour and depth, see ``gvtools.scenes.rgbd``, or a ``.bag``.
-        out: the project's folder; must not hold anything yet.
-        options: what the folder does not tell by itself.
-        draw: adds pictures to the project's folder before it takes its name.
+    The source is a folder of colour and depth or a ``.bag``, ``out`` absent or empty; options say
+    what the folder does not. ``draw`` adds pictures to the project before it gets its name.
     """
     with replaced_folder(out) as work:
         folder = source

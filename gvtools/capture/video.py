@@ -60,10 +60,7 @@ def pick_frames(
     """Write the chosen frames of a video to ``folder`` as ``frame_NNNNNN.jpg``.
 
     The path of the picture is cut into pieces of equal motion, and the sharpest frame of each is
-    taken.
-
-    Args:
-        count: how many frames to take; None takes one a STEP of motion, MOST at most.
+    taken; without a count there is one a STEP of motion, MOST at most.
     """
     if count is not None and count < 2:
         raise OptionError(f"--frames {count}; expected 2 or more")
