@@ -68,9 +68,14 @@ def judge(
         if "consistency" in options.parts:
             # Pictures without depth get the memory's.
             method = replace(method, targets=reference.with_surfaces(method.targets))
-        _tell(method, len(targets), console)
+        _print_matching(method, len(targets), console)
         on_sheets[name] = {t.key: t.picture.rgb for t in method.targets if t.key in shown}
-        return _measure(method, measurement)
+        return {
+            **method.to_dict(),
+            "rounds": max((target.number for target in method.targets), default=0),
+            "views": len(method.targets),
+            **measurement.of(method.targets),
+        }
 
     measured = records_of(zip(paths, names, strict=True), measure)
     figures = {
@@ -106,7 +111,7 @@ def judge(
     return figures
 
 
-def _tell(method: MethodPictures, targets: int, console: Console) -> None:
+def _print_matching(method: MethodPictures, targets: int, console: Console) -> None:
     """Say how the pictures were read and matched."""
     name, matching, pictures = method.name, method.matching, method.pictures
     console.line(
@@ -122,18 +127,6 @@ def _tell(method: MethodPictures, targets: int, console: Console) -> None:
         console.line(f"  {len(matching.left_over)} pictures of no judged view left out")
     for (width, height), count in sorted(method.resized.items()):
         console.warn(f"{name}: {count} pictures of {width}x{height} pixels resized to their views'")
-
-
-def _measure(method: MethodPictures, measurement: Measurement) -> dict[str, Any]:
-    about = method.to_dict()
-    if about["depth"] is None and any(t.surface is not None for t in method.targets):
-        about["depth"] = "none; features are carried by the memory's"
-    return {
-        **about,
-        "rounds": max((target.number for target in method.targets), default=0),
-        "views": len(method.targets),
-        **measurement.of(method.targets),
-    }
 
 
 def _judged_views(

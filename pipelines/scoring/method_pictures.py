@@ -165,6 +165,9 @@ class MethodPictures:
         sizes = {
             (int(t.picture.camera.width[0]), int(t.picture.camera.height[0])) for t in self.targets
         }
+        depth = "own" if any(t.picture.depth is not None for t in self.targets) else None
+        if depth is None and any(t.surface is not None for t in self.targets):
+            depth = "none; features are carried by the memory's"
         return {
             "name": self.name,
             "pictures": str(self.pictures.path),
@@ -178,7 +181,7 @@ class MethodPictures:
                 {"from": list(size), "pictures": count}
                 for size, count in sorted(self.resized.items())
             ],
-            "depth": "own" if any(t.picture.depth is not None for t in self.targets) else None,
+            "depth": depth,
             "reading": list(self.pictures.notes),
         }
 
