@@ -332,14 +332,14 @@ def load_appearance(path: Path) -> Appearance | None:
     return Appearance.load(file) if file.exists() else None
 
 
-def load_memory(path: Path, *, up_to: int | None = None) -> SpatialMemory:
-    """The memory in a file or of a run.
-
-    Args:
-        path: a memory file, a folder of tiles, a coloured PLY, or a run's folder; an unfinished run
-            gives that of its last complete round.
-        up_to: forget the rounds after this one; None keeps all.
-    """
+def load_memory(
+    # A memory file, a folder of tiles, a coloured PLY, or a run's folder; an unfinished run gives
+    # that of its last complete round.
+    path: Path,
+    *,
+    up_to: int | None = None,  # forget the rounds after this one; None keeps all
+) -> SpatialMemory:
+    """The memory in a file or of a run."""
     from gvtools.memory.spatial_memory import SpatialMemory, TiledMemory
 
     memory: SpatialMemory

@@ -133,7 +133,9 @@ def tune(
     make_folder(out)
     with folder_replaced_when_written(out) as folder:
         save_pretrained(learnt.best(tuning), folder)
-        _link_video(config, weights, folder)
+        if config.video is not None and (weights / VIDEO_FOLDER).is_dir():
+            # It is not tuned, so it is not copied.
+            (folder / VIDEO_FOLDER).symlink_to((weights / VIDEO_FOLDER).resolve())
         inputs = inputs_of(split, weights, options=options, seed=seed)
         record = {**tuning.to_dict(), "options": options.to_dict(), "inputs": inputs}
         write_json(folder / RECORD, record)
@@ -308,9 +310,3 @@ def stage_options(
         precision="float32" if device.type == "cpu" else "auto",
     )
     return own.replaced(optimizer=optimizer)
-
-
-def _link_video(config: GeoVerseConfig, weights: Path, folder: Path) -> None:
-    """The video prior is not tuned, so it is not copied."""
-    if config.video is not None and (weights / VIDEO_FOLDER).is_dir():
-        (folder / VIDEO_FOLDER).symlink_to((weights / VIDEO_FOLDER).resolve())
