@@ -87,10 +87,12 @@ class Arguments(Settings):
             if title not in holders:
                 holders[title] = parser.add_argument_group(*title.split(": ", 1))
             holders.get(name, holders[title]).add_argument(
-                _flag(name), dest=name, default=None,
+                _flag(name),
+                dest=name,
+                default=None,
                 **({"required": True} if cls.model_fields[name].is_required() else {}),
                 **_form(known[name], _default(cls, name)),
-            )  # fmt: skip
+            )
 
     @classmethod
     def _title(cls, name: str) -> str:

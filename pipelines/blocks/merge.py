@@ -489,9 +489,12 @@ def _plan(
 
 
 def _poses(
-    runs: Sequence[BlockRun], context: Sequence[str], names: Sequence[str], *,
+    runs: Sequence[BlockRun],
+    context: Sequence[str],
+    names: Sequence[str],
+    *,
     targets: Mapping[str, RunTarget],
-) -> RunPoses | None:  # fmt: skip
+) -> RunPoses | None:
     """The poses of context and targets of the merged run; None where they are the project's."""
     if not (runs[0].block.refined or any(item.moved for item in runs)):
         return None
@@ -548,7 +551,9 @@ def _fitted(plan: Plan, runs: Sequence[BlockRun], console: Console) -> Fitted | 
     ]
     appearance = join_appearances(parts, grid_frame(plan.scene, plan.context))
     fitted = Fitted(
-        appearance, plan.poses, spread=any(fitted.spread for fitted in found),
+        appearance,
+        plan.poses,
+        spread=any(fitted.spread for fitted in found),
         steps=min(fitted.steps for fitted in found),
-    )  # fmt: skip
+    )
     return fit_across(plan, fitted, [item.block for item in runs], console=console)

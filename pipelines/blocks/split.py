@@ -436,12 +436,18 @@ def split(
             owners = _inside(scene, names, cell.holds)
             held = (*owners, *(targets := _inside(scene, others, cell.holds)))
             block = SceneBlock(
-                name=name, names=tuple(cells), project=scene.address, reading=dict(reading or {}),
-                low=cell.low, high=cell.high, owners=owners, targets=targets,
+                name=name,
+                names=tuple(cells),
+                project=scene.address,
+                reading=dict(reading or {}),
+                low=cell.low,
+                high=cell.high,
+                owners=owners,
+                targets=targets,
                 helpers=helpers_of(cell, owners, seen, near=near, overlap=overlap),
                 poses={view: (posed or scene)[view].camera.cam_from_world[0] for view in held},
                 refined=posed is not None,
-            )  # fmt: skip
+            )
             found.append(block)
             say(
                 f"block {name}: {len(owners)} views of its own, {len(block.helpers)} helpers, "
@@ -459,9 +465,13 @@ def _inside(scene: Scene, names: Sequence[str], holds: Callable[[Any], Any]) -> 
 
 
 def _posed(
-    scene: Scene, names: tuple[str, ...], others: tuple[str, ...], *,
-    say: Callable[[str], None], max_side: int | None,
-) -> Scene | None:  # fmt: skip
+    scene: Scene,
+    names: tuple[str, ...],
+    others: tuple[str, ...],
+    *,
+    say: Callable[[str], None],
+    max_side: int | None,
+) -> Scene | None:
     """The project with refined poses; None if the given ones are kept."""
     # ``refined`` needs a target; without any, the first view stands in, and its result is not used.
     targets = scene.subset(others or names[:1]).cameras

@@ -98,8 +98,13 @@ def _checked(args: TrainCommand) -> RunSettings:
             raise OptionError(f"train tune does not look at {args.key(name)}; leave it out")
     if {"minutes", "steps"} <= args.model_fields_set:
         raise OptionError("--minutes and --steps: expected one of them; leave the other out")
-    given = {"tune.minutes": args.minutes, "tune.steps": args.steps, "context": args.context,
-             "depth": args.depth, "seed": args.seed}  # fmt: skip
+    given = {
+        "tune.minutes": args.minutes,
+        "tune.steps": args.steps,
+        "context": args.context,
+        "depth": args.depth,
+        "seed": args.seed,
+    }
     config = with_values(RunSettings(), given)
     if not config.tune.wanted:
         raise OptionError("no minutes and no steps: nothing to do; give --minutes or --steps")

@@ -77,9 +77,15 @@ class ViewCommand(Arguments):
         if self.live or not (self.open3d or self.screenshot):
             try:
                 serve(
-                    source, host=self.host, port=self.port, max_points=self.max_points,
-                    round=self.round, mode=mode, live=self.live, console=console,
-                )  # fmt: skip
+                    source,
+                    host=self.host,
+                    port=self.port,
+                    max_points=self.max_points,
+                    round=self.round,
+                    mode=mode,
+                    live=self.live,
+                    console=console,
+                )
             except KeyboardInterrupt:
                 console.line("viewer ended")
             return

@@ -48,9 +48,14 @@ def write_colmap(source: ExportSource, path: Path, options: ExportOptions) -> st
     # First, so that an export that was killed is known for one when it is made again.
     write_text(path / MODEL / GENERATED, "\n".join([HEADER, *lines]) + "\n")
     write_model(
-        path / MODEL, distinct.cameras, points=memory.positions[kept.rows],
-        colors=memory.columns.colors[kept.rows], point_index=point, view_index=view, xy=xy,
-    )  # fmt: skip
+        path / MODEL,
+        distinct.cameras,
+        points=memory.positions[kept.rows],
+        colors=memory.columns.colors[kept.rows],
+        point_index=point,
+        view_index=view,
+        xy=xy,
+    )
     return (
         f"{len(distinct.cameras)} views ({len(distinct.generated)} generated), {len(kept.rows)} "
         f"points of {len(memory)} observations (voxels of {kept.edge:.4g}), {len(point)} track "

@@ -88,9 +88,12 @@ def write_rrd(source: ExportSource, path: Path, options: ExportOptions) -> str:
 
 
 def _log(
-    recording: rerun.RecordingStream, shot: RecordedCamera, *, origin: NDArray[np.float64],
+    recording: rerun.RecordingStream,
+    shot: RecordedCamera,
+    *,
+    origin: NDArray[np.float64],
     distance: float,
-) -> None:  # fmt: skip
+) -> None:
     import rerun
     from PIL import Image
 

@@ -182,9 +182,13 @@ def _between(values: NDArray[np.floating], rows: NDArray[np.int64], weights: Flo
 
 
 def _add_photographs(
-    sums: Float32, mesh: o3d.t.geometry.TriangleMesh, points: Float32, *, normals: Float32,
+    sums: Float32,
+    mesh: o3d.t.geometry.TriangleMesh,
+    points: Float32,
+    *,
+    normals: Float32,
     shots: Iterable[Shot],
-) -> None:  # fmt: skip
+) -> None:
     """Add each photograph's colours of points (N, 3) to ``sums``.
 
     ``sums`` (N, 4) holds the weighted sum of colours and the sum of weights.

@@ -409,9 +409,14 @@ def tuned(plan: Plan, cache: DepthCache, directory: RunDirectory, *, console: Co
     if record is None:
         console.line(f"tuning {weights} to the context, {config.tune.length}")
         record = tune(
-            scene, weights, out, options=config.tune, completer=options, seed=config.seed,
+            scene,
+            weights,
+            out,
+            options=config.tune,
+            completer=options,
+            seed=config.seed,
             say=console.line,
-        ).to_dict()  # fmt: skip
+        ).to_dict()
     else:
         console.line(f"weights tuned before: {out}")
     directory.add_to_record(TUNING, {name: record[name] for name in record if name != "inputs"})

@@ -380,10 +380,16 @@ def complete_round(
             camera = camera_entry(targets[at].camera)
             views.append({**result.figures, "stem": stems[at], "camera": camera,
                           "coverage": before[at]})  # fmt: skip
-            writing.append(pool.submit(
-                write_target, folder, stems[at], guidance=result.guidance,
-                completion=result.completion, fused=result.fused,
-            ))  # fmt: skip
+            writing.append(
+                pool.submit(
+                    write_target,
+                    folder,
+                    stems[at],
+                    guidance=result.guidance,
+                    completion=result.completion,
+                    fused=result.fused,
+                )
+            )
         with clock.stage("project"):
             after = [target.guidance() for target in targets]
         for view, guidance in zip(views, after, strict=True):
@@ -489,9 +495,14 @@ def _completed_together(
 
 
 def _align_and_fuse(
-    guidance: Guidance, completion: Completion, number: int, *, memory: SpatialMemory,
-    config: RunSettings, clock: Clock,
-) -> TargetResult:  # fmt: skip
+    guidance: Guidance,
+    completion: Completion,
+    number: int,
+    *,
+    memory: SpatialMemory,
+    config: RunSettings,
+    clock: Clock,
+) -> TargetResult:
     valid, depth = guidance.valid[0], completion.depth[0]
     confidence = completion.confidence[0]
     with clock.stage("align"):

@@ -158,9 +158,12 @@ def _figures_of_targets(plan: Plan, directory: RunDirectory) -> list[dict[str, A
         if files is not None:
             target, truth = files
             figures |= view_figures(
-                target.picture, truth, observed=target.observed, generated=target.generated,
+                target.picture,
+                truth,
+                observed=target.observed,
+                generated=target.generated,
                 depth=target.depth,
-            )  # fmt: skip
+            )
         views.append(figures)
     return views
 

@@ -309,9 +309,14 @@ def _fused(probe: _Probe, config: RunSettings) -> SpatialMemory:
     for camera, frame, mask in probe.seen:
         assert frame.depth is not None
         memory.observe(
-            frame.rgb, frame.depth, camera, round=0, mask=mask,
-            options=config.back_projection, pixel_binning=config.savings.pixel_binning,
-        )  # fmt: skip
+            frame.rgb,
+            frame.depth,
+            camera,
+            round=0,
+            mask=mask,
+            options=config.back_projection,
+            pixel_binning=config.savings.pixel_binning,
+        )
     return memory
 
 
