@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image, ImageOps
 
 from gvtools.errors import ProjectError
@@ -36,11 +37,14 @@ RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
 # Pictures are judged at this height, and one whose sharpness is below this share of the median's is
 # called blurred. [pixels]
 JUDGED_HEIGHT, BLURRED = 480, 0.15
+# Pictures at this size show the same where they differ by less on average [pixels, grey levels] and
+# their aspects by less than this share.
+THUMBNAIL, SAME, SAME_ASPECT = (32, 32), 1.5, 0.02
 # Where the median itself is below this, all are called soft (photographs in focus: 100 and more).
 SOFT = 10.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class CapturedPhotograph:
     """One readable picture."""
 
@@ -50,14 +54,19 @@ class CapturedPhotograph:
     camera: str  # pictures of equal text were taken by one camera at one focal length
     turned: bool  # whether its pixels are stored on their side
     sharpness: float  # variance of the Laplacian at JUDGED_HEIGHT, grey levels squared
+    thumbnail: NDArray[np.uint8]  # (w h,) grey levels of the picture at THUMBNAIL
     # Latitude and longitude in degrees, height in metres; None without GPS.
     location: tuple[float, float, float] | None = None
 
 
 def find_photographs(folder: Path) -> tuple[list[CapturedPhotograph], list[Finding]]:
     """The readable, different pictures below a folder in natural order, and what was met."""
-    files = {path.relative_to(folder).as_posix(): path for path in sorted(folder.rglob("*"))
-             if not path.name.startswith(".")}  # fmt: skip
+    every = {path.relative_to(folder).as_posix(): path for path in sorted(folder.rglob("*"))}
+    files = {name: path for name, path in every.items() if not _is_hidden(name)}
+    hidden = [
+        name for name, path in every.items()
+        if name not in files and path.suffix.lower() in PICTURES and path.is_file()
+    ]  # fmt: skip
     foreign = [name for name, path in files.items() if path.suffix.lower() in (*HEIF, *RAW)]
     names = [n for n, path in files.items() if path.suffix.lower() in PICTURES and path.is_file()]
     found: list[CapturedPhotograph] = []
@@ -75,11 +84,22 @@ def find_photographs(folder: Path) -> tuple[list[CapturedPhotograph], list[Findi
         except UNREADABLE:
             damaged.append(name)
     total = len(names)
+    reduced = _reduced_copies(found)
+    found = [item for item in found if item.name not in reduced]
     warnings = [
         f"{len(some)} of {total} pictures {reason}: left out ({named(some)})"
-        for some, reason in ((damaged, "cannot be read"), (copies, "are copies of others"))
+        for some, reason in (
+            (damaged, "cannot be read"),
+            (copies, "are copies of others"),
+            (reduced, "are others again, in another size or format"),
+        )
         if some
     ]
+    if hidden:
+        warnings.append(
+            f"{len(hidden)} pictures lie in hidden folders or those of systems: left out "
+            f"({named(hidden)})"
+        )
     if foreign:
         warnings.append(
             f"{len(foreign)} pictures are HEIC, AVIF or raw: left out ({named(foreign)}); convert "
@@ -94,6 +114,32 @@ def find_photographs(folder: Path) -> tuple[list[CapturedPhotograph], list[Findi
     return found, [*(Finding("warning", text) for text in warnings), *_oddities(found)]
 
 
+def _is_hidden(name: str) -> bool:
+    """Whether a file or a folder above it is hidden, or one that systems make (``@eaDir``)."""
+    return any(part[0] in ".@#$" or part == "__MACOSX" for part in name.split("/"))
+
+
+def _reduced_copies(found: Sequence[CapturedPhotograph]) -> list[str]:
+    """Names of pictures that larger ones, or equally large ones of other formats, show alike."""
+    order = sorted(found, key=lambda item: -item.size[0] * item.size[1])
+    thumbnails = np.array([item.thumbnail for item in order], np.float32)
+    copies: list[str] = []
+    kept: list[int] = []
+    for number, item in enumerate(order):
+        other = [
+            row for row in kept
+            if abs(order[row].size[0] * item.size[1] / (order[row].size[1] * item.size[0]) - 1)
+            < SAME_ASPECT
+            and (order[row].size, order[row].path.suffix) != (item.size, item.path.suffix)
+        ]  # fmt: skip
+        apart = np.abs(thumbnails[other] - thumbnails[number]).mean(axis=1)
+        if apart.size and apart.min() < SAME:
+            copies.append(item.name)
+        else:
+            kept.append(number)
+    return sorted(copies, key=natural_key)
+
+
 def _look_at(path: Path, name: str) -> CapturedPhotograph:
     with open_picture(path) as image:
         exif = image.getexif()
@@ -106,7 +152,10 @@ def _look_at(path: Path, name: str) -> CapturedPhotograph:
     height = min(JUDGED_HEIGHT, grey.height)
     width = max(1, round(grey.width * height / grey.height))
     sharp = sharpness(np.asarray(grey.resize((width, height), Image.Resampling.BOX)))
-    return CapturedPhotograph(path, name, upright.size, camera, turned, sharp, _location(gps))
+    thumbnail = np.asarray(grey.resize(THUMBNAIL, Image.Resampling.BOX)).ravel()
+    return CapturedPhotograph(
+        path, name, upright.size, camera, turned, sharp, thumbnail, _location(gps)
+    )
 
 
 def sharpness(grey: np.ndarray) -> float:

@@ -51,6 +51,23 @@ def test_blurred_pictures_are_named(texture: Image.Image, tmp_path: Path) -> Non
     assert only.message.startswith("most of the 4 pictures have hardly any edges")
 
 
+def test_copies_and_pictures_of_systems_are_left_out_by_content(
+    texture: Image.Image, tmp_path: Path
+) -> None:
+    parts = [texture.crop((40 * index, 0, 40 * index + 480, 360)) for index in range(4)]
+    hidden = ["@eaDir/0.jpg/SYNOPHOTO_THUMB_XL.jpg", ".thumbs/1.jpg", "__MACOSX/._2.jpg"]
+    files = {f"{index}.jpg": part for index, part in enumerate(parts)}
+    files |= {"small/renamed.jpg": parts[1].resize((240, 180)), "2.png": parts[2]}
+    for name in (*files, *hidden):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        files.get(name, parts[0]).save(tmp_path / name)
+    found, findings = find_photographs(tmp_path)
+    assert sorted(item.path.stem for item in found) == ["0", "1", "2", "3"]
+    said = [finding.message for finding in findings if finding.level == "warning"]
+    assert "2 of 6 pictures are others again, in another size or format: left out" in said[0]
+    assert "small/renamed.jpg" in said[0] and "3 pictures lie in hidden folders" in said[1]
+
+
 def test_masks_fit_their_pictures(tmp_path: Path) -> None:
     photos, masks, out = tmp_path / "photos", tmp_path / "masks", tmp_path / "out"
     for folder in (photos, masks):

@@ -21,7 +21,8 @@ from gvtools.errors import OptionError
 
 def photograph(folder, name, pixels, **options):
     Image.fromarray(pixels).save(folder / name, **options)
-    return CapturedPhotograph(folder / name, name, pixels.shape[1::-1], "", False, 1.0)
+    thumbnail = np.zeros(1024, np.uint8)
+    return CapturedPhotograph(folder / name, name, pixels.shape[1::-1], "", False, 1.0, thumbnail)
 
 
 def panorama():
