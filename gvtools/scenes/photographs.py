@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from gvtools.cameras import ROTATION_ROUNDING, Cameras, invert_rigid, rigid_transform
 from gvtools.errors import GvError, ProjectError
 from gvtools.scenes.calibration import Float64, scaled_lens
+from gvtools.scenes.faces import perspective_views
 from gvtools.scenes.images import (
     ImageHeader,
     check_size,
@@ -30,6 +31,7 @@ from gvtools.scenes.images import (
     read_header,
     read_image,
     read_mask,
+    resize_nearest,
     same_aspect,
     stored_depth_size,
 )
@@ -51,6 +53,8 @@ UNREADABLE = "have a damaged picture"
 OTHER_ASPECT = "have a picture of another aspect than their camera"
 BAD_POSE = "have an impossible pose"
 BAD_CAMERA = "have an impossible camera"
+# A principal point is expected within so much of the middle, in sides of the picture.
+CENTER = 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +101,7 @@ class _Sieve:
     scaled: Counter[str] = field(default_factory=Counter)
     defects: list[float] = field(default_factory=list)
     sizes: dict[Path, int] = field(default_factory=dict)
+    resized: dict[LensParameters, tuple[Undistortion, ...]] = field(default_factory=dict)
 
     def present(self, path: Path | None) -> Path | None:
         """The file, if it is there with content; an interrupted download may leave it empty."""
@@ -177,6 +182,7 @@ def posed_scene(
     report += lens_findings([item.lens for item in photographs])
     report += mask_findings([item.frame.mask for item in photographs if item.frame.mask])
     if strict:
+        report += center_findings([item.lens for item in photographs])
         files = [item for item in photographs if item.frame.read is None]
         report += header_findings([(item.frame.image, item.lens.source_size) for item in files])
         report += depth_findings(photographs)
@@ -227,7 +233,7 @@ def _views(
     if frame.lens is None:
         raise _LeftOut(NO_LENS)
     if not isinstance(frame.lens, LensParameters):
-        return frame.lens
+        return _resized(frame, frame.lens, sieve)
     size = frame.lens.size
     if frame.read is None and not sieve.strict:
         try:
@@ -251,6 +257,26 @@ def _views(
         if sieve.strict:
             raise
         raise _LeftOut(BAD_CAMERA, str(error)) from None
+
+
+def _resized(
+    frame: PosedFrame, views: tuple[Undistortion, ...], sieve: _Sieve
+) -> tuple[Undistortion, ...]:
+    """The ways to the views of a picture that has another size than its camera and its aspect."""
+    try:
+        header = None if frame.read else read_header(frame.image)
+    except ProjectError:
+        return views  # said where headers are
+    (w, h), source = views[0].source_size, views[0].source
+    if header is None or (size := (header.width, header.height)) == (w, h):
+        return views
+    if not same_aspect(size, (w, h)):
+        return views
+    sieve.scaled[f"pictures of {size[0]}x{size[1]} for cameras of {w}x{h}: intrinsics scaled"] += 1
+    lens = scaled_lens(LensParameters(source.model_name, tuple(source.params), (w, h)), size)
+    if lens not in sieve.resized:
+        sieve.resized[lens] = perspective_views(*lens, what=str(frame.image))
+    return sieve.resized[lens]
 
 
 def first_size(pictures: Iterable[Path]) -> tuple[int, int] | None:
@@ -302,6 +328,8 @@ class Photograph:
         masks = [] if picture.mask is None else [lens.nearest(picture.mask)]
         if frame.mask is not None:
             mask = read_mask(frame.mask)
+            if same_aspect((mask.shape[1], mask.shape[0]), lens.source_size):
+                mask = resize_nearest(mask, *lens.source_size)
             check_size(mask.shape[::-1], lens.source_size, path=frame.mask)
             masks.append(lens.nearest(mask))
         if lens.inside is not None:
@@ -411,6 +439,20 @@ def lens_findings(lenses: Sequence[Undistortion]) -> list[Finding]:
         listed = named([f"{width}x{height}" for width, height in sizes])
         findings.append(Finding("info", f"views have {len(sizes)} different sizes: {listed}"))
     return findings
+
+
+def center_findings(lenses: Sequence[Undistortion]) -> list[Finding]:
+    """A line when a principal point is far from the middle, as that of another size is."""
+    found = Counter[str]()
+    for lens in lenses:
+        (x, y), (w, h) = lens.K[:2, 2], lens.size
+        if max(abs(x / w - 0.5), abs(y / h - 0.5)) >= CENTER:
+            found[f"({x:.1f}, {y:.1f}) is far from the middle of {w}x{h} pixels"] += 1
+    return [
+        Finding("warning", f"{count} views: the principal point {line}: are the intrinsics of "
+                "another size?")
+        for line, count in found.items()
+    ]  # fmt: skip
 
 
 def rotation_findings(defects: Sequence[float]) -> list[Finding]:

@@ -21,7 +21,7 @@ from gvtools.scenes.phones import POLYCAM, RECORD3D, SCANNER_APP, STRAY_SCANNER
 from gvtools.scenes.rgbd import LAYOUTS, RgbdOptions, count_unposed
 from gvtools.scenes.scene import Finding, Scene
 from gvtools.scenes.transforms import FILE as TRANSFORMS
-from gvtools.scenes.transforms import read_transforms
+from gvtools.scenes.transforms import SPLITS, is_transforms, read_transforms
 
 PICTURES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg")
@@ -31,7 +31,7 @@ BAG = ".bag"
 PHONES = (RECORD3D, POLYCAM, SCANNER_APP, STRAY_SCANNER)
 LOOKED_FOR = (
     "a COLMAP model (cameras.bin or .txt in sparse/N, sparse, sparse_txt or the folder itself)",
-    "transforms.json",
+    f"{TRANSFORMS}, or {SPLITS['train']} and others beside it",
     *(layout.holds for layout in (*LAYOUTS, *PHONES)),
 )
 
@@ -87,7 +87,7 @@ def open_project(
     folder = find_model(path, number=model) if path.is_dir() else None
     if model is not None and folder is None:
         raise OptionError(f"{path}: a file; a model's number is of a COLMAP workspace")
-    told = folder is not None or (path / TRANSFORMS).is_file()
+    told = folder is not None or is_transforms(path)
     phone = None if told else next((layout for layout in PHONES if layout.matches(path)), None)
     if phone is not None:
         if any(option is not None for option in (images, masks, rgbd)):
@@ -104,7 +104,7 @@ def open_project(
         from gvtools.scenes.colmap import read_colmap
 
         scene = read_colmap(path, images=images, masks=masks, model=model)
-        if not (path / TRANSFORMS).is_file():
+        if not is_transforms(path):
             return scene
         note = f"the COLMAP model is read, {TRANSFORMS} is not: give that file to read it instead"
         return replace(scene, findings=(*scene.findings, Finding("info", note)))
@@ -130,7 +130,7 @@ def is_recording(folder: Path) -> bool:
 
 def is_project(folder: Path) -> bool:
     """Whether ``open_project`` would take the folder for a project, going by its files' names."""
-    return find_model(folder) is not None or (folder / TRANSFORMS).is_file() or is_recording(folder)
+    return find_model(folder) is not None or is_transforms(folder) or is_recording(folder)
 
 
 def _nearest(path: Path) -> str:

@@ -447,11 +447,7 @@ def rgbd_scene(recording: Recording, *, kind: str = "rgbd", strict: bool = True)
         unposed=recording.unposed,
         advice="give its pictures and poses",
     )
-    findings, shares = [*scene.findings], K[:2, 2] / lens.size
-    if np.abs(shares - 0.5).max() >= 0.25:
-        line = f"the principal point ({K[0, 2]:.1f}, {K[1, 2]:.1f}) is far from the middle of "
-        line += f"{lens.size[0]}x{lens.size[1]} pixels: are the intrinsics of another size?"
-        findings.append(Finding("warning", line))
+    findings = [*scene.findings]
     if not any(view.has_depth for view in scene):
         findings.append(Finding("warning", f"none of {len(scene)} frames has a depth map"))
     else:

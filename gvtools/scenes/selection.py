@@ -3,6 +3,7 @@
 A selection is one of ``all``, ``every:K``, ``every:K+OFFSET``, ``first:N``, ``last:N``,
 ``range:A-B`` (indices from 0, both ends included), ``not:SPEC``, image names with commas between
 them, or ``@file`` with one name a line. Where names have commas, the longest that fits is taken.
+``train`` names all views in the folder ``train/``, such as a split of Blender's synthetic scenes.
 
 Several views of one picture (``room@front.jpg``, ``room@left.jpg``, see ``faces``) count as one, so
 that a split never stands between them; ``room.jpg`` names all of them.
@@ -19,7 +20,10 @@ from gvtools.errors import OptionError
 from gvtools.scenes.faces import picture_of
 from gvtools.untrusted import read_text
 
-GRAMMAR = "all, every:K, every:K+OFFSET, first:N, last:N, range:A-B, not:SPEC, names, or @file"
+GRAMMAR = (
+    "all, every:K, every:K+OFFSET, first:N, last:N, range:A-B, not:SPEC, names, folders of names, "
+    "or @file"
+)
 _KEYWORDS = ("every", "first", "last", "range", "not")
 _EXAMPLES = ("all", "every:2", "first:6", "last:6", "range:0-5", "not:first:6")
 _FORMS = {
@@ -48,7 +52,7 @@ def _chosen(
     everything = set(range(len(names)))
     if spec == "all":
         return everything
-    index = {**pictures, **{name: [i] for i, name in enumerate(names)}}
+    index = {**_folders(names), **pictures, **{name: [i] for i, name in enumerate(names)}}
     if spec.startswith("@"):
         return _by_name(index, _lines(Path(spec[1:])), f"{spec[1:]}")
     # Views' own names win over a form that looks like them.
@@ -71,6 +75,15 @@ def _chosen(
     rows = list(pictures.values())
     counted = _counted(keyword, numbers, len(rows), whole=whole)
     return {i for number in counted for i in rows[number]}
+
+
+def _folders(names: Sequence[str]) -> dict[str, list[int]]:
+    """Numbers of the views in each folder that names begin with."""
+    folders: dict[str, list[int]] = {}
+    for i, name in enumerate(names):
+        for end in (at for at, sign in enumerate(name) if sign == "/" and at):
+            folders.setdefault(name[:end], []).append(i)
+    return folders
 
 
 def _counted(keyword: str, numbers: list[int], count: int, *, whole: str) -> set[int]:

@@ -1,4 +1,4 @@
-"""``transforms.json`` of nerfstudio and instant-ngp, read and written.
+"""``transforms.json`` of nerfstudio and instant-ngp, read and written; Blender's splits are read.
 
 The file's cameras have OpenGL axes (y up, z backward) and poses camera-to-world; its principal
 point counts the first pixel's centre as (0.5, 0.5), as this project does.
@@ -13,24 +13,33 @@ import reprlib
 from collections.abc import Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import BaseModel, Field, PrivateAttr, ValidationError
 
 from gvtools.cameras import Cameras, invert_rigid, rigid_transform
 from gvtools.errors import ProjectError
 from gvtools.files import write_text
-from gvtools.scenes.calibration import OPENCV_FROM_OPENGL, Float64, finite_array, opencv_pose
+from gvtools.scenes.calibration import (
+    MILLIMETRES,
+    OPENCV_FROM_OPENGL,
+    Float64,
+    finite_array,
+    opencv_pose,
+    scaled_lens,
+)
 from gvtools.scenes.faces import PANORAMA, perspective_views
 from gvtools.scenes.images import read_depth, read_header
-from gvtools.scenes.matching import given_folder
+from gvtools.scenes.matching import given_folder, named
 from gvtools.scenes.photographs import PosedFrame, posed_scene
-from gvtools.scenes.scene import Scene, natural_key
+from gvtools.scenes.scene import Finding, Scene, natural_key
 from gvtools.scenes.undistort import LensParameters, Undistortion
 from gvtools.untrusted import is_file, named_file, read_json, reading
 
 FILE = "transforms.json"
+# The files of Blender's synthetic scenes, one a split; a picture of several belongs to the first.
+SPLITS = {name: f"transforms_{name}.json" for name in ("train", "test", "val")}
 EXPORTER = "gvtools"  # the value of ``exported_by`` in files written here
 GUESSED_SUFFIXES = (".png", ".jpg", ".jpeg")  # Blender's files name pictures without a suffix
 
@@ -39,75 +48,138 @@ PERSPECTIVE = ("", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPEN
 FISHEYE = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 
 # Keys that each frame has for itself.
-OF_A_FRAME = ("transform_matrix", "mask_path", "depth_file_path")
+OF_A_FRAME = ("transform_matrix", "mask_path", "depth_file_path", "depth_path")
+# What tells the focal length along an axis: pixels, or a field of view in radians or degrees.
+FOCAL = {axis: (f"fl_{axis}", f"camera_angle_{axis}", f"{axis}_fov") for axis in "xy"}
+# What tells one axis may differ so much from what else tells it.
+SAME_FOCAL = 0.02
+# Twice a principal point may differ so much from the picture that it is of.
+OFF_CENTER = 0.15
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Positive = Annotated[Number, Field(gt=0)]
 Pixels = Annotated[Number, Field(ge=1, le=200_000, multiple_of=1)]
 Angle = Annotated[Number, Field(gt=0, lt=math.pi)]
+Degrees = Annotated[Number, Field(gt=0, lt=180)]
+
+
+class _Listed(NamedTuple):
+    """A frame of a file: the file's keys and its own, and the picture that it names."""
+
+    shared: Mapping[str, Any]
+    entry: Mapping[str, Any]
+    file: Path  # on disk or not
+    name: str  # the view's
+    what: str  # where it stands, for messages
 
 
 def read_transforms(path: Path, *, images: Path | None = None, masks: Path | None = None) -> Scene:
     """The project of a ``transforms.json``.
 
-    Intrinsics may be shared or stand in each frame, as ``fl_x`` or as ``camera_angle_x``.
+    Intrinsics may be shared or stand in each frame, as ``fl_x`` or as fields of view.
     Distorted cameras become pinhole cameras, panoramas and wide fisheyes several (``faces``);
-    depth (``depth_file_path``, times ``depth_unit_scale_factor``, 1e-3 when absent) and masks
-    (``mask_path``, black = ignore) go through the same mapping. Views are named by
-    their path below the deepest folder they share.
+    depth (``depth_file_path``, times ``depth_unit_scale_factor``, 1e-3 when absent; ``depth_path``,
+    times ``integer_depth_scale``) and masks (``mask_path``, black = ignore) go through the same
+    mapping. Views are named by their path below the deepest folder they share; those of splits
+    begin with ``train/``, ``test/`` or ``val/``.
 
     Args:
-        path: the file, or the folder with a ``transforms.json``.
+        path: the file, or the folder with a ``transforms.json`` or ``transforms_train.json``.
         images: a folder to take the pictures from instead, by their path below the shared folder.
         masks: a folder with ``NAME.png`` for the view NAME, where frames name no mask.
 
     Returns:
         The scene, in the file's world frame and scale.
     """
-    path = Path(path)
-    path = path / FILE if path.is_dir() else path
-    data = load_frames(path)
-    files = _pictures(path, data["frames"])
-    names = _names(files)
+    listed, findings = _listed(Path(path))
+    root = Path(path) if Path(path).is_dir() else Path(path).parent
     masks = None if masks is None else given_folder(masks, "masks")
-    home = path.parent
-    if images is not None:
-        home = given_folder(images, "images")
-        files = [home / name for name in names]
+    home = root if images is None else given_folder(images, "images")
     cameras: dict[LensParameters, tuple[Undistortion, ...]] = {}
-    frames = []
-    for i, (entry, name, file) in enumerate(zip(data["frames"], names, files, strict=True)):
-        named_file(home, file, where=f"{path}, frame {i}")
+    frames, said = [], dict[str, list[str]]()
+    for shared, entry, own, name, where in listed:
+        file = own if images is None else home / name
+        named_file(home, file, where=where)
         if not is_file(file):
             frames.append(PosedFrame(name, file, None, None))
             continue
-        what = f"{path}, frame {i} ({name})"
-        keys = frame_keys(entry, data, what=what)
+        what = f"{where} ({name})"
+        keys = frame_keys(entry, shared, what=what)
         mask = None if masks is None else masks / f"{name}.png"
         if keys.mask_path:
-            mask = named_file(path.parent, keys.mask_path, where=what)
-        depth = keys.depth_file_path
+            mask = named_file(root, keys.mask_path, where=what)
+        depth, unit = keys.depth()
         frames.append(
             PosedFrame(
                 name,
                 file,
                 _views(keys, file, cameras, what=what),
                 _pose(keys, what),
-                named_file(path.parent, depth, where=what) if depth else None,
-                partial(read_depth, unit=keys.depth_unit_scale_factor),
+                named_file(root, depth, where=what) if depth else None,
+                partial(read_depth, unit=unit),
                 mask,
                 where=what,
             )
         )
+        for line in keys.doubts(file):
+            said.setdefault(line, []).append(name)
+    findings += [
+        Finding("warning", f"{len(names)} frames ({named(names)}): {line}")
+        for line, names in said.items()
+    ]
     return posed_scene(
-        path.parent,
+        root,
         frames,
         poses="world_from_cam",
         metric=False,
         kind="transforms",
         strict=True,
+        findings=findings,
         advice="give their folder with --images",
     )
+
+
+def is_transforms(folder: Path) -> bool:
+    """Whether a folder holds a ``transforms.json``, or those of splits."""
+    return any((folder / name).is_file() for name in (FILE, *SPLITS.values()))
+
+
+def _listed(path: Path) -> tuple[list[_Listed], list[Finding]]:
+    """The frames of a file or folder, each picture once, and what is to be said of them."""
+    if path.is_file() or (path / FILE).is_file() or not is_transforms(path):
+        path = path / FILE if path.is_dir() else path
+        data = load_frames(path)
+        files = _pictures(path, data["frames"])
+        places = zip(data["frames"], files, _names(files), strict=True)
+        listed = [
+            _Listed(data, entry, file, name, f"{path}, frame {i}")
+            for i, (entry, file, name) in enumerate(places)
+        ]
+        unused = data.get("ply_file_path")
+        line = f"ply_file_path ({reprlib.repr(unused)}) is not read: depth comes from pictures"
+        return listed, [Finding("info", line)] if unused else []
+    splits, found = dict[Path, str](), list[_Listed]()
+    sizes = dict.fromkeys(SPLITS, 0)
+    for split, name in SPLITS.items():
+        if not (path / name).is_file():
+            continue
+        data = load_frames(path / name)
+        for i, (entry, file) in enumerate(
+            zip(data["frames"], _pictures(path / name, data["frames"]), strict=True)
+        ):
+            if splits.setdefault(file, split) == split:
+                found.append(_Listed(data, entry, file, split, f"{path / name}, frame {i}"))
+                sizes[split] += 1
+    names = _names([item.file for item in found])
+    listed = [
+        item._replace(name=name if name.startswith(f"{item.name}/") else f"{item.name}/{name}")
+        for item, name in zip(found, names, strict=True)
+    ]
+    held = [split for split, count in sizes.items() if count]
+    line = f"splits: {', '.join(f'{split} ({sizes[split]} frames)' for split in held)}"
+    if len(held) > 1:
+        line += f"; select them by name: --context {held[0]} --targets {held[1]}"
+    return listed, [Finding("info", line)]
 
 
 def transforms_frames(
@@ -139,13 +211,11 @@ def read_transforms_cameras(path: Path) -> Cameras:
 
     Views and their order are those of ``read_transforms``.
     """
-    data = load_frames(path)
-    files = _pictures(path, data["frames"])
     cameras: dict[LensParameters, tuple[Undistortion, ...]] = {}
     found = []
-    for i, (entry, name, file) in enumerate(zip(data["frames"], _names(files), files, strict=True)):
-        what = f"{path}, frame {i} ({name})"
-        keys = frame_keys(entry, data, what=what)
+    for shared, entry, file, name, where in _listed(Path(path))[0]:
+        what = f"{where} ({name})"
+        keys = frame_keys(entry, shared, what=what)
         pose = invert_rigid(rigid_transform(_pose(keys, what), what=what)[0])
         for lens in _views(keys, file, cameras, what=what):
             found.append((lens.name(name), lens.K, lens.pose(pose), *lens.size))
@@ -276,7 +346,9 @@ class FrameKeys(BaseModel):
     transform_matrix: Any = None
     mask_path: str | None = None
     depth_file_path: str | None = None
-    depth_unit_scale_factor: Positive = 1e-3
+    depth_unit_scale_factor: Positive = MILLIMETRES
+    depth_path: str | None = None
+    integer_depth_scale: Positive | None = None
     camera_model: str = ""
     is_fisheye: Annotated[int, Field(ge=0, le=1)] | None = None
     w: Pixels = None  # type: ignore[assignment]
@@ -284,6 +356,9 @@ class FrameKeys(BaseModel):
     fl_x: Positive = None  # type: ignore[assignment]
     fl_y: Positive = None  # type: ignore[assignment]
     camera_angle_x: Angle = None  # type: ignore[assignment]
+    camera_angle_y: Angle = None  # type: ignore[assignment]
+    x_fov: Degrees = None  # type: ignore[assignment]
+    y_fov: Degrees = None  # type: ignore[assignment]
     cx: Number = None  # type: ignore[assignment]
     cy: Number = None  # type: ignore[assignment]
     k1: Number = 0.0
@@ -292,21 +367,22 @@ class FrameKeys(BaseModel):
     k4: Number = 0.0
     p1: Number = 0.0
     p2: Number = 0.0
+    # The file's, where the frame tells a focal length of its own.
+    _of_file: FrameKeys | None = PrivateAttr(None)
 
     def lens(self, picture: Path, *, what: str) -> LensParameters:
         """The recorded camera; the ``picture`` tells the size where no key does."""
-        if self.w is None or self.h is None:
-            header = read_header(picture)
-            size = header.width, header.height
-        else:
-            size = int(self.w), int(self.h)
+        size = self._size(picture)
+        if (times := self._times(size)) != 1:
+            whole = {"w": round(size[0] * times), "h": round(size[1] * times)}
+            return scaled_lens(self.model_copy(update=whole).lens(picture, what=what), size)
         center = (
             size[0] / 2 if self.cx is None else self.cx,
             size[1] / 2 if self.cy is None else self.cy,
         )
         if self.camera_model == PANORAMA:
             return LensParameters(PANORAMA, (float(size[0]), float(size[1])), size)
-        shared: tuple[float, ...] = (*self._focal(size[0], what), *center)
+        shared: tuple[float, ...] = (*self._focal(size, what), *center)
         named = self.camera_model
         if named in FISHEYE or (not named and self.is_fisheye):
             return LensParameters(
@@ -329,21 +405,105 @@ class FrameKeys(BaseModel):
             return LensParameters("FULL_OPENCV", (*shared, self.k3, 0.0, 0.0, 0.0), size)
         return LensParameters("OPENCV", shared, size)
 
-    def _focal(self, width: int, what: str) -> tuple[float, float]:
-        x = self.fl_y if self.fl_x is None else self.fl_x
-        if x is not None:
-            return x, x if self.fl_y is None else self.fl_y
-        if self.camera_angle_x is None:
-            raise ProjectError(f"{what}: neither fl_x nor camera_angle_x; expected one of them")
-        x = 0.5 * width / math.tan(0.5 * self.camera_angle_x)
-        return x, x
+    def depth(self) -> tuple[str | None, float]:
+        """The depth map and scene units per stored unit; apps for phones name them otherwise."""
+        if self.depth_file_path or not self.depth_path:
+            return self.depth_file_path, self.depth_unit_scale_factor
+        return self.depth_path, self.integer_depth_scale or self.depth_unit_scale_factor
+
+    def doubts(self, picture: Path) -> list[str]:
+        """What the keys leave open or contradict."""
+        lines = []
+        if self.depth_path and not self.depth_file_path and self.integer_depth_scale is None:
+            unit = self.depth_unit_scale_factor
+            lines.append(f"depth_path without integer_depth_scale: {unit:g} a step is assumed")
+        size = self._size(picture)
+        if (times := self._times(size)) != 1:
+            lines.append(
+                f"no w and h, and the principal point ({self.cx:g}, {self.cy:g}) is the middle of "
+                f"pictures {times:g} times as large as these ({size[0]}x{size[1]}): intrinsics "
+                "scaled; if they are of these pictures, write w and h"
+            )
+        for level in (self, self._of_file) if not self.is_fisheye else ():
+            for axis, length in zip("xy", size, strict=True):
+                told = {} if level is None else level._told(axis, length)
+                (first, one), *others = told.items() or [("", 0.0)]
+                lines += [
+                    f"{key} says a focal length of {value:.5g} pixels, {first} {one:.5g}: "
+                    f"{first} is taken; take the wrong one away"
+                    for key, value in others
+                    if abs(value - one) > SAME_FOCAL * one
+                ]
+        return lines
+
+    def _size(self, picture: Path) -> tuple[int, int]:
+        if self.w is not None and self.h is not None:
+            return int(self.w), int(self.h)
+        header = read_header(picture)
+        return header.width, header.height
+
+    def _times(self, size: tuple[int, int]) -> float:
+        """How many times as large the pictures are that the principal point is the middle of."""
+        sized = self.w is not None and self.h is not None
+        if sized or self.cx is None or self.cy is None or min(self.cx, self.cy) <= 0:
+            return 1
+        x, y = 2 * self.cx / size[0], 2 * self.cy / size[1]
+        mean = (x + y) / 2
+        times = float(round(mean)) if mean > 1 else 1 / round(1 / mean)
+        return times if max(abs(x / times - 1), abs(y / times - 1)) < OFF_CENTER else 1
+
+    def _told(self, axis: str, length: int) -> dict[str, float]:
+        """Focal length along an axis by each key that tells it, the one that counts first."""
+        pixels, radians, degrees = (getattr(self, key) for key in FOCAL[axis])
+        angles = radians, None if degrees is None else math.radians(degrees)
+        found = [pixels, *(a and 0.5 * length / math.tan(0.5 * a) for a in angles)]
+        return {key: value for key, value in zip(FOCAL[axis], found, strict=True) if value}
+
+    def _axes(self, size: tuple[int, int]) -> list[float | None]:
+        told = self._told("x", size[0]), self._told("y", size[1])
+        return [next(iter(values.values()), None) for values in told]
+
+    def _focal(self, size: tuple[int, int], what: str) -> tuple[float, float]:
+        x, y = self._axes(size)
+        of_file = [None, None] if self._of_file is None else self._of_file._axes(size)
+        if of_file[0] and of_file[1]:
+            # Both files and pictures keep the shape of their pixels.
+            shape = of_file[1] / of_file[0]
+            x, y = x or (y and y / shape), y or (x and x * shape)
+        x, y = x or of_file[0], y or of_file[1]
+        x, y = x or y, y or x
+        if not x or not y:
+            raise ProjectError(
+                f"{what}: no focal length; expected fl_x, camera_angle_x or x_fov, or those of y"
+            )
+        return x, y
 
 
 def frame_keys(frame: Mapping[str, Any], shared: Mapping[str, Any], *, what: str) -> FrameKeys:
     """A frame's keys, checked; those of the camera may stand in the file's ``shared`` ones."""
+    told = {key for keys in FOCAL.values() for key in keys}
+    if {"fl_x", "fl_y"} & {*frame, *shared}:
+        angles = told - {"fl_x", "fl_y"}
+        frame, shared = (
+            {key: value for key, value in level.items() if key not in angles or _angle(value)}
+            for level in (frame, shared)
+        )
     values = {key: shared[key] for key in shared if key not in OF_A_FRAME} | dict(frame)
-    if "fl_x" in values or "fl_y" in values:
-        values.pop("camera_angle_x", None)  # not looked at
+    of_file = None
+    if told & {*frame} and told & {*shared}:
+        of_file = _checked({key: shared[key] for key in told & {*shared}}, what)
+        values = {key: value for key, value in values.items() if key not in told - {*frame}}
+    keys = _checked(values, what)
+    keys._of_file = of_file
+    return keys
+
+
+def _angle(value: object) -> bool:
+    found = finite_array(value, 1)
+    return found is not None and 0 < found[0] < 180
+
+
+def _checked(values: dict[str, Any], what: str) -> FrameKeys:
     try:
         return FrameKeys.model_validate(values)
     except ValidationError as error:

@@ -229,3 +229,16 @@ def test_picture_of_another_size_is_an_error_finding_and_raises_when_loaded(tmp_
     assert [f.level for f in scene.findings if "50x40" in f.message] == ["error"]
     with pytest.raises(ProjectError, match="50x40 pixels; its camera expects 96x72"):
         scene.views[1].load()
+
+
+@pytest.mark.parametrize("model", ["PINHOLE", "SIMPLE_RADIAL", "OPENCV_FISHEYE"])
+def test_smaller_pictures_of_the_same_aspect_scale_their_cameras_and_detections(tmp_path, model):
+    workspace(tmp_path, model)
+    whole = read_colmap(tmp_path)
+    for path in (tmp_path / "images").iterdir():
+        save(path, ramp(WIDTH // 2, HEIGHT // 2))
+    scene = read_colmap(tmp_path)
+    np.testing.assert_allclose(scene.cameras.K[:, 0, 0], whole.cameras.K[:, 0, 0] / 2, rtol=0.05)
+    assert reprojection_errors(scene).max() < 1e-3
+    line = f"{len(scene)} pictures of 48x36 for cameras of 96x72: intrinsics scaled"
+    assert line in [finding.message for finding in scene.findings]

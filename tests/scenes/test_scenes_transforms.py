@@ -25,7 +25,9 @@ from scenes_workspace import (
 from gvtools.cameras import Cameras
 from gvtools.errors import GvError, ProjectError
 from gvtools.scenes.colmap import read_colmap
-from gvtools.scenes.transforms import read_transforms, write_transforms
+from gvtools.scenes.project import open_project
+from gvtools.scenes.selection import select
+from gvtools.scenes.transforms import read_transforms, read_transforms_cameras, write_transforms
 from pipelines.cli import main
 
 
@@ -286,9 +288,119 @@ def test_malformed_files(tmp_path, text):
         read_transforms(tmp_path)
 
 
+ANGLES = {"camera_angle_x": 2 * math.atan(48 / 90), "camera_angle_y": 2 * math.atan(36 / 120)}
+FOVS = {"x_fov": math.degrees(ANGLES["camera_angle_x"]), "y_fov": 33.4}
+FROM_FOV = 36 / math.tan(math.radians(16.7))
+
+
+@pytest.mark.parametrize(
+    ("shared", "own", "expected"),
+    [
+        (ANGLES, {}, (90, 120)),
+        ({}, ANGLES, (90, 120)),
+        ({"camera_angle_y": ANGLES["camera_angle_y"]}, {}, (120, 120)),
+        (FOVS, {}, (90, FROM_FOV)),
+        ({"y_fov": 33.4}, {}, (FROM_FOV, FROM_FOV)),
+        ({"fl_x": 100, **ANGLES}, {}, (100, 120)),  # each axis by what tells it
+        ({"fl_x": 100}, {"fl_y": 120}, (100, 120)),
+        # A frame's own wins, in whatever form; the pixels keep the shape that the file's have.
+        ({"fl_x": 100, "fl_y": 100}, {"camera_angle_x": ANGLES["camera_angle_x"]}, (90, 90)),
+        ({"fl_x": 100, "fl_y": 200}, {"camera_angle_x": ANGLES["camera_angle_x"]}, (90, 180)),
+        ({"fl_x": 100, "fl_y": 200, "camera_angle_x": 1.0}, {"fl_y": 120}, (60, 120)),
+    ],
+)
+@pytest.mark.parametrize("size", [{}, {"w": WIDTH, "h": HEIGHT}])
+def test_focal_lengths_in_every_form(tmp_path, shared, own, expected, size):
+    save(tmp_path / "images/a.png", ramp())
+    path = transforms(tmp_path, [frame(**own)], **shared, **size)
+    K = read_transforms(path).cameras.K[0]
+    np.testing.assert_allclose((K[0, 0], K[1, 1]), expected)
+    assert K[:2, 2].tolist() == [48, 36]
+
+
+@pytest.mark.parametrize(
+    ("shape", "expected", "line"),
+    [
+        ((48, 36), (45, 45.5, 24, 18), "the middle of pictures 2 times as large"),
+        ((192, 144), (180, 182, 96, 72), "the middle of pictures 0.5 times as large"),
+        ((96, 72), (90, 91, 48, 36), ""),
+        ((60, 45), (90, 91, 48, 36), "far from the middle"),
+    ],
+)
+def test_intrinsics_without_a_size_are_of_the_size_of_their_middle(tmp_path, shape, expected, line):
+    save(tmp_path / "images/a.png", ramp(*shape))
+    keys = {key: PINHOLE[key] for key in ("fl_x", "fl_y", "cx", "cy")}
+    scene = read_transforms(transforms(tmp_path, [frame()], **keys))
+    assert scene.cameras.K[0][[0, 1, 0, 1], [0, 1, 2, 2]].tolist() == list(expected)
+    warned = [item.message for item in scene.findings if item.level == "warning"]
+    assert (line in warned[0]) if line else not warned
+
+
+@pytest.mark.parametrize(
+    ("shared", "line"),
+    [
+        ({"camera_angle_x": 1.2}, "camera_angle_x says a focal length of 70.161 pixels, fl_x 90"),
+        ({"y_fov": 50}, "y_fov says a focal length of 77.202 pixels, fl_y 91"),
+        ({"camera_angle_x": ANGLES["camera_angle_x"]}, ""),
+        ({"camera_angle_x": 1.2, "is_fisheye": True}, ""),
+    ],
+)
+def test_focal_lengths_that_contradict_each_other_are_said(tmp_path, shared, line):
+    save(tmp_path / "images/a.png", ramp())
+    scene = read_transforms(transforms(tmp_path, [frame()], **PINHOLE, **shared))
+    assert line in messages(scene) if line else "says a focal length" not in messages(scene)
+
+
+def test_splits_are_folders_of_names_and_each_picture_is_of_one(tmp_path, capsys):
+    rgba = np.dstack([ramp(), np.full((HEIGHT, WIDTH), 255, np.uint8)])
+    held = {"train": "train/r_0", "test": "test/r_0", "val": "shots/r_1"}
+    for split, name in held.items():
+        save(tmp_path / f"{name}.png", rgba)
+        frames = [frame(f"./{name}"), frame("./test/r_0")]
+        data = {"camera_angle_x": 0.6, "frames": frames[: 1 + (split == "val")]}
+        (tmp_path / f"transforms_{split}.json").write_text(json.dumps(data))
+    scene = open_project(tmp_path)
+    assert scene.names == ("test/r_0.png", "train/r_0.png", "val/shots/r_1.png")
+    assert select(scene.names, "train") == ("train/r_0.png",)
+    assert select(scene.names, "not:train") == ("test/r_0.png", "val/shots/r_1.png")
+    assert main(["check", str(tmp_path)]) == 0
+    told = "splits: train (1 frames), test (1 frames), val (1 frames); select them by name: "
+    assert told + "--context train --targets test" in capsys.readouterr().out
+    assert len(read_transforms_cameras(tmp_path)) == 3
+
+
+@pytest.mark.parametrize(
+    ("keys", "expected"),
+    [
+        ({"integer_depth_scale": 0.0005}, 1.0),
+        ({"integer_depth_scale": 10 / 65535, "depth_unit_scale_factor": 1.0}, 2000 * 10 / 65535),
+        ({}, 2.0),
+    ],
+)
+def test_depth_as_apps_for_phones_name_it(tmp_path, keys, expected):
+    save(tmp_path / "images/a.png", ramp())
+    save(tmp_path / "a.depth.png", np.full((HEIGHT, WIDTH), 2000, np.uint16))
+    path = transforms(tmp_path, [frame(depth_path="a.depth.png")], **PINHOLE, **keys)
+    scene = read_transforms(path)
+    np.testing.assert_allclose(scene.views[0].load().depth, expected, rtol=1e-6)
+    assert ("0.001 a step is assumed" in messages(scene)) == (not keys)
+
+
+@pytest.mark.parametrize("factor", [0.5, 2])
+def test_pictures_of_another_size_and_the_same_aspect_scale_their_camera(tmp_path, factor):
+    small = int(WIDTH * factor), int(HEIGHT * factor)
+    save(tmp_path / "images/a.png", ramp(*small))
+    save(tmp_path / "m.png", np.full((HEIGHT, WIDTH), 255, np.uint8))
+    scene = read_transforms(transforms(tmp_path, [frame(mask_path="m.png")], **PINHOLE))
+    assert scene.cameras.K[0][0].tolist() == [90 * factor, 0, 48 * factor]
+    assert scene.views[0].load().rgb.shape[1::-1] == small
+    assert scene.views[0].load().mask is None or scene.views[0].load().mask.all()
+    assert f"{small[0]}x{small[1]} for cameras of 96x72: intrinsics scaled" in messages(scene)
+
+
 def test_no_focal_length(tmp_path):
     save(tmp_path / "images/a.png", ramp())
-    with pytest.raises(ProjectError, match="neither fl_x nor camera_angle_x"):
+    with pytest.raises(ProjectError, match="no focal length; expected fl_x, "):
         read_transforms(transforms(tmp_path, [frame()], w=WIDTH, h=HEIGHT))
 
 
