@@ -12,11 +12,8 @@ import csv
 import io
 import math
 import re
-from collections.abc import Callable
 from dataclasses import dataclass
 from numbers import Integral
-
-from gvtools.errors import OptionError, ShapeError
 
 # Significant digits of a column without decimals of its own.
 SIGNIFICANT = 4
@@ -57,14 +54,6 @@ class Table:
     caption: str = ""
     notes: tuple[str, ...] = ()
 
-    def __post_init__(self) -> None:
-        for number, row in enumerate(self.rows, start=1):
-            if len(row) != len(self.columns):
-                raise ShapeError(
-                    f"table {self.caption!r}: row {number} has {len(row)} values; expected "
-                    f"{len(self.columns)}"
-                )
-
 
 def csv_text(table: Table) -> str:
     """The table as CSV (RFC 4180), without caption and notes.
@@ -103,7 +92,7 @@ def markdown(table: Table) -> str:
     return "\n".join([*above, *lines, *below]) + "\n"
 
 
-def latex(table: Table, *, label: str | None = None) -> str:
+def latex(table: Table) -> str:
     """A table environment for booktabs; caption above, notes below in small print."""
     arrow = {"higher": r"~$\uparrow$", "lower": r"~$\downarrow$", None: ""}
     heads = [_latex_text(column.heading) + arrow[column.better] for column in table.columns]
@@ -111,8 +100,6 @@ def latex(table: Table, *, label: str | None = None) -> str:
     lines = [r"\begin{table}", r"  \centering"]
     if table.caption:
         lines.append(rf"  \caption{{{_latex_text(table.caption)}}}")
-    if label:
-        lines.append(rf"  \label{{{label}}}")
     lines += [rf"  \begin{{tabular}}{{{sides}}}", r"    \toprule"]
     lines += [f"    {' & '.join(heads)} \\\\", r"    \midrule"]
     for row in table.rows:
@@ -125,16 +112,6 @@ def latex(table: Table, *, label: str | None = None) -> str:
     # A blank line begins the paragraph of each note.
     lines += [f"\n  {{\\footnotesize {_latex_text(note)}\\par}}" for note in table.notes]
     return "\n".join([*lines, r"\end{table}"]) + "\n"
-
-
-FORMS: dict[str, Callable[[Table], str]] = {"csv": csv_text, "markdown": markdown, "latex": latex}
-
-
-def render(table: Table, form: str) -> str:
-    """The table in a form of FORMS: csv, markdown or latex."""
-    if form not in FORMS:
-        raise OptionError(f"table form {form!r}; expected one of {', '.join(FORMS)}")
-    return FORMS[form](table)
 
 
 def _plain(value: Value) -> str | int | float | None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from gvtools.evaluation.images import FIGURES
 from gvtools.evaluation.published import MeasuredRow, Setting
 from gvtools.evaluation.statistics import mean_interval
-from gvtools.evaluation.tables import Column, Ranked, Table, Value, markdown, render
+from gvtools.evaluation.tables import Column, Ranked, Table, Value, csv_text, latex, markdown
 from gvtools.files import write_text
 from pipelines.report import nested
 from pipelines.scoring.measurement import JUDGED, NEVER_OBSERVED
@@ -52,7 +52,7 @@ POSES = (
     ("pose AUC at 3 degrees, failures as wrong", "auc.3", "pictures"),
     ("pose AUC at 30 degrees, failures as wrong", "auc.30", "pictures"),
 )
-SUFFIXES = {"csv": ".csv", "markdown": ".md", "latex": ".tex"}
+FORMS = {".csv": csv_text, ".md": markdown, ".tex": latex}
 
 
 def view_table(views: Sequence[Mapping[str, Any]], caption: str) -> Table:
@@ -210,8 +210,8 @@ def print_table(table: Table, console: Console, *, ranks: bool = False) -> None:
 def write_tables(folder: Path, tables: Mapping[str, Table]) -> None:
     """Each table as CSV, Markdown and LaTeX."""
     for name, table in tables.items():
-        for form, suffix in SUFFIXES.items():
-            write_text(folder / f"{name}{suffix}", render(table, form))
+        for suffix, form in FORMS.items():
+            write_text(folder / f"{name}{suffix}", form(table))
 
 
 def _column(figure: str) -> Column:
