@@ -6,12 +6,10 @@ import difflib
 import shlex
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 from gvtools.errors import OptionError, ProjectError, UnposedError
-from gvtools.files import digest
 from gvtools.scenes.calibration import load_matrix
 from gvtools.scenes.collection import SceneCollection, of_scenes
 from gvtools.scenes.colmap_model import find_model
@@ -246,23 +244,6 @@ def open_collection(address: str, root: Path | None = None) -> SceneCollection:
 
         path = Path(address)
         return open_shards(path) if is_shards(path) else of_scenes([open_project(path)])
-    from gvtools.scenes.data_sets.catalogue import load_spec, open_data_set, scenes_of
-    from gvtools.specs import name_key
+    from gvtools.scenes.data_sets.catalogue import open_scenes
 
-    name, colon, scene = address.removeprefix(SPEC).partition(":")
-    spec = load_spec(name)
-    if root is None:
-        raise OptionError(f"{address}: no root; give the folder of the download of {spec.name}")
-    key = name_key(name)
-    if colon:
-        opened = open_data_set(name, scene, root)
-        return replace(of_scenes([opened], title=f"{spec.name} {scene}".strip()), data_set=key)
-    names = scenes_of(name, root)
-    read = partial(_read_scene, key, root=Path(root))
-    return SceneCollection(spec.name, names, read, None, digest(list(names)), key)
-
-
-def _read_scene(data_set: str, scene: str, *, root: Path) -> Scene:
-    from gvtools.scenes.data_sets.catalogue import load_spec, read_scene
-
-    return read_scene(load_spec(data_set), scene, root)
+    return open_scenes(address, root)

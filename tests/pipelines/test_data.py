@@ -365,7 +365,10 @@ def test_damaged_shards_are_lines_with_status_2(download, tmp_path, capsys):
     ("arguments", "complaint"),
     [
         (("shards", "7-Scense", "--root", "ROOT", "--out", "OUT"), "did you mean '7scenes'?"),
-        (("shards", "spec:7-Scenes", "--out", "OUT"), "spec:7-Scenes: no root; give the folder"),
+        (
+            ("shards", "spec:7-Scenes", "--out", "OUT"),
+            "spec:7-Scenes: where 7-Scenes lies is not said; give the folder",
+        ),
         (
             ("shards", "7-Scenes", "--root", "ROOT", "--out", "OUT", "--scenes", "chess/seq-03"),
             "did you mean 'chess/seq-02'?",

@@ -198,7 +198,7 @@ def test_a_damaged_file_costs_its_windows_alone_and_is_counted(home, tmp_path):
 @pytest.mark.parametrize(
     ("entry", "share", "said"),
     [
-        ("spec:7-Scenes", 0.5, r"spec:7-Scenes: no root; give the folder"),
+        ("spec:7-Scenes", 0.5, r"spec:7-Scenes: where 7-Scenes lies is not said; give the folder"),
         ({"project": "kitchen", "root": "."}, 0.5, "expected one for spec:NAME alone"),
         ("absent", 0.5, "no such folder"),
         ("kitchen", 0, "expected both or none"),

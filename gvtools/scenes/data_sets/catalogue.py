@@ -11,13 +11,15 @@ import difflib
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import Field, ValidationError, model_validator
 
 from gvtools.errors import OptionError, ProjectError
+from gvtools.files import digest
+from gvtools.scenes.collection import SceneCollection, of_scenes
 from gvtools.scenes.data_sets import aria, captures, hypersim, mvs, reconstructed, synthetic, waymo
 from gvtools.scenes.layout import FORM, SPEC, Layout
 from gvtools.scenes.scene import Origin, Scene
@@ -208,12 +210,9 @@ def open_data_set(name: str, scene: str, root: Path) -> Scene:
     return read_scene(spec, scene, Path(root))
 
 
-def open_address(address: Path | str, root: Path | None) -> Scene:
-    """The scene that ``spec:NAME:SCENE`` names in the folder of the data set's download.
-
-    ":SCENE" may be left out where the folder holds only one.
-    """
-    name, _, scene = str(address).removeprefix(SPEC).partition(":")
+def _parse_address(address: Path | str, root: Path | None) -> tuple[DataSetSpec, str | None, Path]:
+    """The data set, scene (None for all) and folder that an address and a root name."""
+    name, colon, scene = str(address).removeprefix(SPEC).partition(":")
     if not name:
         raise OptionError(f"{address}: names no data set; expected {FORM}")
     spec = load_spec(name)
@@ -222,7 +221,31 @@ def open_address(address: Path | str, root: Path | None) -> Scene:
             f"{address}: where {spec.name} lies is not said; give the folder of its download by "
             "--root DIR (root= in Python)"
         )
-    return open_data_set(name, scene, Path(root))
+    return spec, scene if colon else None, Path(root)
+
+
+def open_address(address: Path | str, root: Path | None) -> Scene:
+    """The scene that ``spec:NAME:SCENE`` names in the folder of the data set's download.
+
+    ":SCENE" may be left out where the folder holds only one.
+    """
+    spec, scene, folder = _parse_address(address, root)
+    return open_data_set(spec.name, scene or "", folder)
+
+
+def open_scenes(address: str, root: Path | None) -> SceneCollection:
+    """The scenes that ``spec:NAME`` names, or the one that ``spec:NAME:SCENE`` does."""
+    spec, scene, folder = _parse_address(address, root)
+    key = name_key(spec.name)
+    if scene is not None:
+        opened = open_data_set(key, scene, folder)
+        return replace(of_scenes([opened], title=f"{spec.name} {scene}".strip()), data_set=key)
+    names, read = scenes_of(key, folder), partial(_read_named, key, root=folder)
+    return SceneCollection(spec.name, names, read, None, digest(list(names)), key)
+
+
+def _read_named(data_set: str, scene: str, *, root: Path) -> Scene:
+    return read_scene(load_spec(data_set), scene, root)
 
 
 def chosen_scenes(name: str, root: Path, scenes: Sequence[str] = ()) -> tuple[str, ...]:
