@@ -274,7 +274,7 @@ def _load(network: Any, path: Path) -> None:
     """Put a published file's tensors into a network; every learned one has to be there."""
     from gvtools.networks.tensors import not_finite
 
-    stored = _published(path)
+    stored = _read_published(path)
     bad = not_finite(stored)
     if bad is not None:
         raise CheckpointError(f"{path}: {bad} holds values that are not finite")
@@ -291,7 +291,7 @@ def _load(network: Any, path: Path) -> None:
         )
 
 
-def _published(path: Path) -> dict[str, Tensor]:
+def _read_published(path: Path) -> dict[str, Tensor]:
     """Tensors of a published file by the names of kornia's networks."""
     from gvtools.networks.tensors import plain_tensors, read_pickled, read_tensors
 

@@ -73,13 +73,13 @@ def fit_similarity(
         with_scale: False fits a rigid motion.
         weights: (N,) >= 0; rows of weight 0 count for nothing.
     """
-    source, target, weight = _checked(source, target, weights)
+    source, target, weight = _check(source, target, weights)
     row = weight > 0
     if row.sum() < 3:
         return _degenerate(len(source), f"{row.sum()} point pair(s), at least 3 are needed")
     weight = weight[row] / weight.sum()
-    x, x_unit, source_center, x_defect = _centered(source, row, weight)  # (34)
-    y, y_unit, target_center, y_defect = _centered(target, row, weight)  # (35)
+    x, x_unit, source_center, x_defect = _center(source, row, weight)  # (34)
+    y, y_unit, target_center, y_defect = _center(target, row, weight)  # (35)
     if x_defect or y_defect:
         defect = f"{x_defect} source" if x_defect else f"{y_defect} target"
         return _degenerate(len(source), f"{defect} points")
@@ -131,7 +131,7 @@ def fit_line(source: ArrayLike, target: ArrayLike, *, with_scale: bool) -> Simil
     )  # fmt: skip
 
 
-def _checked(
+def _check(
     source: ArrayLike, target: ArrayLike, weights: ArrayLike | None
 ) -> tuple[Float64, Float64, Float64]:
     """Points and weights as float64; raises as ``fit_similarity`` says."""
@@ -148,7 +148,7 @@ def _checked(
     return source, target, weight
 
 
-def _centered(
+def _center(
     points: Float64, row: NDArray[np.bool_], weight: Float64
 ) -> tuple[Float64, float, Float64, str]:
     """Points about their centroid, in a power of two near their extent.

@@ -42,10 +42,10 @@ def harmonics(directions: ArrayLike) -> NDArray[np.float64]:
     return np.stack(np.broadcast_arrays(*function(HARMONICS, x, y, z)), axis=1)
 
 
-def harmonics_turned(axes: ArrayLike) -> NDArray[np.float64]:
+def turn_harmonics(axes: ArrayLike) -> NDArray[np.float64]:
     """(9, 9) matrix M: coefficients c in a frame are M c in one where its axes are ``axes`` (3, 3).
 
-    >>> halfway = harmonics_turned(np.diag([1.0, -1.0, -1.0]))  # half a turn around x
+    >>> halfway = turn_harmonics(np.diag([1.0, -1.0, -1.0]))  # half a turn around x
     >>> np.diag(halfway).round().astype(int).tolist()
     [1, -1, -1, 1, -1, 1, 1, -1, 1]
     """
@@ -64,7 +64,7 @@ def turn_gaussians(values: NDArray[np.float32], axes: NDArray[np.float64]) -> ND
     rotation = Rotation.from_matrix(axes) * Rotation.from_quat(np.stack([x, y, z, w], axis=1))
     out[:, QUATERNION:LOGIT] = np.roll(rotation.as_quat(), 1, axis=1)
     sh = values[:, SH:].reshape(len(values), -1, 3)
-    out[:, SH:] = np.einsum("ij,njc->nic", harmonics_turned(axes), sh).reshape(len(values), -1)
+    out[:, SH:] = np.einsum("ij,njc->nic", turn_harmonics(axes), sh).reshape(len(values), -1)
     return out
 
 

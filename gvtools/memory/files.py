@@ -227,7 +227,7 @@ def tile_folder(path: Path) -> Path:
 def save_tiles(memory: Store, folder: Path) -> Path:
     """Write a memory in tiles."""
     tiles = memory.tiles
-    with tiles.lock, _replaced(folder) as new:
+    with tiles.lock, _replace_folder(folder) as new:
         table = []
         for number, tile in tiles:
             if tile.file is None or tile.dirty:
@@ -347,7 +347,7 @@ def _add_tiles(
 
 def copy_tiles(source: Path, target: Path) -> None:
     """Make the tiles in a folder those of another, too, by links where there are any."""
-    with _replaced(target) as new:
+    with _replace_folder(target) as new:
         for path in sorted(source.iterdir()):
             link(path, new / path.name)
 
@@ -363,7 +363,7 @@ def link(source: Path, target: Path) -> None:
 
 
 @contextmanager
-def _replaced(folder: Path) -> Iterator[Path]:
+def _replace_folder(folder: Path) -> Iterator[Path]:
     """An empty folder that takes the place of ``folder``, which may be absent."""
     recover_folder(folder)
     if folder.exists():

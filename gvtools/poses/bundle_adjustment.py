@@ -144,7 +144,7 @@ def adjusted_poses(
     with quiet_colmap(errors=False):
         if tracks is None:
             with tempfile.TemporaryDirectory() as folder:
-                model = _triangulated(frames, cameras, Path(folder))
+                model = _triangulate(frames, cameras, Path(folder))
         else:
             model = _model(cameras, tracks)
             _solve(model, ROUNDS[-1])
@@ -163,7 +163,7 @@ def adjusted_poses(
     well_observed = np.bincount(found.view, minlength=len(cameras)) >= LEAST_SEEN
     if well_observed.mean() < 0.5:
         return None
-    return _placed(poses, found, cameras, well_observed=well_observed, errors=errors)
+    return _place(poses, found, cameras, well_observed=well_observed, errors=errors)
 
 
 def can_adjust(cameras: Cameras, tracks: Tracks | None) -> bool:
@@ -194,7 +194,7 @@ def tracks_of(scene: Scene, names: Sequence[str], frame: LocalFrame) -> Tracks |
     )  # fmt: skip
 
 
-def _placed(
+def _place(
     poses: Float64, tracks: Tracks, cameras: Cameras, *, well_observed: NDArray[np.bool_],
     errors: tuple[float, float],
 ) -> AdjustedPoses:  # fmt: skip
@@ -218,7 +218,7 @@ def _placed(
     return AdjustedPoses(poses, tracks, errors)
 
 
-def _triangulated(
+def _triangulate(
     frames: Sequence[Frame], cameras: Cameras, work: Path
 ) -> pycolmap.Reconstruction | None:
     """Points of the pictures' features, and poses adjusted to them; None where hardly any match."""

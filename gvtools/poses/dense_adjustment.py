@@ -76,7 +76,7 @@ def pose_equations(
     for s in range(count):
         if (weights[s] > 0).any():
             off[s] = np.median(np.abs(across[s, weights[s] > 0]))
-    system, right = _eliminated(jacobian, along, measured, weight=weights)
+    system, right = _eliminate_depths(jacobian, along, measured, weight=weights)
     return PoseEquations(system, right, off)
 
 
@@ -104,7 +104,7 @@ def adjust_cameras(
         lift = np.zeros((6 * len(others), 6 * (len(others) + 1)))
         for i, pose in enumerate(relative):
             lift[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] = np.eye(6)
-            lift[6 * i : 6 * i + 6, -6:] = -_carried(pose)
+            lift[6 * i : 6 * i + 6, -6:] = -_adjoint(pose)
         rows = np.concatenate([np.arange(6 * v, 6 * v + 6) for v in (*others, view)])
         system[np.ix_(rows, rows)] += lift.T @ measured.system @ lift
         right[rows] += lift.T @ measured.right
@@ -112,7 +112,7 @@ def adjust_cameras(
     return replace(cameras, cam_from_world=_rigid(motion) @ cameras.cam_from_world)
 
 
-def _carried(pose: Float64) -> Float64:
+def _adjoint(pose: Float64) -> Float64:
     """(6, 6) a motion in one camera's frame as a motion in another's (the adjoint)."""
     rotation, (x, y, z) = pose[:3, :3], pose[:3, 3]
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
@@ -151,7 +151,7 @@ def _derivatives(
     return np.concatenate([turn, shift], axis=-1), along
 
 
-def _eliminated(
+def _eliminate_depths(
     jacobian: Float64, along: Float64, motion: Float64, *, weight: Float64
 ) -> tuple[Float64, Float64]:
     """Normal equations of the sources' motions, with weights that set outliers aside.

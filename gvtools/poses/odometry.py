@@ -113,10 +113,10 @@ class RgbdFrames:
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
         camera = scene.views[0].camera
-        self._size = _reduced(camera.width[0], camera.height[0], side=SIDE)
+        self._size = _reduced_size(camera.width[0], camera.height[0], side=SIDE)
         #: (3, 3) at the reduced size, the first pixel's centre being (0, 0) as Open3D counts.
         self.K = _centre_origin(camera.resized(*self._size).K[0])
-        self.feature_size = _reduced(camera.width[0], camera.height[0], side=FEATURE_SIDE)
+        self.feature_size = _reduced_size(camera.width[0], camera.height[0], side=FEATURE_SIDE)
         #: (3, 3) of the features' pixels.
         self.feature_K = _centre_origin(camera.resized(*self.feature_size).K[0])
         self._frames: OrderedDict[int, SmallFrame] = OrderedDict()
@@ -193,10 +193,10 @@ def compare(frames: RgbdFrames, source: int, target: int, *, start: Float64) -> 
         )
         if refined is not None and within(refined @ invert_rigid(pose), MOST_SHIFT, MOST_TURN):
             # Keep the pose with the smaller median difference of depths.
-            by = [_compared(first.depth, second.depth, frames.K, pose=at) for at in (refined, pose)]
+            by = [_compare(first.depth, second.depth, frames.K, pose=at) for at in (refined, pose)]
             if by[0][2] <= by[1][2]:
                 pose = refined
-    overlap, agreement, _, in_front = _compared(first.depth, second.depth, frames.K, pose=pose)
+    overlap, agreement, _, in_front = _compare(first.depth, second.depth, frames.K, pose=pose)
     if overlap < LEAST_OVERLAP or agreement < LEAST_AGREEMENT or in_front > MOST_IN_FRONT:
         return None
     information = o3d.t.pipelines.odometry.compute_odometry_information_matrix(
@@ -273,7 +273,7 @@ def _constrains_pose(depth: NDArray[np.float32], K: Float64) -> bool:
     return bool(weights[0] >= LEAST_CONSTRAINT * weights[-1])
 
 
-def _compared(
+def _compare(
     first: NDArray[np.float32], second: NDArray[np.float32], K: Float64, *, pose: Float64
 ) -> tuple[float, float, float, float]:
     """Overlap and agreement, see ``Pair``, median difference, and share in front of ``second``."""
@@ -365,7 +365,7 @@ def _thumbnail(grey: NDArray[Any]) -> NDArray[np.float64]:
     return row / max(float(np.linalg.norm(row)), 1e-9)
 
 
-def _reduced(width: int, height: int, *, side: int) -> tuple[int, int]:
+def _reduced_size(width: int, height: int, *, side: int) -> tuple[int, int]:
     scale = min(1.0, side / max(width, height))
     return max(1, round(width * scale)), max(1, round(height * scale))
 

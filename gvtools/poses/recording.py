@@ -140,7 +140,7 @@ def _next(frames: RgbdFrames, at: int, motion: Float64) -> Pair | None:
     if not _sure(best) and not np.array_equal(motion, np.eye(4)):
         best = _better(best, compare(frames, at, at - 1, start=np.eye(4)))
     if not _sure(best):
-        best = _better(best, _recognised(frames, at, at - 1))
+        best = _better(best, _compare_by_features(frames, at, at - 1))
     return best
 
 
@@ -153,7 +153,7 @@ def _better(first: Pair | None, second: Pair | None) -> Pair | None:
     return max(pairs, key=lambda pair: pair.agreement, default=None)
 
 
-def _recognised(frames: RgbdFrames, source: int, target: int) -> Pair | None:
+def _compare_by_features(frames: RgbdFrames, source: int, target: int) -> Pair | None:
     """The pair of two frames whose initial pose comes from matched features."""
     start = start_from_features(frames.features(source), frames.features(target), frames.feature_K)
     return None if start is None else compare(frames, source, target, start=start)
@@ -194,7 +194,7 @@ def _loops_alike(
         for other in [*near, *alike.tolist()]:
             wanted.add((max(key, keyframes[other]), min(key, keyframes[other])))
     for source, target in sorted(wanted - set(pairs)):
-        pair = _recognised(frames, source, target)
+        pair = _compare_by_features(frames, source, target)
         if pair is not None:
             pairs[source, target] = pair
 

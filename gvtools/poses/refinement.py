@@ -137,12 +137,12 @@ def agreeing_poses(views: Iterable[FitView]) -> NDArray[np.float64]:
     unit = np.diag([1.0, 1.0, 1.0, TYPICAL_DEPTH / np.median(known)])
     given = [np.linalg.inv(unit) @ view.cam_from_local @ unit for view in views]
     images = [_image(view, K, size, scale=TYPICAL_DEPTH / np.median(known)) for view in views]
-    refined = _optimised(np.stack(given), images, K, size=size)
+    refined = _optimise(np.stack(given), images, K, size=size)
     moved = refined @ align_poses(refined, np.stack(given))
     return np.asarray(unit @ moved @ np.linalg.inv(unit))
 
 
-def _optimised(
+def _optimise(
     given: Float64, images: list[o3d.geometry.RGBDImage], K: Float64, *, size: tuple[int, int]
 ) -> Float64:
     """(V, 4, 4) poses that agree with the pairs of images; pairs that contradict are left out."""
@@ -193,7 +193,7 @@ def _image(
 
 def comparable(views: Sequence[FitView]) -> list[ReducedView]:
     """Views as ``prediction_error`` compares them: smaller, without their noise."""
-    return [_blurred(reduce_view(view, SMALLER)) for view in views]
+    return [_blur(reduce_view(view, SMALLER)) for view in views]
 
 
 def prediction_error(
@@ -221,13 +221,13 @@ def prediction_error(
             points = rays * view.depth[y, x, None]
             motion = poses[other] @ np.linalg.inv(at[row])
             points = points @ motion[:3, :3].T + motion[:3, 3]
-            found, inside = _looked_up(small[other].target, points, small[other].K)
+            found, inside = _look_up(small[other].target, points, small[other].K)
             if inside.sum() > FEWEST:
                 errors.append(float(np.median(np.abs(found - view.target[:, y, x])[:, inside])))
     return float(np.mean(errors)) if errors else float("nan")
 
 
-def _blurred(view: ReducedView) -> ReducedView:
+def _blur(view: ReducedView) -> ReducedView:
     """Without its noise, which looking up between pixels would average away.
 
     Else poses seemed better that make pictures meet between pixels.
@@ -236,7 +236,7 @@ def _blurred(view: ReducedView) -> ReducedView:
     return replace(view, target=smooth[0].numpy())
 
 
-def _looked_up(
+def _look_up(
     picture: NDArray[np.float32], points: NDArray[np.float64], K: NDArray[np.float64]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Colours (3, N) of a picture at points of its camera's frame, and which lie inside."""

@@ -67,8 +67,7 @@ def reduce_view(view: FitView, factor: int) -> ReducedView:
     if (rows, columns) != (height, width):
         both = torch.nn.functional.interpolate(both[None], (rows, columns), mode="area")[0]
     depth, estimate = (
-        None if full is None else _picked(full, rows, columns)
-        for full in (view.depth, view.estimate)
+        None if full is None else _pick(full, rows, columns) for full in (view.depth, view.estimate)
     )
     K = view.K.copy()
     K[0] *= columns / width
@@ -79,7 +78,7 @@ def reduce_view(view: FitView, factor: int) -> ReducedView:
     return ReducedView(arrays[:3], arrays[3], depth, estimate, K)
 
 
-def _picked(depth: NDArray[np.float32], rows: int, columns: int) -> NDArray[np.float32]:
+def _pick(depth: NDArray[np.float32], rows: int, columns: int) -> NDArray[np.float32]:
     """The pixels of (H, W) depth that are nearest to those of a smaller picture."""
     height, width = depth.shape
     if (rows, columns) == (height, width):

@@ -73,7 +73,7 @@ class ScanTable:
         step = min(CHUNK, max(1, CHUNK_BYTES // width))
         parts = [(first, min(step, self.count - first)) for first in range(0, self.count, step)]
         if self.layout == "columns":
-            unpacked = _unpacked(path, self)
+            unpacked = _unpack(path, self)
             for first, rows in parts:
                 yield {name: column[first : first + rows] for name, column in unpacked.items()}
         elif self.layout == "rows":
@@ -241,7 +241,7 @@ def _check_compressed(path: Path, table: ScanTable) -> None:
         )
 
 
-def _unpacked(path: Path, table: ScanTable) -> dict[str, NDArray[Any]]:
+def _unpack(path: Path, table: ScanTable) -> dict[str, NDArray[Any]]:
     """The columns of compressed points."""
     packed, whole = np.fromfile(path, "<u4", 2, offset=table.offset).tolist()
     data = np.fromfile(path, np.uint8, packed, offset=table.offset + 8)

@@ -14,7 +14,7 @@ from splat_scene import HEIGHT, NEAR, WIDTH, K, pose, rough_gaussians, walk
 
 from gvtools.appearance.camera_corrections import Exposures
 from gvtools.appearance.gaussians import ATTRIBUTES, FIRST_OPACITY, Gaussians
-from gvtools.appearance.harmonics import expose, harmonics, harmonics_turned, turn_gaussians
+from gvtools.appearance.harmonics import expose, harmonics, turn_gaussians, turn_harmonics
 from gvtools.appearance.splat.project_kernels import HARMONICS, LOGIT, SH, VALUES
 from gvtools.appearance.splat.splat import Lens, Splat
 from gvtools.cameras import Cameras
@@ -48,7 +48,7 @@ def test_harmonics_are_those_of_splat_files():
 
 
 def test_harmonics_turn_within_their_degree():
-    matrix = harmonics_turned(AXES)
+    matrix = turn_harmonics(AXES)
     np.testing.assert_allclose(matrix @ matrix.T, np.eye(9), atol=1e-12)
     outside = np.ones((9, 9), bool)
     for first, last in ((0, 1), (1, 4), (4, 9)):

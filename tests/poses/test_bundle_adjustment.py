@@ -94,7 +94,7 @@ def test_exact_poses_stay(room):
 
 def test_known_tracks_need_no_picture(room, monkeypatch):
     frames, cameras = room
-    monkeypatch.setattr(bundle_adjustment, "_triangulated", None)
+    monkeypatch.setattr(bundle_adjustment, "_triangulate", None)
     tracks, given = tracks_through(cameras), off(cameras)
     assert tracks.exact(cameras)
     assert not tracks.exact(given)

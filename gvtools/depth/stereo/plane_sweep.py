@@ -228,9 +228,9 @@ class PlaneSweepStereo:
         if depths.origin == "points":
             return depths
         names = self._sources(view, depths)
-        small = [_halved(self._pyramid(self._scene[name])) for name in names]
+        small = [_halve(self._pyramid(self._scene[name])) for name in names]
         coarse = coarse_depth(
-            _halved(reference), small, depths,
+            _halve(reference), small, depths,
             options=self.options.replaced(window=5, planes=None),
             matcher=self._matcher, device=self._device,
         )  # fmt: skip
@@ -295,7 +295,7 @@ def make_matcher(options: StereoOptions) -> tuple[Matcher, torch.device]:
     return TorchMatcher(options), torch.device("cuda" if cuda else "cpu")
 
 
-def _halved(pyramid: Pyramid) -> Pyramid:
+def _halve(pyramid: Pyramid) -> Pyramid:
     """The coarsest level at half its size, alone."""
     image, camera = pyramid.images[-1], pyramid.cameras[-1]
     width, height = max(8, round(image.shape[1] / 2)), max(8, round(image.shape[0] / 2))

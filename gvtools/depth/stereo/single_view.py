@@ -117,14 +117,14 @@ def refine_planes(
     for i in range(iterations):
         reach = 1 if i % 2 == 0 else 3
         for dy, dx in ((0, reach), (reach, 0), (0, -reach), (-reach, 0)):
-            offer(_shifted(planes, dy, dx))
+            offer(_shift(planes, dy, dx))
         offer(fit_planes(planes[0], (1 - cost).clamp(min=0.01)))
         for change in (0.5, -0.5) if i % 2 == 0 else (0.25, -0.25):
             offer(torch.stack([planes[0] + change * step, planes[1], planes[2]]))
     return _between(planes, cost, level, matcher=matcher, step=0.4 * step)
 
 
-def _shifted(planes: torch.Tensor, dy: int, dx: int) -> torch.Tensor:
+def _shift(planes: torch.Tensor, dy: int, dx: int) -> torch.Tensor:
     """Each pixel's neighbour's plane, continued to the pixel; the border keeps its own."""
     moved = planes.roll((dy, dx), dims=(1, 2))
     moved[0] += moved[1] * dx + moved[2] * dy

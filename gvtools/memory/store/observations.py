@@ -338,7 +338,7 @@ class SegmentPlaces(GrowableTable):
 
 
 # Rows, confidence added and confidence before, of one view that agreed.
-Agreement = tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.float32]]
+AgreementEntry = tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.float32]]
 # Placeholder for the column ``next``: rebuild_index links the chains again.
 NONE = np.full(1, -1, np.int32)
 
@@ -352,7 +352,7 @@ class Observations:
         self.segments = Segments()
         self.index = VoxelIndex()
         # By round, one entry for each fused view that saw what earlier rounds had observed.
-        self.agreements: dict[int, list[Agreement]] = {}
+        self.agreements: dict[int, list[AgreementEntry]] = {}
 
     def __len__(self) -> int:
         return self.columns.count
@@ -371,7 +371,7 @@ class Observations:
             confidence[rows] = np.minimum(before + weights, np.float32(self.weight_cap))
         self.agreements.setdefault(round, []).append((rows, weights, before))
 
-    def agreement_log(self) -> list[tuple[int, Agreement]]:
+    def agreement_log(self) -> list[tuple[int, AgreementEntry]]:
         """The agreements with their rounds, in order."""
         return [(r, entry) for r in sorted(self.agreements) for entry in self.agreements[r]]
 

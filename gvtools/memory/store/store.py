@@ -13,7 +13,7 @@ from pydantic import Field, field_validator
 
 from gvtools.errors import OptionError
 from gvtools.memory.store.local_frame import LocalFrame
-from gvtools.memory.store.observations import Agreement, Columns, Observations
+from gvtools.memory.store.observations import AgreementEntry, Columns, Observations
 from gvtools.memory.store.tile_set import TileSet
 from gvtools.memory.store.views import FreeGrid, ViewTable
 from gvtools.memory.store.voxel_index import MAX_VOXEL, VoxelLevels, check_grid
@@ -135,7 +135,7 @@ class Store:
         return self.whole.columns
 
     @property
-    def agreements(self) -> dict[int, list[Agreement]]:
+    def agreements(self) -> dict[int, list[AgreementEntry]]:
         """By round, what its views added to the confidence of earlier rounds' observations."""
         return self.whole.agreements
 

@@ -17,7 +17,7 @@ from gvtools.kernels import compiled
 from gvtools.memory.store.array_file import ArrayFile, write_arrays
 from gvtools.memory.store.observations import (
     LAYOUT,
-    Agreement,
+    AgreementEntry,
     Observations,
     Segments,
     SplatColumns,
@@ -202,7 +202,7 @@ class Tile:
             raise _misfit(file, name)
         return column
 
-    def agreements(self) -> list[tuple[int, Agreement]]:
+    def agreements(self) -> list[tuple[int, AgreementEntry]]:
         """(round, (rows, confidence added, confidence before)) of each view that agreed here."""
         if self.store is not None:
             return self.store.agreement_log()
@@ -286,7 +286,7 @@ def of_views(view: NDArray[np.int32], views: ViewTable) -> dict[str, NDArray[Any
     return {"round": views.round[view], "generated": views.generated[view], "next": none}
 
 
-def read_agreements(file: ArrayFile) -> list[tuple[int, Agreement]]:
+def read_agreements(file: ArrayFile) -> list[tuple[int, AgreementEntry]]:
     """The agreements in a tile's file, see ``Observations.agreement_log``."""
     ends = file.array("agreement_start").tolist()
     row, weight, before = (file.array(f"agreement_{name}") for name in ("row", "weight", "before"))
