@@ -105,8 +105,11 @@ def read_target(folder: Path, entry: Mapping[str, Any]) -> TargetFiles:
             raise ValueError(f"pictures and depth of shapes {sorted(shapes)}")
         if depth.dtype != np.float32 or not np.isfinite(depth).all() or (depth < 0).any():
             raise ValueError(f"depth of type {depth.dtype}, or not finite, or negative")
-        if confidence is not None and confidence.shape != depth.shape:
-            raise ValueError(f"confidence of shape {confidence.shape}")
+        if confidence is not None:
+            if confidence.shape != depth.shape or confidence.dtype.kind != "f":
+                raise ValueError(f"confidence of shape {confidence.shape}, {confidence.dtype}")
+            if not np.isfinite(confidence).all():
+                raise ValueError("confidence that is not finite")
         if not 0 < scale < np.inf:
             raise ValueError(f"a scale of {scale}")
     except (*UNREADABLE, ShapeError) as error:

@@ -197,6 +197,18 @@ def test_a_flipped_bit_of_a_picture_is_named_or_without_effect(run, whole, kind)
     assert found > 20
 
 
+@pytest.mark.parametrize(("name", "value"), [("completion", np.nan), ("completion", -1),
+                                             ("confidence", np.inf)])  # fmt: skip
+def test_numbers_that_no_target_has_are_named(run, name, value):
+    (path,) = run.glob("round_001/depth_*.npz")
+    with np.load(path) as stored:
+        arrays = dict(stored)
+    arrays[name][3, 4] = value
+    np.savez(path, **arrays)
+    (path.parent / "SHA256SUMS").unlink()
+    assert "not finite" in said(run)
+
+
 def test_context_depth_is_checked(tmp_path):
     from gvtools.depth.source import DepthMap
     from gvtools.runs.context_depth import write_context_depth
