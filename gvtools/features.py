@@ -121,7 +121,7 @@ class SiftMatcher(Settings):
 
     def _sift(self) -> Any:
         """The extractor, created once."""
-        import pycolmap
+        from gvtools.colmap import pycolmap
 
         if not self._extractor:
             options = pycolmap.FeatureExtractionOptions()
@@ -328,7 +328,7 @@ def root_sift(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
 @contextmanager
 def quiet_colmap(*, errors: bool = True) -> Iterator[None]:
     """COLMAP's progress kept off the terminal, and its warnings and errors if not ``errors``."""
-    import pycolmap
+    from gvtools.colmap import pycolmap
 
     level = pycolmap.logging.minloglevel
     least = pycolmap.logging.WARNING if errors else pycolmap.logging.FATAL

@@ -172,7 +172,7 @@ def _by_pycolmap(
 
     It refuses some sets that determine the motion, such as many of three points.
     """
-    import pycolmap
+    from gvtools.colmap import pycolmap
 
     solve = pycolmap.estimate_sim3d if with_scale else pycolmap.estimate_rigid3d
     fit = solve(source, target)

@@ -5,7 +5,9 @@ from __future__ import annotations
 import argparse
 import io
 import os
+import signal
 import sys
+import threading
 from collections.abc import Mapping, Sequence
 from importlib import import_module
 from typing import NoReturn
@@ -42,6 +44,14 @@ COMMANDS = {
     "view": "pipelines.commands.view",
     "bench": "pipelines.commands.bench",
 }
+
+
+class _Terminated(KeyboardInterrupt):
+    """The process was asked to end: it ends as on Ctrl-C."""
+
+
+def _terminate(*_: object) -> NoReturn:
+    raise _Terminated
 
 
 class _Parser(argparse.ArgumentParser):
@@ -92,6 +102,9 @@ def main(argv: Sequence[str] | None = None, *, modules: Mapping[str, str] = COMM
         if isinstance(stream, io.TextIOWrapper):
             # What a console's encoding lacks is escaped: no work is lost for a name's sake.
             stream.reconfigure(errors="backslashreplace")
+    main_thread = threading.current_thread() is threading.main_thread()
+    if main_thread and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
+        signal.signal(signal.SIGTERM, _terminate)
     words = sys.argv[1:] if argv is None else argv
     parser = build_parser(modules, only=words[0] if words and words[0][:1] != "-" else "")
     args = argparse.Namespace(debug=False)
@@ -110,13 +123,15 @@ def main(argv: Sequence[str] | None = None, *, modules: Mapping[str, str] = COMM
             raise
         print(f"gvtools: {error}", file=sys.stderr)
         return 2
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as interrupt:
         goes_on = (
             "reconstruct and train go on with --resume, tradeoff, benchmark, fleet and data shards "
             "by themselves; refine changed nothing"
         )
-        print(f"gvtools: interrupted; {goes_on}", file=sys.stderr)
-        return 1
+        ended = isinstance(interrupt, _Terminated)
+        what = "terminated" if ended else "interrupted"
+        print(f"gvtools: {what}; {goes_on}", file=sys.stderr)
+        return 128 + signal.SIGTERM if ended else 1
     except Exception as error:
         if args.debug:
             raise

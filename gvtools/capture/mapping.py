@@ -70,7 +70,7 @@ class MappingResult:
 
 def find_cameras(task: MappingTask) -> MappingResult:
     """Find intrinsics and poses of pictures."""
-    import pycolmap
+    from gvtools.colmap import pycolmap
 
     source, count = task.source or task.images, len(task.names)
     with quiet_colmap(errors=False):
@@ -136,7 +136,7 @@ def _map(
 
     Intrinsics of faces, and their rotations, are fixed. None where neither gives a model.
     """
-    import pycolmap
+    from gvtools.colmap import pycolmap
 
     globally, pipeline = pycolmap.GlobalPipelineOptions(), pycolmap.IncrementalPipelineOptions()
     globally.random_seed = pipeline.random_seed = SEED
@@ -200,7 +200,7 @@ def _explained(models: Sequence[pycolmap.Reconstruction], pairs: Pairs) -> float
 
 def _settle(model: pycolmap.Reconstruction, *, refine: bool) -> None:
     """Deregister pictures that see too few points, then bundle-adjust the rest once more."""
-    import pycolmap
+    from gvtools.colmap import pycolmap
 
     if model.num_reg_images() < 2:
         return

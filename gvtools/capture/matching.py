@@ -78,7 +78,7 @@ class MappingTask:
 
 def match_pictures(task: MappingTask) -> tuple[Path, str]:
     """Fill a database with features and verified matches; returns it, and how pairs were chosen."""
-    import pycolmap
+    from gvtools.colmap import pycolmap
 
     database, learned, rigs = task.work / "database.db", task.learned, task.rigs
     given = {
@@ -128,7 +128,7 @@ def match_pictures(task: MappingTask) -> tuple[Path, str]:
 
 def _match_sift(database: Path, task: MappingTask) -> str:
     """Match SIFT of pairs of pictures; returns in words how the pairs were chosen."""
-    import pycolmap
+    from gvtools.colmap import pycolmap
 
     options, count = pycolmap.FeatureMatchingOptions(), len(task.names)
     options.skip_image_pairs_in_same_frame = bool(task.rigs)
@@ -208,7 +208,7 @@ def similar_pairs(
 
 def sift_descriptors(database: Path) -> dict[str, NDArray[np.float32]]:
     """(N, 128) RootSIFT descriptors of each picture in COLMAP's database."""
-    import pycolmap
+    from gvtools.colmap import pycolmap
 
     described = {}
     with pycolmap.Database.open(database) as opened:
@@ -271,7 +271,7 @@ def _of_picture(rgb: np.ndarray, matcher: FeatureMatcher) -> Features:
 
 def write_keypoints(database: Path, features: Mapping[str, Features]) -> None:
     """Write keypoints of all of the database's pictures, by their names."""
-    import pycolmap
+    from gvtools.colmap import pycolmap
 
     with pycolmap.Database.open(database) as opened:
         for image in opened.read_all_images():
@@ -287,7 +287,7 @@ def write_keypoints(database: Path, features: Mapping[str, Features]) -> None:
 
 def verified(database: Path) -> dict[tuple[str, str], int]:
     """Pairs of pictures that overlap, with the number of their verified matches."""
-    import pycolmap
+    from gvtools.colmap import pycolmap
 
     with pycolmap.Database.open(database) as opened:
         names = {image.image_id: image.name for image in opened.read_all_images()}
@@ -305,7 +305,7 @@ def flat_pairs(database: Path) -> list[tuple[NDArray[np.float64], tuple[int, int
 
     Two-view geometry then has no depth to go by: the scene is flat, or the camera only turned.
     """
-    import pycolmap
+    from gvtools.colmap import pycolmap
 
     kinds = pycolmap.TwoViewGeometryConfiguration
     flat = (kinds.PLANAR, kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC)

@@ -58,7 +58,7 @@ class FaceRig:
 
     def config(self) -> pycolmap.RigConfig:
         """The rig as COLMAP has it: the first face is its reference."""
-        import pycolmap
+        from gvtools.colmap import pycolmap
 
         reference = self.faces[0].rotation
         cameras = []
@@ -143,7 +143,7 @@ def write_faces(
     photographs: Sequence[CapturedPhotograph], images: Path, *, masks: Path | None, face_masks: Path
 ) -> list[FaceRig]:
     """Cut panoramas into faces, see ``FaceRig.names``, and their masks ``NAME.png`` likewise."""
-    import pycolmap
+    from gvtools.colmap import pycolmap
 
     sizes: dict[tuple[int, int], list[CapturedPhotograph]] = {}
     for item in photographs:

@@ -49,7 +49,7 @@ def place(
     Locations are latitude and longitude [degrees] and height [m] of pictures by name; the distance
     is that of the places where two pictures were taken, metres.
     """
-    import pycolmap
+    from gvtools.colmap import pycolmap
 
     placed = {name: value for name, value in locations.items() if _found(model, name) is not None}
     placement: WorldPlacement | None = None
@@ -87,7 +87,7 @@ def _found(model: pycolmap.Reconstruction, name: str) -> NDArray[np.float64] | N
 def _by_gps(
     model: pycolmap.Reconstruction, placed: Mapping[str, tuple[float, float, float]]
 ) -> tuple[WorldPlacement | None, list[Finding]]:
-    import pycolmap
+    from gvtools.colmap import pycolmap
 
     names, values = list(placed), np.array(list(placed.values()))
     origin = values.mean(axis=0)
@@ -122,8 +122,9 @@ def _by_gps(
 
 def _level(model: pycolmap.Reconstruction) -> None:
     """Rotate the cameras' mean up vector to +z, and move their mean centre to the origin."""
-    import pycolmap
     from scipy.spatial.transform import Rotation
+
+    from gvtools.colmap import pycolmap
 
     images = [image for image in model.images.values() if image.has_pose]
     rotations = np.stack([image.cam_from_world().rotation.matrix() for image in images])

@@ -27,7 +27,7 @@ SOURCES = 20
 
 def has_patch_match() -> bool:
     """Whether this pycolmap can run PatchMatch."""
-    import pycolmap
+    from gvtools.colmap import pycolmap
 
     return bool(pycolmap.has_cuda)
 
@@ -62,8 +62,9 @@ class ColmapPatchMatch:
         return DepthMap(trusted.depth, trusted.confidence, self.name)
 
     def _run(self, folder: Path) -> dict[str, NDArray[np.float32]]:
-        import pycolmap
         from PIL import Image
+
+        from gvtools.colmap import pycolmap
 
         write_workspace(folder, self._scene, self.views)
         for name in self.views:

@@ -156,7 +156,7 @@ class _Matched:
 
 def _match(pictures: Sequence[PosedPicture], folder: Path, seed: int) -> _Matched:
     """Extract features, where no mask is False, and match every pair; the poses play no part."""
-    import pycolmap
+    from gvtools.colmap import pycolmap
 
     names = write_pictures(((picture.rgb, picture.mask) for picture in pictures), folder)
     (folder / "model").mkdir()
@@ -241,7 +241,7 @@ def _triangulate(
     pictures: Sequence[PosedPicture], folder: Path, *, limit: float, seed: int
 ) -> pycolmap.Reconstruction:
     """Triangulate the verified matches; poses and intrinsics stay as they are."""
-    import pycolmap
+    from gvtools.colmap import pycolmap
 
     poses = np.concatenate([picture.camera.cam_from_world for picture in pictures])
     model = posed_model(folder / "database.db", poses)

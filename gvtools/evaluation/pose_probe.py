@@ -59,7 +59,7 @@ def absolute_pose(
     pose of the smallest share of inliers would have been met; below 0.1 there are at most 10,000.
     None when no four matches agree on a pose.
     """
-    import pycolmap
+    from gvtools.colmap import pycolmap
 
     if len(xy) < LEAST:
         return None

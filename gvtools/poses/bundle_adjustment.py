@@ -222,7 +222,7 @@ def _triangulate(
     frames: Sequence[Frame], cameras: Cameras, work: Path
 ) -> pycolmap.Reconstruction | None:
     """Points of the pictures' features, and poses adjusted to them; None where hardly any match."""
-    import pycolmap
+    from gvtools.colmap import pycolmap
 
     names = write_pictures(((frame.rgb, frame.mask) for frame in frames), work)
     images, database = work / "images", work / "database.db"
@@ -270,7 +270,7 @@ def _model(cameras: Cameras, tracks: Tracks) -> pycolmap.Reconstruction:
 
 def _solve(model: pycolmap.Reconstruction, error: float | None) -> None:
     """Adjust poses and points, then drop points beyond ``error`` px; None: points alone move."""
-    import pycolmap
+    from gvtools.colmap import pycolmap
 
     options = pycolmap.BundleAdjustmentOptions()
     fix_cameras(options)

@@ -39,7 +39,7 @@ def extract_sift(
     where no feature may be; ``first_octave`` -1 doubles pictures before, 0 takes a quarter of the
     time.
     """
-    import pycolmap
+    from gvtools.colmap import pycolmap
 
     options = pycolmap.FeatureExtractionOptions()
     options.max_image_size = side
@@ -63,7 +63,7 @@ def list_pairs(pairs: Sequence[tuple[str, str]], work: Path) -> Path:
 
 def verification() -> pycolmap.TwoViewGeometryOptions:
     """COLMAP's options of verifying matches, the same every time."""
-    import pycolmap
+    from gvtools.colmap import pycolmap
 
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed = SEED
@@ -79,7 +79,7 @@ def fix_cameras(options: pycolmap.BundleAdjustmentOptions) -> None:
 
 def adjust(model: pycolmap.Reconstruction, options: pycolmap.BundleAdjustmentOptions) -> None:
     """Bundle-adjust all registered pictures, silently, unlike pycolmap.bundle_adjustment."""
-    import pycolmap
+    from gvtools.colmap import pycolmap
 
     options.print_summary = False
     pycolmap.ObservationManager(model).filter_observations_with_negative_depth()
@@ -116,7 +116,7 @@ def row_of(image: pycolmap.Image) -> int:
 
 def set_intrinsics(database: Path, K: NDArray[np.float64]) -> None:
     """Give the cameras of the pictures, PINHOLE, their known intrinsics (V, 3, 3)."""
-    import pycolmap
+    from gvtools.colmap import pycolmap
 
     with pycolmap.Database.open(database) as opened:
         for image in opened.read_all_images():
@@ -128,7 +128,7 @@ def set_intrinsics(database: Path, K: NDArray[np.float64]) -> None:
 
 def posed_model(database: Path, cam_from_world: NDArray[np.float64]) -> pycolmap.Reconstruction:
     """A model without points of the pictures at known poses (V, 4, 4), with their keypoints."""
-    import pycolmap
+    from gvtools.colmap import pycolmap
 
     model = pycolmap.Reconstruction()
     with pycolmap.Database.open(database) as opened:

@@ -278,7 +278,7 @@ class _Task:
 
     def _by_features(self, scale: float, level: float, *, outward: bool) -> Float64 | None:
         """A placement by matched features with about this scale; None if none is found."""
-        import pycolmap
+        from gvtools.colmap import pycolmap
 
         if self._left <= 0:
             return None

@@ -310,7 +310,7 @@ def load_model(folder: Path, *, faces: bool = False) -> ColmapModel:
 
 
 def _read(files: ModelFiles) -> pycolmap.Reconstruction:
-    import pycolmap
+    from gvtools.colmap import pycolmap
 
     reconstruction = pycolmap.Reconstruction()
     try:
@@ -505,7 +505,7 @@ def build_reconstruction(
     xy: NDArray[np.float64],
 ) -> pycolmap.Reconstruction:
     """The model in memory; see ``write_colmap``."""
-    import pycolmap
+    from gvtools.colmap import pycolmap
 
     model = pycolmap.Reconstruction()
     camera_ids = _add_cameras(model, cameras)
@@ -537,7 +537,7 @@ def build_reconstruction(
 
 
 def _add_cameras(model: pycolmap.Reconstruction, cameras: Cameras) -> list[int]:
-    import pycolmap
+    from gvtools.colmap import pycolmap
 
     known: dict[tuple[float, ...], int] = {}
     ids = []

@@ -293,7 +293,7 @@ def _fisheye_faces(camera: pycolmap.Camera, limit: float) -> tuple[Face, ...]:
 def _pinhole(
     focal: float, size: tuple[int, int], principal: tuple[float, float]
 ) -> pycolmap.Camera:
-    import pycolmap
+    from gvtools.colmap import pycolmap
 
     return pycolmap.Camera(
         model="PINHOLE", width=size[0], height=size[1], params=[focal, focal, *principal]

@@ -160,7 +160,7 @@ def undistortion(
 
     ``what`` says where the camera was read, for messages.
     """
-    import pycolmap
+    from gvtools.colmap import pycolmap
 
     camera = camera_of(model, params, size, what=what)
     if not camera.is_perspective():
@@ -187,7 +187,7 @@ def camera_of(
     model: str, params: Sequence[float] | NDArray[np.float64], size: tuple[int, int], *, what: str
 ) -> pycolmap.Camera:
     """A camera of COLMAP from its model's name, parameters and size, checked."""
-    import pycolmap
+    from gvtools.colmap import pycolmap
 
     if model not in pycolmap.CameraModelId.__members__ or model == "INVALID":
         raise ProjectError(

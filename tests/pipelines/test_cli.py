@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import resource
 import shutil
 import subprocess
@@ -16,6 +17,7 @@ from command_line import refused
 from PIL import Image
 from tiny_scan import write_scan
 
+import gvtools
 from gvtools.cameras import Cameras
 from gvtools.errors import GvError
 from gvtools.scenes.colmap_model import write_colmap
@@ -217,3 +219,27 @@ def test_names_that_a_console_cannot_show_are_escaped(scan, tmp_path):
         check=False,
     )  # fmt: skip
     assert run.returncode == 0 and "K\\xfcche" in run.stdout and not run.stderr
+
+
+@pytest.mark.parametrize("before", ["", "from gvtools.colmap import pycolmap;"])
+def test_a_termination_is_one_line_and_143(before):
+    code = (
+        "import os, signal, sys;"
+        "from pipelines import cli;"
+        "from pipelines.commands import data;"
+        f"data.ListData.run = data.CheckCommand.run = lambda *_: exec("
+        f"'{before}os.kill(os.getpid(), signal.SIGTERM)');"
+        "sys.exit(cli.main(['check', '.']))"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert run.returncode == 143
+    assert run.stderr.startswith("gvtools: terminated; ") and run.stderr.count("\n") == 1
+
+
+def test_pycolmap_is_imported_in_one_place():
+    root = Path(gvtools.__file__).parents[1]
+    for package in ("gvtools", "pipelines", "viz"):
+        for file in (root / package).rglob("*.py"):
+            text = file.read_text(encoding="utf-8").split("if TYPE_CHECKING:")[0]
+            if file != root / "gvtools" / "colmap.py":
+                assert not re.search(r"^\s*import pycolmap$", text, re.M), file

@@ -119,7 +119,7 @@ class AriaLens(Undistortion):
 
 def aria_lens(params: Sequence[float], size: tuple[int, int], radius: float) -> AriaLens:
     """The lens of Aria's FISHEYE624 parameters, pixels, whose first pixel's centre is (0, 0)."""
-    import pycolmap
+    from gvtools.colmap import pycolmap
 
     focal, cx, cy, *distortion = params
     fisheye = (focal, focal, cx + 0.5, cy + 0.5, *distortion)
