@@ -20,7 +20,7 @@ evaluation. Its depth is not read: the files do not say whether it is along the 
 
 Names are compared in lower case, without the file extension, without folders where that finds more
 partners, and without a prefix or suffix that most pictures share (``generated_NAME.png``,
-``NAME.rgb.png``). By order, both are sorted naturally by name (2 before 10).
+``NAME.rgb.png``) or that all views do. By order, both are sorted naturally by name (2 before 10).
 """
 
 from __future__ import annotations
@@ -70,6 +70,7 @@ def match_pictures(
     pictures: Sequence[str],
     views: Sequence[str],
     *,
+    others: Sequence[str] = (),
     rule: str = "auto",
     alphabetical: bool = False,
     what: str = "pictures",
@@ -78,6 +79,7 @@ def match_pictures(
 
     Args:
         views: names of the views that are to be judged.
+        others: of the project's other views; pictures named like those stand for none by order.
         rule: "name", "order", or "auto": by name where any name matches, by order where none does
             and there are as many pictures as views.
         alphabetical: whether numbers in the pictures' names count the views in alphabetical order
@@ -95,8 +97,17 @@ def match_pictures(
     by_name = rule == "name" or (rule == "auto" and not alphabetical)
     partners: list[int | None] = [None] * len(views)
     if by_name:
-        partners = _by_name(pictures, views, what)
+        partners = _by_name(pictures, views, what, others=others)
     found = sum(number is not None for number in partners)
+    if rule == "auto" and by_name and not found and others:
+        like = [i for i in _by_name(pictures, others, what) if i is not None]
+        if like:
+            raise OptionError(
+                f"{what}: {len(like)} of {len(pictures)} pictures (such as {pictures[like[0]]!r}) "
+                f"are named like views that are not judged, none like the {len(views)} that are (first "
+                f"{views[0]!r}); give those views' pictures or their --targets, or, if the names "
+                "count the views, --match order"
+            )
     if rule == "name" and not found:
         raise OptionError(
             f"{what}: none of {len(pictures)} pictures (first {pictures[0]!r}) is named like one "
@@ -130,18 +141,21 @@ def _natural_order(names: Sequence[str]) -> list[int]:
     return sorted(range(len(names)), key=lambda number: natural_key(names[number]))
 
 
-def _by_name(pictures: Sequence[str], views: Sequence[str], what: str) -> list[int | None]:
+def _by_name(
+    pictures: Sequence[str], views: Sequence[str], what: str, *, others: Sequence[str] = ()
+) -> list[int | None]:
     """For each view the index of the picture with its name, with or without folders; or None.
 
-    Of both, what finds most partners is taken.
+    Of both, and of names without what all views share, what finds most partners is taken.
     """
     tried: list[list[list[int]]] = [[[] for _ in views]]
     for view_folders in (True, False):
-        view_keys = [_key(name, folders=view_folders) for name in views]
-        if len(set(view_keys)) == len(view_keys):
-            for folders in (True, False):
-                keys = [_key(name, folders=folders) for name in pictures]
-                tried.append(_partners(keys, view_keys))
+        whole = [_key(name, folders=view_folders) for name in (*views, *others)]
+        for view_keys in (whole[: len(views)], _without_affixes(whole)[: len(views)]):
+            if len(set(view_keys)) == len(view_keys):
+                for folders in (True, False):
+                    keys = [_key(name, folders=folders) for name in pictures]
+                    tried.append(_partners(keys, view_keys))
     best = max(tried, key=lambda lists: sum(bool(numbers) for numbers in lists))
     for view, numbers in zip(views, best, strict=True):
         if len(numbers) > 1:
@@ -151,6 +165,23 @@ def _by_name(pictures: Sequence[str], views: Sequence[str], what: str) -> list[i
                 "give a folder with one picture a view"
             )
     return [numbers[0] if numbers else None for numbers in best]
+
+
+def _without_affixes(names: Sequence[str]) -> list[str]:
+    """Names without the words that all of them begin or end with.
+
+    >>> _without_affixes(["a-001.color", "a-012.color"])
+    ['001', '012']
+    """
+    cuts = []
+    for texts in (names, [name[::-1] for name in names]):
+        low, high = min(texts), max(texts)
+        shared = low[: next((i for i, sign in enumerate(low) if high[i] != sign), len(low))]
+        words = re.sub("[0-9]+$", "", shared)
+        if not all(text[len(words) : len(words) + 1].isdecimal() for text in texts):
+            words = re.sub("[a-z0-9]+$", "", shared)
+        cuts.append(len(words))
+    return [name[cuts[0] : len(name) - cuts[1]] or name for name in names]
 
 
 def _partners(pictures: Sequence[str], views: Sequence[str]) -> list[list[int]]:

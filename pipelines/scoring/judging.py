@@ -64,7 +64,7 @@ def judge(
 
     def measure(given: tuple[Path, str]) -> Record:
         path, name = given
-        method = open_method(path, name, targets, rule=rule)
+        method = open_method(path, name, targets, rule=rule, others=reference.others)
         if "consistency" in options.parts:
             # Pictures without depth get the memory's.
             method = replace(method, targets=reference.with_surfaces(method.targets))

@@ -71,6 +71,15 @@ class JudgeReference:
         """The targets with the run's own pictures, or the memory's where cameras were given."""
         return run_targets(self.run) if self.cameras is None else self._projected(self.cameras)
 
+    @property
+    def others(self) -> tuple[str, ...]:
+        """Names of the project's views that are not judged."""
+        if self.cameras is not None:
+            return ()
+        judged = {target.picture.name for target in self.targets}
+        scene, truths = self.run.scenes
+        return tuple(name for name in (truths or scene).names if name not in judged)
+
     def with_surfaces(self, targets: Sequence[MeasuredTarget]) -> list[MeasuredTarget]:
         """The targets, those whose picture has no depth of its own with the memory's."""
         return [t if t.picture.depth is not None else self._with_surface(t) for t in targets]
@@ -202,7 +211,12 @@ def method_names(paths: Sequence[Path], names: Sequence[str]) -> list[str]:
 
 
 def open_method(
-    path: Path, name: str, targets: Sequence[MeasuredTarget], *, rule: str
+    path: Path,
+    name: str,
+    targets: Sequence[MeasuredTarget],
+    *,
+    rule: str,
+    others: Sequence[str] = (),
 ) -> MethodPictures:
     """The pictures of a run of gvtools, or those that ``open_pictures`` reads, for the targets.
 
@@ -211,7 +225,12 @@ def open_method(
     pictures = _run_pictures(path) if (path / RECORD).is_file() else open_pictures(path)
     views = [target.picture.name for target in targets]
     matching = match_pictures(
-        pictures.names, views, rule=rule, alphabetical=pictures.alphabetical, what=str(path)
+        pictures.names,
+        views,
+        others=others,
+        rule=rule,
+        alphabetical=pictures.alphabetical,
+        what=str(path),
     )
     matched, resized = [], dict[tuple[int, int], int]()
     for target, number in zip(targets, matching.picture_of, strict=True):

@@ -286,3 +286,21 @@ def test_what_is_not_clear_is_refused(pictures, message):
 def test_a_rule_that_finds_nothing_is_refused():
     with pytest.raises(OptionError, match="--match order"):
         match_pictures(["p.png"], ["a.jpg"], rule="name")
+
+
+def test_pictures_named_like_other_views_are_refused():
+    others, views = ["k-001.color.png", "k-003.color.png"], ["k-002.color.png", "k-004.color.png"]
+    for names in (others, ["001.png", "003.png"], ["gen_k-001.jpg", "gen_k-003.jpg"]):
+        with pytest.raises(
+            OptionError, match=r"named like views that are not judged.*--match order"
+        ):
+            match_pictures(names, views, others=others)
+        assert match_pictures(names, views, others=others, rule="order").picture_of == (0, 1)
+    assert match_pictures(["x.png", "y.png"], views, others=others).rule == "order"
+
+
+@pytest.mark.parametrize("form", ["{}.png", "gen_{}.jpg", "k-{}.rgb.png"])
+def test_affixes_that_views_share_are_stripped(form):
+    views = ["cam/k-012.color.png", "cam/k-004.color.png", "cam/k-001.color.png"]
+    found = match_pictures([form.format(n) for n in ("001", "012")], views)
+    assert (found.rule, found.picture_of) == ("name", (1, None, 0))
