@@ -31,7 +31,7 @@ from gvtools.guidance import Guidance
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.splat.api import SplatOptions
 from gvtools.optional import require
-from gvtools.runs.run import load_appearance, load_memory
+from gvtools.runs.run import at_run_poses, load_appearance, load_memory
 from gvtools.runs.target_files import to_bytes, write_png
 from gvtools.scenes.scene import Frame
 from gvtools.trajectories import PATHS, named_path
@@ -165,18 +165,21 @@ QUALITY = 18
 WEBP_QUALITY = 80
 
 
-def film_cameras(memory: SpatialMemory, path: str, *, width: int | None = None) -> Cameras:
+def film_cameras(
+    memory: SpatialMemory, path: str, *, width: int | None = None, run: Path | None = None
+) -> Cameras:
     """The cameras of a film's frames, all of one even size, as video coders need it.
 
     Args:
         memory: ``orbit`` and the like are computed from its observed views; the first of these
             gives intrinsics and size to paths that have none.
         width: of the frames, pixels; None keeps the cameras' width.
+        run: whose refined poses the views of a project take.
     """
     views = [view.camera for view in memory.views.photographed]
     if not views:
         raise OptionError("a memory without observed views; give a run or its memory.npz")
-    cameras = _path_cameras(memory, concatenate(views), path)
+    cameras = _path_cameras(memory, concatenate(views), path, run=run)
     first = cameras[0]
     columns, rows = int(first.width[0]), int(first.height[0])
     if (cameras.width != columns).any() or (cameras.height != rows).any():
@@ -194,7 +197,9 @@ def film_cameras(memory: SpatialMemory, path: str, *, width: int | None = None) 
     return cameras.cropped(0, 0, width=columns // 2 * 2, height=rows // 2 * 2)
 
 
-def _path_cameras(memory: SpatialMemory, captured: Cameras, path: str) -> Cameras:
+def _path_cameras(
+    memory: SpatialMemory, captured: Cameras, path: str, *, run: Path | None
+) -> Cameras:
     name, _, count = path.partition(":")
     if name in PATHS:
         if count and not (count.isdecimal() and int(count) >= 1):
@@ -224,6 +229,7 @@ def _path_cameras(memory: SpatialMemory, captured: Cameras, path: str) -> Camera
         from gvtools.scenes.project import open_project
 
         scene = open_project(Path(place))
+        scene = scene if run is None else at_run_poses(scene, run)[0]
         return scene.subset(select(scene.names, selection if at else "all")).cameras
     from gvtools.trajectory_files import read_trajectory
 

@@ -104,9 +104,8 @@ def match_pictures(
         if like:
             raise OptionError(
                 f"{what}: {len(like)} of {len(pictures)} pictures (such as {pictures[like[0]]!r}) "
-                f"are named like views that are not judged, none like the {len(views)} that are (first "
-                f"{views[0]!r}); give those views' pictures or their --targets, or, if the names "
-                "count the views, --match order"
+                f"are named like views that are not judged, and none like one that is (such as "
+                f"{views[0]!r}); give those views' pictures, or, where names count, --match order"
             )
     if rule == "name" and not found:
         raise OptionError(

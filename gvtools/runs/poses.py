@@ -26,6 +26,8 @@ class RunPoses:
     targets: NDArray[np.float64]
     # Whether features determined them, to a fraction of a pixel.
     by_features: bool = False
+    # Typical, scene units, where other cameras err like the context near them; else 0.
+    depth: float = 0.0
 
     def save(self, path: Path) -> None:
         """Write them into one file."""
@@ -39,6 +41,7 @@ class RunPoses:
             "context_poses": self.context,
             "target_poses": self.targets,
             "poses_by_features": self.by_features,
+            "poses_depth": self.depth,
         }
 
     @classmethod
@@ -51,7 +54,8 @@ class RunPoses:
             context, targets = (
                 _rigid(data[name], name) for name in ("context_poses", "target_poses")
             )
-            poses = cls(context, targets, bool(data.get("poses_by_features", False)))
+            by_features, depth = data.get("poses_by_features", False), data.get("poses_depth", 0.0)
+            poses = cls(context, targets, bool(by_features), float(depth))
         except (*UNREADABLE, ShapeError) as error:
             raise MemoryFileError(
                 f"{path}: expected refined poses; found none: {error}; start the run again with "

@@ -15,6 +15,7 @@ from pydantic import BaseModel, Field, ValidationError, model_validator
 from gvtools.cameras import Cameras, rigid_transform
 from gvtools.errors import MemoryFileError, OptionError, ProjectError, ShapeError
 from gvtools.memory.files import INDEX
+from gvtools.poses.motions import mean_near, motions_between, move_pose
 from gvtools.runs.digests import check_sums
 from gvtools.runs.folder import RunDirectory
 from gvtools.runs.layout import (
@@ -39,6 +40,10 @@ if TYPE_CHECKING:
 
 # How often a run is read anew whose memory was replaced meanwhile.
 ATTEMPTS = 5
+
+
+# Refinement turns no camera by more [rad]; other poses of the same names are another project's.
+FARTHEST_TURN = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,6 +173,41 @@ def load_run(path: Path | str, *, project: Path | None = None) -> Run:
     path = Path(path)
     check_sums(path, [METRICS] if (path / METRICS).is_file() else [])
     return Run(path, read_record(path), read_reports(path), project)
+
+
+def at_run_poses(scene: Scene, run: Path) -> tuple[Scene, str]:
+    """A scene at the poses of a run of it, and what was done; "" where the run has no own poses.
+
+    ``run`` is a run's folder or the memory in it. Views that it did not have move like its context
+    near them, where cameras err alike there.
+    """
+    folder = run if run.is_dir() else run.parent
+    poses = refined_poses_of(folder) if (folder / RECORD).is_file() else None
+    if poses is None:
+        return scene, ""
+    record = read_record(folder)
+    context, held = record["context"], record["targets"]
+    held = held if record["targets_kind"] == "hold-out" else []
+    motions = None
+    if set(context) <= set(scene.names):
+        given = scene.subset(context).cameras.cam_from_world
+        motions = motions_between(given, poses.context)
+    if motions is None or np.linalg.norm(motions[:, 3:], axis=1).max() > FARTHEST_TURN:
+        return scene, f"poses: as given; the run's own are refined, but not for {scene.root}"
+    others = [name for name in scene.names if name not in {*context, *held}]
+    moved = with_poses(scene, context, poses.context)
+    if held:
+        moved = with_poses(moved, held, poses.targets)
+    how = "stay as given"
+    if poses.depth:
+        how = "moved like the context near them"
+        near = [
+            move_pose(pose, mean_near(pose, given, motions, depth=poses.depth))
+            for pose in (scene[name].camera.cam_from_world[0] for name in others)
+        ]
+        moved = with_poses(moved, others, np.array(near).reshape(-1, 4, 4))
+    rest = f"; {len(others)} views that it did not have {how}" if others else ""
+    return moved, f"poses: as refined by the run{rest}"
 
 
 def load_growing_run(path: Path, *, project: Path | None = None) -> Run:

@@ -57,7 +57,7 @@ class RenderCommand(LpipsArguments, SceneArguments):
     def run(self, console: Console) -> None:
         from gvtools.files import write_json
         from gvtools.runs.layout import file_stems
-        from gvtools.runs.run import load_appearance, load_memory
+        from gvtools.runs.run import at_run_poses, load_appearance, load_memory
         from gvtools.scenes.selection import select
         from pipelines.rendering import measure, render_view, summary, write_view
 
@@ -70,6 +70,12 @@ class RenderCommand(LpipsArguments, SceneArguments):
         if not len(memory.views):
             raise OptionError(f"{self.memory}: {EMPTY}")
         cameras, scene = _cameras(self, memory)
+        poses = ""
+        if scene is not None:
+            scene, poses = at_run_poses(scene, self.memory)
+            cameras = scene.cameras
+            if poses:
+                console.line(poses)
         if self.against_images and scene is None:
             raise OptionError(
                 f"--against-images: {self.cameras} is a trajectory without pictures; give a project"
@@ -90,6 +96,8 @@ class RenderCommand(LpipsArguments, SceneArguments):
                 write_view(self.out, stems[name], guidance)
             views.append(measure(name, guidance, frame, seconds=seconds, lpips=lpips))
         figures = summary(views, compared=self.against_images, no_lpips=no_lpips)
+        if poses:
+            figures["poses"] = poses
         if self.json_ is not None:
             write_json(self.json_, figures)
         else:
@@ -183,7 +191,7 @@ class FilmCommand(Arguments):
         memory = load_memory(self.memory, up_to=self.round)
         if not len(memory):
             raise OptionError(f"{self.memory}: {EMPTY}")
-        cameras = film_cameras(memory, self.path, width=self.width)
+        cameras = film_cameras(memory, self.path, width=self.width, run=self.memory)
         rounds = memory.rounds if self.growth else (self.round,)
         del memory
         start, projecting = time.perf_counter(), 0.0

@@ -566,5 +566,9 @@ def _fitted(fits: Sequence[Fit], plan: Plan, earlier: Fitted | None) -> Fitted:
         return replace(fitted, poses=earlier.poses, spread=earlier.spread)
     given = frame.cam_from_local(plan.targets.cameras.cam_from_world)
     targets = np.array([cameras.corrected(pose) for pose in given]).reshape(-1, 4, 4)
-    poses = RunPoses(frame.cam_from_world(cameras.poses()), frame.cam_from_world(targets))
+    poses = RunPoses(
+        frame.cam_from_world(cameras.poses()),
+        frame.cam_from_world(targets),
+        depth=cameras.depth if cameras.spread else 0.0,
+    )
     return replace(fitted, poses=poses, spread=cameras.spread)

@@ -256,6 +256,7 @@ def refined_poses_of(
         frame.cam_from_world(result.poses),
         frame.cam_from_world(np.array(moved).reshape(-1, 4, 4)),
         result.by_features,
+        result.depth if result.spread else 0.0,
     )
 
 

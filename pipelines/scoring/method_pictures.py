@@ -92,6 +92,8 @@ class JudgeReference:
     @property
     def poses(self) -> str:
         """Whose the poses of the targets and the context are."""
+        if self.cameras is not None and refined_poses_of(self.run.path) is not None:
+            return f"as given in {self.cameras}; the context's refined by the run"
         return "recorded" if refined_poses_of(self.run.path) is None else "refined by the run"
 
     def context(self) -> list[PosedPicture]:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import run_command
 from run_files import Killed, kill_after_round_0, reconstructed, results
 from tiny_scan import world_from_cam, write_scan
 
@@ -14,7 +17,7 @@ from gvtools.errors import MemoryFileError
 from gvtools.poses.motions import move_pose
 from gvtools.procedural.noisy_room import jitter_poses
 from gvtools.runs.poses import RunPoses
-from gvtools.runs.run import load_run
+from gvtools.runs.run import at_run_poses, load_run
 from gvtools.scenes.project import open_project
 from pipelines.reconstruction import prepare
 
@@ -117,3 +120,30 @@ def test_a_world_whose_origin_is_far_away_is_refined_as_well(scan, whole, tmp_pa
     kept, near = (RunPoses.load(run / POSES) for run in (run(far, tmp_path / "run"), whole))
     assert kept is not None and near is not None
     np.testing.assert_allclose(kept.context[:, :3, :3], near.context[:, :3, :3], atol=1e-5)
+
+
+@pytest.mark.parametrize("depth", [0.0, 2.0])
+def test_the_project_of_a_run_is_seen_at_its_refined_poses(scan, whole, tmp_path, depth):
+    copy = tmp_path / "run"
+    shutil.copytree(whole, copy)
+    scene = open_project(scan)
+    extra = replace(scene.views[3], name="z.png")
+    scene = replace(scene, views=(*scene.views, extra))
+    given = scene.cameras.cam_from_world
+    shift = np.eye(4)
+    shift[:3, 3] = (0.01, 0.02, -0.03)
+    RunPoses(shift @ given[:8], given[8:10], depth=depth).save(copy / POSES)
+    moved, said = at_run_poses(scene, copy)
+    np.testing.assert_allclose(moved.cameras.cam_from_world[:8], shift @ given[:8], atol=1e-12)
+    expected = shift @ given[10] if depth else given[10]
+    np.testing.assert_allclose(moved.cameras.cam_from_world[10], expected, atol=1e-9)
+    assert ("moved like" if depth else "1 views that it did not have stay as given") in said
+    assert at_run_poses(moved, copy / "memory.npz")[1] == said
+    other = replace(scene, views=scene.views[5:])
+    assert at_run_poses(other, copy) == (
+        other,
+        f"poses: as given; the run's own are refined, but not for {scene.root}",
+    )
+    out = tmp_path / "out.json"
+    run_command("render", copy, "--cameras", scan, "--against-images", "--json", out, quiet=True)
+    assert "as refined by the run" in json.loads(out.read_text())["poses"]
