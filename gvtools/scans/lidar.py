@@ -207,6 +207,8 @@ def _e57_chunks(file: Any, index: int, pose: NDArray[np.float64]) -> Iterator[Ch
             low, high = limits
             share = np.clip((rgb - low) / np.maximum(high - low, 1e-12), 0, 1)
             colors = np.rint(255 * np.nan_to_num(share)).astype(np.uint8)
+            if not header.node.isDefined("colorLimits"):
+                colors = rgb  # the whole scan tells their range
         chunk = Chunk(positions, colors, columns.get(INTENSITY), index)
         state = columns.get(INVALID[axes])
         yield chunk if state is None else chunk.without(state != 0, "invalid")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,8 +30,8 @@ class Chunk:
     """Some points of a file."""
 
     positions: NDArray[np.float64]  # (N, 3) float64, the file's frame and unit; may hold NaN
-    # (N, 3) uint8, or uint16 if the file may mean 8 or 16 bits; None without colours
-    colors: NDArray[np.uint8] | NDArray[np.uint16] | None = None
+    # (N, 3) of any type, whose range the whole scan tells; None without colours
+    colors: NDArray[Any] | None = None
     intensity: NDArray[np.float32] | None = None  # (N,) float32, any unit; None without intensity
     station: int = 0  # index into the file's stations
     # number of points that the file itself marks as unusable, by reason
@@ -74,6 +75,7 @@ class Scan:
     colored_by: str  # source of the colours: "colour", "intensity" (grey) or "nothing" (one grey)
     count: int  # number of points in the file
     dropped: dict[str, int]  # number of points of the file that are left out, by reason
+    color_range: str = ""  # what was decided of the colours' range, where their type does not tell
 
     def __len__(self) -> int:
         return len(self.positions)

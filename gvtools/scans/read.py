@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.errors import GvError, MemoryFileError, OptionError
+from gvtools.ranges import CLOUD_OUTLIERS, OF_CLOUDS, said_of, to_bytes, white_of
 from gvtools.scans.lidar import open_lidar
 from gvtools.scans.points import Chunk, Scan, ScanFile
 from gvtools.scans.tables import open_pcd, open_ply
@@ -59,10 +60,10 @@ def read_scan(path: Path, *, most: int = MOST_POINTS, generated: bool = False) -
     held = reading.whole()
     if held is None:
         raise MemoryFileError(f"{path}: none of its {file.count} points is usable; expected some")
-    colors, colored_by = _colors(held)
+    colors, colored_by, color_range = _colors(held)
     return Scan(
         path.name, reading.origin, held["positions"], colors, held["station"], file.stations,
-        colored_by, file.count, dict(reading.dropped),
+        colored_by, file.count, dict(reading.dropped), color_range,
     )  # fmt: skip
 
 
@@ -152,17 +153,14 @@ class _Reading:
         self._held = len(first)
 
 
-def _colors(held: dict[str, NDArray[Any]]) -> tuple[NDArray[np.uint8], str]:
-    """(N, 3) colours, and what they are made from; black ones throughout were not recorded."""
-    colors = held["colors"]
+def _colors(held: dict[str, NDArray[Any]]) -> tuple[NDArray[np.uint8], str, str]:
+    """(N, 3) colours, what they are made from (black ones were not recorded), and their range."""
+    colors, said = held["colors"], ""
     if colors.any():
-        if colors.dtype == np.uint16:
-            # LAS means 16 bits; some programs write 8.
-            eight = int(colors.max()) <= 255
-            colors = (colors if eight else colors >> 8).astype(np.uint8)
-        rgb, by = colors, "colour"
+        white = white_of(colors, tops=OF_CLOUDS, outliers=CLOUD_OUTLIERS)
+        rgb, by, said = to_bytes(colors, white), "colour", said_of(colors.dtype, white)
         if held["with_color"].all():
-            return rgb, by
+            return rgb, by, said
     else:
         rgb, by = np.zeros((len(colors), 3), np.uint8), "nothing"
     bare = ~held["with_color"] if by == "colour" else np.ones(len(rgb), np.bool_)
@@ -176,4 +174,4 @@ def _colors(held: dict[str, NDArray[Any]]) -> tuple[NDArray[np.uint8], str]:
         grey = np.full(len(intensity), GREY, np.uint8)
     rgb = rgb.copy()
     rgb[bare] = grey[:, None]
-    return rgb, by
+    return rgb, by, said

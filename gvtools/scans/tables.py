@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from gvtools.errors import MemoryFileError
 from gvtools.kernels import compiled
 from gvtools.ply import point_vertices, read_header
+from gvtools.ranges import color_names
 from gvtools.scans.points import CHUNK, GENERATED, Chunk, ScanFile, Station
 
 # A number and what parts it from the next one; what one takes at most.
@@ -22,8 +23,7 @@ LEAST_TEXT, MOST_TEXT = 2, 64
 CHUNK_BYTES = 1 << 26
 Columns = Mapping[str, NDArray[Any]]
 
-# Names that programs give to the colour, and to how much light came back, the usual first.
-COLORS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
+# Names that programs give to how much light came back, the usual first.
 INTENSITIES = ("intensity", "scalar_Intensity", "scalar_intensity", "reflectance")
 
 MAX_HEADER = 1 << 13
@@ -34,6 +34,8 @@ SIZES = ("1", "2", "4", "8")
 # What is read of a compressed file's fields, and how much they unpack to at most: LZF makes no more
 # than 88 bytes of one, and of points about two.
 READ = ("x", "y", "z", "rgb", "rgba", "intensity")
+# What Gaussians have for a colour, less 0.5 and over the factor, and for how opaque they are.
+SPLATS, HARMONIC = ("f_dc_0", "f_dc_1", "f_dc_2", "opacity"), 0.28209479177387814
 MOST_RATIO, MOST_BYTES = 88, 1 << 31
 
 
@@ -131,18 +133,35 @@ def open_ply(path: Path) -> ScanFile:
 
 
 def _ply_chunk(columns: Columns, kinds: Mapping[str, np.dtype[Any]]) -> Chunk:
-    colors = None
-    for names in COLORS:
-        if colors is None and set(names) <= set(columns):
-            # Integers by the range of their type, others from 0 to 1.
-            kind = kinds[names[0]]
-            top = float(np.iinfo(kind).max) if kind.kind in "ui" else 1.0
-            rgb = np.stack([columns[name].astype(np.float32) for name in names], axis=1)
-            scaled = np.clip(np.nan_to_num(rgb) * (255 / top), 0, 255)
-            colors = np.rint(scaled).astype(np.uint8)
+    if {*SPLATS} <= {*columns}:
+        return _splat_chunk(columns)
+    colors = _stored_colors(columns, kinds)
     intensity = next((columns[n].astype(np.float32) for n in INTENSITIES if n in columns), None)
     chunk = Chunk(_positions(columns), colors, intensity)
     return chunk.without(columns[GENERATED] != 0, GENERATED) if GENERATED in columns else chunk
+
+
+def _splat_chunk(columns: Columns) -> Chunk:
+    """The centres of Gaussians that are rather opaque, in the colour that they have all around."""
+    shade = np.stack([columns[name] for name in SPLATS[:3]], axis=1) * HARMONIC + 0.5
+    colors = np.rint(np.clip(np.nan_to_num(shade), 0, 1) * 255).astype(np.uint8)
+    chunk = Chunk(_positions(columns), colors)
+    return chunk.without(~(columns[SPLATS[3]] > 0), "transparent Gaussians")
+
+
+def _stored_colors(columns: Columns, kinds: Mapping[str, np.dtype[Any]]) -> NDArray[Any] | None:
+    """(N, 3) colours of separate channels, as they are stored; the whole scan tells their range."""
+    names = color_names(columns)
+    if not names or any(columns[name].ndim > 1 for name in names):
+        return None
+    kind = kinds[names[0]]
+    rgb = np.stack([columns[name] for name in names], axis=1)
+    if kind.kind == "f":
+        return rgb.astype(np.float32)
+    whole = np.nan_to_num(rgb).astype(np.int64)
+    if kind.itemsize == 1:  # bytes may be declared as signed
+        return (whole & 255).astype(np.uint8)
+    return whole.clip(0, 65535).astype(np.uint16) if kind.itemsize == 2 else whole
 
 
 def _positions(columns: Columns) -> NDArray[np.float64]:
@@ -171,6 +190,8 @@ def _pcd_chunk(columns: Columns, dtype: np.dtype[np.void]) -> Chunk:
             bits = columns[name].astype(np.int64).astype(np.uint32)
         rgb = np.stack([(bits >> shift) & 255 for shift in (16, 8, 0)], axis=1)
         colors = rgb.astype(np.uint8)
+    else:
+        colors = _stored_colors(columns, {name: dtype[name] for name in dtype.names or ()})
     intensity = columns["intensity"].astype(np.float32) if "intensity" in columns else None
     return Chunk(_positions(columns), colors, intensity)
 
@@ -252,8 +273,9 @@ def _unpack(path: Path, table: ScanTable) -> dict[str, NDArray[Any]]:
             "save it again"
         )
     columns = {}
-    for name in READ:
-        if name in (table.dtype.names or ()):
+    names = table.dtype.names or ()
+    for name in (*READ, *color_names(names)):
+        if name in names:
             kind, start = table.dtype.fields[name][:2]  # type: ignore[index]
             columns[name] = np.frombuffer(out, kind, table.count, offset=table.count * start)
     return columns

@@ -8,7 +8,7 @@ longer fit its camera.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +21,7 @@ from PIL import Image
 from gvtools.errors import ProjectError, ShapeError
 from gvtools.files import replaced_when_written
 from gvtools.optional import require
+from gvtools.ranges import PICTURE_OUTLIERS, WHOLE, to_bytes, white_of
 from gvtools.scenes.scene import Frame
 from gvtools.untrusted import (
     DAMAGED,
@@ -29,6 +30,7 @@ from gvtools.untrusted import (
     load_array,
     load_arrays,
     open_picture,
+    read_bytes,
     reading,
     regular,
 )
@@ -43,6 +45,7 @@ DEPTH_SATURATED = 65535  # "no reading" of Kinect-like 16-bit depth, besides 0
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".ppm")
 # Pillow's layouts of pixels with an alpha channel.
 WITH_ALPHA = ("RGBA", "LA", "PA", "RGBa", "La")
+SAMPLED = 8  # pictures that tell the range of a project's
 OPAQUE_FROM = 128  # an alpha at or above this counts as part of the picture
 
 _EXIF_ORIENTATION = 0x0112
@@ -75,14 +78,57 @@ def read_header(path: Path) -> ImageHeader:
         return ImageHeader(image.width, image.height, image.mode, orientation)
 
 
-def read_image(path: Path) -> Frame:
+def read_image(path: Path, *, white: float = 65535) -> Frame:
     """The picture at ``path`` as 8-bit RGB, with its alpha channel as a mask.
 
-    Grey is repeated over the channels, palettes are resolved, 16 bits a channel keep their upper
-    eight. EXIF orientation is not applied (see the module's text).
+    Grey is repeated over the channels, palettes are resolved, 16 bits a channel become eight, of
+    which full brightness is ``white``. EXIF orientation is not applied (see the module's text).
     """
     with _picture(path) as image:
+        if white != 65535 and _is_deep(image):
+            levels = to_bytes(_levels(path, image), white)
+            if levels.ndim == 3 and levels.shape[2] == 4:
+                mask = levels[..., 3] >= OPAQUE_FROM
+                return Frame(np.ascontiguousarray(levels[..., :3]), mask=mask)
+            rgb = levels if levels.ndim == 3 else np.repeat(levels[..., None], 3, axis=-1)
+            return Frame(rgb)
         return _decode(image, path)
+
+
+def _is_deep(image: Image.Image) -> bool:
+    """Whether a picture has 16 bits a channel, of which Pillow's layout keeps eight in colour."""
+    return image.mode.startswith("I;16") or ";16" in str(getattr(image, "tile", ""))
+
+
+def _levels(path: Path, image: Image.Image) -> NDArray[np.uint16]:
+    """(H, W) or (H, W, 3 or 4) of a picture with 16 bits a channel."""
+    if image.mode.startswith("I;16"):
+        return np.asarray(image, np.uint16)
+    import cv2
+
+    found = cv2.imdecode(np.frombuffer(read_bytes(path), np.uint8), cv2.IMREAD_UNCHANGED)
+    if found is None or found.dtype != np.uint16:
+        raise ProjectError(f"{path}: 16 bits a channel cannot be read; save it as 16-bit PNG")
+    order = [2, 1, 0, 3][: found.shape[2]] if found.ndim == 3 else ...
+    return np.asarray(found[..., order], np.uint16)
+
+
+def white_of_pictures(paths: Sequence[Path]) -> float:
+    """Full brightness of a project's pictures of 16 bits a channel, from a few of them."""
+    seen = []
+    for path in paths[:: -(-len(paths) // SAMPLED) or 1]:
+        try:
+            with _picture(path) as image:
+                if not _is_deep(image):
+                    return WHOLE[-1]
+                levels = _levels(path, image)
+        except ProjectError:
+            continue
+        levels = levels[..., :3] if levels.ndim == 3 else levels
+        seen.append(levels[:: -(-levels.shape[0] // 512), :: -(-levels.shape[1] // 512)].ravel())
+    if not seen:
+        return WHOLE[-1]
+    return white_of(np.concatenate(seen), tops=WHOLE, outliers=PICTURE_OUTLIERS)
 
 
 def decode_picture(data: bytes, *, where: str) -> Frame:

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import ROTATION_ROUNDING, Cameras, invert_rigid, rigid_transform
 from gvtools.errors import GvError, ProjectError
+from gvtools.ranges import WHOLE
 from gvtools.scenes.calibration import Float64, scaled_lens
 from gvtools.scenes.faces import perspective_views
 from gvtools.scenes.images import (
@@ -34,6 +36,7 @@ from gvtools.scenes.images import (
     resize_nearest,
     same_aspect,
     stored_depth_size,
+    white_of_pictures,
 )
 from gvtools.scenes.matching import named
 from gvtools.scenes.scene import Finding, Frame, Scene, View, natural_key
@@ -53,6 +56,8 @@ UNREADABLE = "have a damaged picture"
 OTHER_ASPECT = "have a picture of another aspect than their camera"
 BAD_POSE = "have an impossible pose"
 BAD_CAMERA = "have an impossible camera"
+# Pictures that may have 16 bits a channel, and what is done with them.
+DEEP, UPPER = (".png", ".tif", ".tiff"), "the upper eight bits are used"
 # A principal point is expected within so much of the middle, in sides of the picture.
 CENTER = 0.25
 
@@ -181,11 +186,19 @@ def posed_scene(
     photographs.sort(key=lambda item: natural_key(item.name))
     report += lens_findings([item.lens for item in photographs])
     report += mask_findings([item.frame.mask for item in photographs if item.frame.mask])
+    deep = [i.frame.image for i in photographs if i.frame.read is None]
+    white = white_of_pictures([path for path in deep if path.suffix.lower() in DEEP])
+    if white != WHOLE[-1]:
+        photographs = [replace(item, white=white) for item in photographs]
     if strict:
         report += center_findings([item.lens for item in photographs])
         files = [item for item in photographs if item.frame.read is None]
         report += header_findings([(item.frame.image, item.lens.source_size) for item in files])
         report += depth_findings(photographs)
+    if white != WHOLE[-1]:
+        report = [item for item in report if not item.message.endswith(UPPER)]
+        line = f"16-bit pictures hold no more than {white:g}: all are read as 0 to {white:g}"
+        report.append(Finding("info", line))
     views_of_scene = tuple(item.view() for item in photographs)
     return Scene(Path(root), kind, views_of_scene, None, tuple(report), metric=metric)
 
@@ -300,6 +313,7 @@ class Photograph:
     frame: PosedFrame
     lens: Undistortion  # from the recorded camera to the view's
     cam_from_world: Float64  # (4, 4), rigid, of the view
+    white: float = WHOLE[-1]  # full brightness of 16 bits a channel
 
     @property
     def name(self) -> str:
@@ -323,7 +337,8 @@ class Photograph:
     def load(self) -> Frame:
         """The pixels in the pinhole camera."""
         frame, lens = self.frame, self.lens
-        picture = (frame.read or read_image)(frame.image)
+        read = frame.read or partial(read_image, white=self.white)
+        picture = read(frame.image)
         check_size(picture.rgb.shape[1::-1], lens.source_size, path=frame.image)
         masks = [] if picture.mask is None else [lens.nearest(picture.mask)]
         if frame.mask is not None:
@@ -383,7 +398,7 @@ def conversion_findings(headers: Sequence[ImageHeader]) -> list[Finding]:
     kinds: Counter[str] = Counter()
     for header in headers:
         if header.mode.startswith("I;16"):
-            kinds["16-bit grey: the upper eight bits are used"] += 1
+            kinds[f"16-bit grey: {UPPER}"] += 1
         elif header.mode in ("L", "1", "LA"):
             kinds["grey: repeated over red, green and blue"] += 1
         if header.has_alpha:

@@ -340,6 +340,8 @@ def _scan_summary(scan: Scan) -> str:
         text += f" from {len(scan.stations)} stations"
     if scan.colored_by != "colour":
         text += f", grey by {scan.colored_by}"
+    if scan.color_range:
+        text += f", {scan.color_range}"
     dropped = ", ".join(f"{count:,} {reason}" for reason, count in scan.dropped.items())
     return f"{text} ({dropped})" if dropped else text
 

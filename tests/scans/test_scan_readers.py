@@ -342,3 +342,95 @@ def test_unknown_suffixes_missing_files_and_missing_packages_are_named(tmp_path,
     monkeypatch.setitem(__import__("sys").modules, "laspy", None)
     with pytest.raises(OptionError, match=r"gvtools\[scan\]"):
         open_scan(path)
+
+
+KINDS = {"u1": "uchar", "i1": "char", "u2": "ushort", "i4": "int", "f4": "float", "f8": "double"}
+RED = ("red", "green", "blue")
+
+
+def write_channels(path, positions, colors, *, names=RED, text=False):
+    """A PLY or PCD of points with three channels of any type."""
+    kind = colors.dtype.str[1:]
+    table = np.zeros(len(positions), [(axis, "f8") for axis in "xyz"] + [(n, kind) for n in names])
+    for k in range(3):
+        table["xyz"[k]], table[names[k]] = positions[:, k], colors[:, k]
+    count, size, letter = len(table), kind[1], kind[0].upper()
+    if path.suffix == ".ply":
+        form = "ascii" if text else "binary_little_endian"
+        head = [
+            "ply", f"format {form} 1.0", f"element vertex {count}",
+            *(f"property double {axis}" for axis in "xyz"),
+            *(f"property {KINDS[kind]} {name}" for name in names), "end_header",
+        ]  # fmt: skip
+    else:
+        head = [
+            "VERSION 0.7", f"FIELDS x y z {' '.join(names)}", f"SIZE 8 8 8 {size} {size} {size}",
+            f"TYPE F F F {letter} {letter} {letter}", "COUNT 1 1 1 1 1 1", f"WIDTH {count}",
+            "HEIGHT 1", "VIEWPOINT 0 0 0 1 0 0 0", f"POINTS {count}",
+            f"DATA {'ascii' if text else 'binary'}",
+        ]  # fmt: skip
+    rows = "\n".join(" ".join(str(value) for value in row) for row in table.tolist()) + "\n"
+    body = rows.encode() if text else table.tobytes()
+    path.write_bytes(("\n".join(head) + "\n").encode() + body)
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".pcd"])
+@pytest.mark.parametrize("text", [True, False])
+@pytest.mark.parametrize(
+    ("kind", "factor", "names"),
+    [
+        ("u1", 1, RED),
+        ("i1", 1, RED),  # bytes above 127 are negative
+        ("u2", 1, RED),
+        ("u2", 16, RED),
+        ("u2", 257, ("r", "g", "b")),
+        ("i4", 1, RED),
+        ("i4", 257, RED),
+        ("f4", 1, ("diffuse_red", "diffuse_green", "diffuse_blue")),
+        ("f4", 1 / 255, ("R", "G", "B")),
+        ("f8", 257, ("scalar_Red", "scalar_Green", "scalar_Blue")),
+    ],
+)
+@pytest.mark.parametrize("outliers", [0, 4])
+def test_colours_of_every_type_range_and_name(
+    tmp_path, suffix, text, kind, factor, names, outliers
+):
+    positions, colors = surface(500)
+    stored = (colors * np.float64(factor)).astype("u1" if kind == "i1" else kind).astype(kind)
+    if kind not in ("u1", "i1"):
+        stored[:outliers] = np.nan if outliers and kind[0] == "f" else 65535
+        stored[outliers // 2 : outliers] = 65535
+    path = write_channels(tmp_path / f"scan{suffix}", positions, stored, names=names, text=text)
+    scan = read_scan(path)
+    np.testing.assert_allclose(scan.colors[outliers:].astype(int), colors[outliers:], atol=1)
+    usual = kind in ("u1", "i1") or (kind, factor) in (("u2", 257), ("f4", 1 / 255))
+    assert bool(scan.color_range) != usual
+
+
+@pytest.mark.parametrize("factor", [1, 16, 256, 257])
+def test_las_with_colours_of_several_bits_and_an_outlier(tmp_path, factor):
+    laspy = pytest.importorskip("laspy")
+    positions, colors = surface(500)
+    path = write_las(tmp_path / "scan.las", positions, colors, bits=8)
+    las = laspy.read(path)
+    for name in RED:
+        las[name] = np.asarray(las[name]) * factor
+        las[name][3] = 65535
+    las.write(path)
+    shown = np.delete(read_scan(path).colors, 3, axis=0)
+    np.testing.assert_array_equal(shown, np.delete(colors, 3, axis=0))
+
+
+def test_gaussians_given_as_a_scan_are_their_opaque_centres(tmp_path):
+    positions, colors = surface(300)
+    names = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity")
+    opacity = np.where(np.arange(300) < 100, -3.0, 3.0)
+    values = np.column_stack([positions, (colors / 255 - 0.5) / 0.28209479, opacity])
+    head = ["ply", "format binary_little_endian 1.0", "element vertex 300",
+            *(f"property float {name}" for name in names), "end_header", ""]  # fmt: skip
+    path = tmp_path / "splats.ply"
+    path.write_bytes("\n".join(head).encode() + values.astype("<f4").tobytes())
+    scan = read_scan(path)
+    np.testing.assert_allclose(scan.colors.astype(int), colors[100:], atol=1)
+    assert scan.dropped == {"transparent Gaussians": 100} and scan.colored_by == "colour"
