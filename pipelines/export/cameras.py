@@ -14,9 +14,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from gvtools.errors import GvError
 from gvtools.files import link_or_copy, write_text
 from gvtools.memory.thinning import thin
+from gvtools.runs.run import load_run
+from gvtools.runs.target_files import write_png
 from gvtools.scenes.colmap_model import write_colmap as write_model
+from gvtools.scenes.images import IMAGE_SUFFIXES, read_image
+from gvtools.scenes.matching import named
+from gvtools.scenes.scene import View
 from gvtools.scenes.transforms import FILE as TRANSFORMS
 from gvtools.scenes.transforms import write_transforms as write_frames
 from gvtools.scenes.transforms import written_here
@@ -67,26 +73,61 @@ def write_transforms(source: ExportSource, path: Path, options: ExportOptions) -
     """Write ``transforms.json``: the file, or into the folder.
 
     ``images`` is the folder of the observed views' pictures, absolute or relative to the file;
-    pictures of generated views are those of the run's rounds.
+    those that are not there are taken from the run's project, undistorted where it is not. Pictures
+    of generated views are those of the run's rounds.
     """
     file, distinct = transforms_file(path), source.cameras()
     home = file.parent.resolve()
-    paths, elsewhere = [], {}
+    paths, elsewhere, absent = [], dict[Path, Path | NDArray[np.uint8]](), list[str]()
+    views = _project_views(source)
     for name in distinct.cameras.names:
         made = distinct.generated.get(name)
-        picture = (home / options.images / name if made is None else made).resolve()
-        inside = picture.is_relative_to(home)
-        place = picture.relative_to(home) if inside else Path("images") / name
-        paths.append(place)
-        if not inside and picture.is_file():
+        given = (home / options.images / name if made is None else made).resolve()
+        picture: Path | NDArray[np.uint8] = given
+        if not given.is_file():
+            picture = _pixels(views[name]) if made is None and name in views else given
+        place = Path("images") / name
+        if not isinstance(picture, Path):
+            place = place.with_suffix(".png")
             elsewhere[home / place] = picture
+        elif picture.is_relative_to(home):
+            place = picture.relative_to(home)
+        elif picture.is_file():
+            elsewhere[home / place] = picture
+        if isinstance(picture, Path) and not picture.is_file():
+            absent.append(name)
+        paths.append(place)
     write_frames(file, distinct.cameras, image_paths=paths, generated=distinct.generated.keys())
     # Readers look nowhere else: pictures from elsewhere get a second name, by a link or a copy.
-    for place, picture in elsewhere.items():
-        place.parent.mkdir(parents=True, exist_ok=True)
-        place.unlink(missing_ok=True)
-        link_or_copy(picture, place)
-    return f"{len(distinct.cameras)} views ({len(distinct.generated)} generated) in {path}"
+    for target, picture in elsewhere.items():
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.unlink(missing_ok=True)
+        if isinstance(picture, Path):
+            link_or_copy(picture, target)
+        else:
+            write_png(target, picture)
+    told = f"{len(distinct.cameras)} views ({len(distinct.generated)} generated) in {path}"
+    if absent:
+        told += f"; {len(absent)} pictures are not there ({named(absent)}): give --images"
+    return told
+
+
+def _project_views(source: ExportSource) -> dict[str, View]:
+    """The views of the run's project by name; none where it cannot be read."""
+    try:
+        return {view.name: view for view in load_run(source.path).scenes[0]}
+    except GvError:
+        return {}
+
+
+def _pixels(view: View) -> Path | NDArray[np.uint8]:
+    """A view's picture file, or its pixels where the file holds them distorted or larger."""
+    rgb = view.load().rgb
+    file = view.files[0] if view.files else None
+    picture = file is not None and file.suffix.lower() in IMAGE_SUFFIXES
+    if file is not None and picture and np.array_equal(read_image(file).rgb, rgb):
+        return file.resolve()
+    return rgb
 
 
 def transforms_file(path: Path) -> Path:

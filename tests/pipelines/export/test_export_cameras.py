@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
 import pytest
 from box_project import VOXEL, fused
+from command_line import run_command
 from export_runs import export_run
 from PIL import Image
 
 from gvtools.errors import OptionError, ProjectError
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.store.views import SourceView
+from gvtools.scenes.project import open_project
+from pipelines.export import cameras
 
 ORIGIN = (431_000.0, 5_650_000.0, 120.0)
 
@@ -160,6 +164,22 @@ def test_a_view_observed_and_generated_shows_its_photograph(scene, saved, tmp_pa
     frames = json.loads((tmp_path / "out" / "transforms.json").read_text())["frames"]
     assert [frame["file_path"] for frame in frames] == ["images/view_0.png", "images/view_2.png"]
     assert not any("generated" in frame for frame in frames)
+
+
+def test_absent_pictures_are_taken_from_the_runs_project_or_said(
+    scene, saved, tmp_path, monkeypatch, capsys
+):
+    run_command("export", saved, "--format", "transforms", "--out", tmp_path / "without")
+    assert "pictures are not there (view_0.png" in capsys.readouterr().out
+    frame = replace(scene["view_2.png"].load(), rgb=np.full((72, 96, 3), 7, np.uint8))
+    changed = replace(scene["view_2.png"], load=lambda: frame)
+    project = replace(scene, views=(scene["view_0.png"], changed))
+    monkeypatch.setattr(cameras, "load_run", lambda path: SimpleNamespace(scenes=(project, None)))
+    export_run(saved, "transforms", tmp_path / "out")
+    again = open_project(tmp_path / "out")
+    by_name = {view.name.split("/")[-1]: view.load().rgb for view in again}
+    np.testing.assert_array_equal(by_name["view_0.png"], scene["view_0.png"].load().rgb)
+    np.testing.assert_array_equal(by_name["view_2.png"], frame.rgb)
 
 
 def test_pictures_are_named_from_anywhere(saved, tmp_path, monkeypatch):
