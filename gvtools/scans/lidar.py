@@ -34,6 +34,10 @@ INTENSITY = "intensity"
 UNIT = 1e-3
 
 
+# Keys of GeoTIFF whose values are EPSG numbers, and the number of none.
+PROJECTED, GEOGRAPHIC, VERTICAL, OWN_CRS = 3072, 2048, 4096, 32767
+
+
 def open_lidar(path: Path, *, generated: bool = False) -> ScanFile:
     """A LAS, LAZ or E57, its header read; ``generated`` keeps a completer's points of a LAS."""
     suffix = path.suffix.lower()
@@ -52,7 +56,7 @@ def open_lidar(path: Path, *, generated: bool = False) -> ScanFile:
         for item in head[0]["stations"]
     )
     chunks = (Chunk(**{**facts, **arrays}) for facts, arrays in items)
-    return ScanFile(path, head[0]["count"], stations, chunks)
+    return ScanFile(path, head[0]["count"], stations, chunks, head[0].get("crs", ""))
 
 
 def _sent(chunk: Chunk) -> Item:
@@ -81,9 +85,23 @@ def read_las(path: Path, *, generated: bool) -> Iterator[Item]:
         bits = LEAST_BITS if header.are_points_compressed else 8 * size
         room = path.stat().st_size - int(header.offset_to_point_data)
         _check_count(path, count, bits=bits, room=room)
-        yield {"count": count, "stations": [{"name": path.stem, "center": None}]}, {}
+        stations = [{"name": path.stem, "center": None}]
+        yield {"count": count, "stations": stations, "crs": _crs(header)}, {}
         for points in reader.chunk_iterator(min(CHUNK, max(1, CHUNK_BYTES // max(size, 1)))):
             yield _sent(_las_chunk(points, generated=generated))
+
+
+def _crs(header: Any) -> str:
+    """The coordinate system that a LAS names: WKT, or EPSG numbers of older files; else ""."""
+    codes: dict[int, int] = {}
+    for record in (*header.vlrs, *(header.evlrs or ())):
+        if text := str(getattr(record, "string", "") or "").strip("\0 "):
+            return text
+        keys = getattr(record, "geo_keys", ())
+        codes |= {int(key.id): int(key.value_offset) for key in keys if not key.tiff_tag_location}
+    flat, height = codes.get(PROJECTED) or codes.get(GEOGRAPHIC), codes.get(VERTICAL)
+    numbers = [code for code in (flat, height) if code and code != OWN_CRS]
+    return f"EPSG:{'+'.join(map(str, numbers))}" if flat and flat != OWN_CRS else ""
 
 
 def _las_chunk(points: Any, *, generated: bool) -> Chunk:

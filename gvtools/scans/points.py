@@ -59,6 +59,7 @@ class ScanFile:
     count: int  # number of points, including unusable ones
     stations: tuple[Station, ...]  # at least one
     chunks: Iterator[Chunk]  # all points, in the order of the file, read as they are asked for
+    crs: str = ""  # the coordinate system that it names, WKT or "EPSG:N"
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +77,7 @@ class Scan:
     count: int  # number of points in the file
     dropped: dict[str, int]  # number of points of the file that are left out, by reason
     color_range: str = ""  # what was decided of the colours' range, where their type does not tell
+    crs: str = ""  # as of ScanFile
 
     def __len__(self) -> int:
         return len(self.positions)

@@ -64,6 +64,7 @@ def read_scan(path: Path, *, most: int = MOST_POINTS, generated: bool = False) -
     return Scan(
         path.name, reading.origin, held["positions"], colors, held["station"], file.stations,
         colored_by, file.count, dict(reading.dropped), color_range,
+        file.crs,
     )  # fmt: skip
 
 

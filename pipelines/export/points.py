@@ -17,8 +17,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gvtools.errors import GvError
 from gvtools.files import replaced_when_written
 from gvtools.memory.ply import export_memory_ply
+from gvtools.runs.run import load_run
 from pipelines.export.formats import ExportOptions
 from pipelines.export.source import ExportSource, box_middle
 
@@ -26,6 +28,8 @@ from pipelines.export.source import ExportSource, box_middle
 POINT_FORMAT, VERSION = 7, "1.4"
 # Steps of coordinates in a voxel, at least, and the largest number of them.
 STEPS_PER_VOXEL, MOST_STEPS = 10, 2**31 - 1
+# Bytes of a record in a LAS's head, less its end.
+MOST_WKT = 65_534
 # glTF: a type of numbers, and the extension that shows colours as they are.
 UINT16, UNLIT = 5123, "KHR_materials_unlit"
 # 8 bits to 16: 255 becomes 65535.
@@ -56,6 +60,9 @@ def write_las(source: ExportSource, path: Path, options: ExportOptions) -> str:
     header.generating_software = "gvtools"
     # What point formats from 6 on have to say.
     header.global_encoding.wkt = True
+    crs, told = _crs(source)
+    if crs:
+        header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(crs))
     header.offsets = np.round(points.middle)
     reach = float(np.abs(points.positions - header.offsets).max())
     # A power of ten, as other software writes it.
@@ -82,7 +89,28 @@ def write_las(source: ExportSource, path: Path, options: ExportOptions) -> str:
     cloud["scanned"] = memory.scanned[rows]
     with replaced_when_written(path) as temporary, temporary.open("wb") as file:
         cloud.write(file, do_compress=path.suffix.lower() == ".laz")
-    return f"{source.points_summary(points)} in {path}, coordinates in steps of {step:g}"
+    return f"{source.points_summary(points)} in {path}, coordinates in steps of {step:g}{told}"
+
+
+def _crs(source: ExportSource) -> tuple[str, str]:
+    """WKT of the coordinate system of the run's scan where it is the memory's, and what is said."""
+    try:
+        scan = load_run(source.path).rounds[0].get("scan") or {}
+        crs = str(scan.get("crs") or "")
+        placement = np.array(scan["placement"]["world_from_scan"]) if crs else np.eye(4)
+    except (GvError, LookupError, TypeError, AttributeError, ValueError):
+        return "", ""
+    if not np.array_equal(placement, np.eye(4)):
+        return "", "; not in the scan's coordinate system (--cloud-placement moved it)"
+    if crs.startswith("EPSG:"):
+        try:
+            import pyproj
+        except ImportError:
+            return "", f"; the scan's {crs} is left out (WKT of it needs pyproj)"
+        crs = str(pyproj.CRS.from_user_input(crs).to_wkt("WKT1_GDAL"))
+    if len(crs) > MOST_WKT:
+        return "", "; the scan's coordinate system is left out (too long)"
+    return crs, f", in the scan's coordinate system ({crs[:60]})" if crs else ""
 
 
 def write_usd(source: ExportSource, path: Path, options: ExportOptions) -> str:

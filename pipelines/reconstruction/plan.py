@@ -81,6 +81,7 @@ class PlacedScan:
             "colored_by": scan.colored_by,
             "dropped": dict(Counter(scan.dropped) + Counter(report.dropped)),
             "placement": self.placement.to_json(),
+            "crs": scan.crs,
         }
 
 

@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import json
+import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from box_project import fused
+from command_line import run_command
 from export_runs import export_run
 from plyfile import PlyData
+from scan_files import write_las
 
 from gvtools.errors import OptionError
 from gvtools.memory.store.local_frame import LocalFrame
 from gvtools.memory.thinning import thin
+from gvtools.scans.read import read_scan
+from pipelines.export import points
 
 ORIGIN = (431_000.0, 5_650_000.0, 120.0)
 
@@ -182,3 +188,33 @@ def test_thinning_some_observations_counts_no_others(bare_run):
     assert among[kept.rows].all() and 10 < len(kept.rows) <= 100
     np.testing.assert_array_equal(kept.group >= 0, among)
     np.testing.assert_array_equal(kept.group[kept.rows], np.arange(len(kept.rows)))
+
+
+WKT = 'LOCAL_CS["site",UNIT["metre",1]]'
+NAMED = "the scan's coordinate system"
+
+
+@pytest.mark.parametrize(
+    ("crs", "placement", "carried", "said"),
+    [
+        (WKT, np.eye(4), WKT, f"in {NAMED}"),
+        (WKT, np.diag([2.0, 2, 2, 1]), None, f"not in {NAMED}"),
+        ("EPSG:25832", np.eye(4), None, "EPSG:25832 is left out"),
+        ("", np.eye(4), None, "coordinates in steps"),
+    ],
+)
+def test_las_carries_the_coordinate_system_of_a_scan_that_lies_in_it(
+    far, tmp_path, monkeypatch, capsys, crs, placement, carried, said
+):
+    laspy = pytest.importorskip("laspy")
+    monkeypatch.setitem(sys.modules, "pyproj", None)
+    write_las(tmp_path / "scan.las", np.eye(4, 3), None, crs=crs)
+    placed = {"world_from_scan": placement.tolist()}
+    scan = {"crs": read_scan(tmp_path / "scan.las").crs, "placement": placed}
+    run = SimpleNamespace(rounds=({"scan": scan},))
+    monkeypatch.setattr(points, "load_run", lambda path: run)
+    out = tmp_path / "out.las"
+    run_command("export", far[0], "--format", "las", "--out", out)
+    assert said in capsys.readouterr().out
+    found = [record.string for record in laspy.read(out).header.vlrs if hasattr(record, "string")]
+    assert found == ([carried] if carried else [])
