@@ -47,6 +47,20 @@ PARSER_ERRORS = (
 DAMAGED = (OSError, ValueError, LookupError, StopIteration, *PARSER_ERRORS)
 
 
+# What files named as pictures begin with when they are none that is read.
+HELD = {
+    **dict.fromkeys((b"ftyphei", b"ftyphev", b"ftypmif1", b"ftypmsf1"), "HEIC: convert it to JPEG"),
+    b"ftypavi": "AVIF: convert it to JPEG",
+    b"jxl ": "JPEG XL: convert it to PNG",
+    b"git-lfs": "a pointer of Git LFS: fetch the file by 'git lfs pull'",
+    b"%pdf": "PDF",
+    b"<!doctype": "a web page: download it again",
+    b"<html": "a web page: download it again",
+    b"ftyp": "a video",
+    b"pk\x03\x04": "a ZIP archive: unpack it",
+}
+
+
 @contextmanager
 def reading(
     where: Path | str,
@@ -321,13 +335,26 @@ def read_array(stream: IO[bytes], size: int) -> NDArray[Any]:
     return array
 
 
+def _head(path: Path) -> bytes:
+    with regular(path).open("rb") as file:
+        return file.read(64)
+
+
+def _held(head: bytes) -> str:
+    """What the first bytes of a file say that is no picture, "" where they say nothing."""
+    return next((kind for mark, kind in HELD.items() if mark in head[:32].lower()), "")
+
+
 def open_picture(source: Path | bytes) -> Image.Image:
     """A picture, open but not decoded, whose pixels take no more memory than its file explains."""
-    from PIL import Image
+    from PIL import Image, UnidentifiedImageError
 
     size = len(source) if isinstance(source, bytes) else regular(source).stat().st_size
     try:
         image = Image.open(io.BytesIO(source) if isinstance(source, bytes) else source)
+    except UnidentifiedImageError:
+        kind = _held(source[:64] if isinstance(source, bytes) else _head(source))
+        raise ValueError(f"no picture{kind and f', but {kind}'}") from None
     except (Image.DecompressionBombError, LookupError, *PARSER_ERRORS) as error:
         raise ValueError(str(error) or type(error).__name__) from None
     width, height = image.size

@@ -284,6 +284,7 @@ def load_model(folder: Path, *, faces: bool = False) -> ColmapModel:
         line = f"model {folder.name} is read; further models are not: {listed}"
         findings.append(Finding("warning", line))
     reconstruction = _read(files)
+    findings += _contradicting_text(files, reconstruction)
     if reconstruction.num_reg_images() == 0:
         raise ProjectError(
             f"{folder}: no registered image among {reconstruction.num_images()}; expected at least "
@@ -307,6 +308,33 @@ def load_model(folder: Path, *, faces: bool = False) -> ColmapModel:
         one = () if faces else (undistortion(*lens, what=what),)
         views[key] = one or perspective_views(*lens, what=what)
     return ColmapModel(files, images, views, reconstruction, tuple(findings))
+
+
+def _contradicting_text(
+    files: ModelFiles, reconstruction: pycolmap.Reconstruction
+) -> list[Finding]:
+    """A warning when a ``cameras.txt`` beside the binary model says other cameras."""
+    path = files.folder / "cameras.txt"
+    if files.suffix == ".txt" or not path.is_file():
+        return []
+    try:
+        rows = [line.split() for line in read_text(path).splitlines() if line[:1] not in ("", "#")]
+        told = {int(row[0]): (row[1], np.array(row[2:], np.float64)) for row in rows}
+    except (OSError, ValueError, IndexError):
+        return []
+    for key, camera in sorted(reconstruction.cameras.items()):
+        own = np.array([camera.width, camera.height, *camera.params])
+        model, values = told.get(key, ("", own))
+        same = model == camera.model_name and values.shape == own.shape
+        if same and np.allclose(values, own, rtol=1e-3, atol=1e-6):
+            continue
+        other = f"{model} {values.tolist()}" if model else "no such camera"
+        line = (
+            f"cameras.bin is read, and {path.name} beside it differs: camera {key} is "
+            f"{camera.model_name} {own.tolist()}, there {other}; take the wrong one away"
+        )
+        return [Finding("warning", line)]
+    return []
 
 
 def _read(files: ModelFiles) -> pycolmap.Reconstruction:

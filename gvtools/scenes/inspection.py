@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
 from gvtools.errors import GvError
+from gvtools.scenes.depth_contradictions import unit_findings
 from gvtools.scenes.pixel_contradictions import PixelCheck
 from gvtools.scenes.scene import Finding, Frame, Scene, SparsePoints
 
@@ -99,6 +100,7 @@ def inspect(scene: Scene, *, probes: int | None = None) -> SceneReport:
     findings += _views_without_depth(scene)
     findings += _doubtful_cameras(scene, errors)
     findings += pixels.findings()
+    findings += unit_findings(scene)
     findings += contradiction_findings(
         scene,
         {item.view: item.thumbnail for item in opened},

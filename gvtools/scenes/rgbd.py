@@ -136,7 +136,8 @@ class RgbdFolder(ABC):
 
     def uncalibrated(self, root: Path, options: RgbdOptions) -> Recording:
         """A recording where neither an option nor a file has intrinsics."""
-        K, finding = sensor_default()
+        pictures = (frame.image for frame in self.frames(root, options))
+        K, finding = sensor_default(first_size(pictures))
         return Recording(root, _under(options, color_K=K), findings=[finding])
 
     def posed(self, recording: Recording, *, strict: bool) -> Recording:
@@ -253,7 +254,16 @@ class _Tum(RgbdFolder):
         at = partial(pose_at, times=truth.stamps[order], poses=truth.poses[order], same=limit)
         stamped = self._stamped(recording.root, recording.options)
         frames = [replace(frame, pose=at(time)) for time, frame in stamped]
-        return replace(recording, frames=frames, unposed=f"{NO_POSE} within {limit:g} s")
+        # How far off those are that have none tells clocks that differ from poses that lack.
+        off = [
+            np.abs(truth.stamps - t).min()
+            for (t, _), f in zip(stamped, frames, strict=True)
+            if f.pose is None
+        ]
+        unposed = f"{NO_POSE} within {limit:g} s"
+        if off:
+            unposed += f" (the nearest is {min(off):.3g} to {max(off):.3g} s off)"
+        return replace(recording, frames=frames, unposed=unposed)
 
 
 def _stamped_files(path: Path) -> list[tuple[float, str]]:

@@ -97,7 +97,11 @@ class Scene:
     def __post_init__(self) -> None:
         index = {view.name: i for i, view in enumerate(self.views)}
         if len(index) != len(self.views):
-            raise ProjectError(f"{self.root}: two views have the same name; names must be unique")
+            names = [view.name for view in self.views]
+            twice = next(name for name in names if names.count(name) > 1)
+            raise ProjectError(
+                f"{self.root}: two views have the same name, {twice!r}; names must be unique"
+            )
         object.__setattr__(self, "_index", index)
 
     def __len__(self) -> int:

@@ -16,6 +16,7 @@ from gvtools.completers.base import Completer
 from gvtools.errors import OptionError
 from gvtools.runs.digests import array_digest, fingerprint
 from gvtools.runs.poses import RunPoses, posed, with_poses
+from gvtools.scenes.depth_contradictions import unit_findings
 from gvtools.scenes.layout import is_address
 from gvtools.scenes.matching import natural
 from gvtools.scenes.pixel_contradictions import probed
@@ -333,7 +334,8 @@ def describe(plan: Plan, console: Console) -> None:
             f"{', '.join(plan.ignored)} changes nothing: no plane sweep computes depth here, but "
             f"{plan.source.name}"
         )
-    for finding in (*plan.scene.findings, *probed(plan.scene, plan.context)):
+    met = *plan.scene.findings, *probed(plan.scene, plan.context), *unit_findings(plan.scene)
+    for finding in met:
         if finding.level == "warning":
             console.warn(finding.message)
 

@@ -242,3 +242,14 @@ def test_smaller_pictures_of_the_same_aspect_scale_their_cameras_and_detections(
     assert reprojection_errors(scene).max() < 1e-3
     line = f"{len(scene)} pictures of 48x36 for cameras of 96x72: intrinsics scaled"
     assert line in [finding.message for finding in scene.findings]
+
+
+@pytest.mark.parametrize("focal", [90, 95])
+def test_a_text_model_that_contradicts_the_binary_one_beside_it_is_said(tmp_path, focal):
+    reconstruction = workspace(tmp_path, "PINHOLE")
+    for camera in reconstruction.cameras.values():
+        camera.focal_length_x = focal
+    reconstruction.write_text(tmp_path / "sparse/0")
+    said = [found.message for found in read_colmap(tmp_path).findings]
+    line = "cameras.bin is read, and cameras.txt beside it differs: camera 1 is PINHOLE [96.0, "
+    assert any(line in message for message in said) == (focal != 90)

@@ -1,6 +1,8 @@
 # mypy: no-check-untyped-defs
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -164,3 +166,20 @@ def test_a_projects_pictures_of_16_bits_a_channel_have_one_range(tmp_path, bits,
         np.testing.assert_allclose(view.load().rgb[..., 0].astype(int), red // shade, atol=1)
     said = any("16-bit pictures hold no more than" in found.message for found in scene.findings)
     assert said == (bits < 16)
+
+
+@pytest.mark.parametrize(
+    ("head", "said"),
+    [
+        (b"\0\0\0\x18ftypheic\0\0\0\0mif1", "HEIC: convert it"),
+        (b"version https://git-lfs.github.com/spec/v1\n", "git lfs pull"),
+        (b"<!DOCTYPE html><html>", "a web page"),
+        (b"%PDF-1.4", "PDF"),
+        (b"PK\3\4", "a ZIP archive"),
+        (b"anything", "unreadable (no picture)"),
+    ],
+)
+def test_what_is_no_picture_is_named_by_its_bytes(tmp_path, head, said):
+    (tmp_path / "a.jpg").write_bytes(head + bytes(200))
+    with pytest.raises(ProjectError, match=re.escape(said)):
+        read_image(tmp_path / "a.jpg")
