@@ -133,6 +133,19 @@ def link_or_copy(source: Path, target: Path) -> None:
         shutil.copyfile(source, target)
 
 
+def check_space(path: Path, needed: int) -> None:
+    """Refuse to write so many bytes below ``path`` where fewer are free."""
+    place = path
+    while not place.exists():
+        place = place.parent
+    free = shutil.disk_usage(place).free
+    if free < needed:
+        raise ProjectError(
+            f"{path}: {needed / 1e9:.1f} GB are needed, {free / 1e9:.1f} GB are free; free some "
+            "space or choose another folder"
+        )
+
+
 def check_parent(path: Path) -> None:
     """Before a long computation: whether its result can be written to ``path`` in the end."""
     if not path.parent.is_dir():

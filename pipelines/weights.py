@@ -53,15 +53,12 @@ _FLOAT32 = 4
 
 # What is done with the files of each configuration, one step a line.
 GLD_STEPS = (
-    "put the files above into DIR, under the same names: hf download SeonghuJeon/GLD --local-dir "
-    "DIR has all but model_stats/, which is in the code repository "
-    "cvlab-kaist/Geometric-Latent-Diffusion",
+    "gvtools weights fetch gld --to DIR, or put the files above there under the same names",
     "gvtools weights check DIR",
 )
 STEPS = {
     "depth": (
-        "put model.safetensors of one of them into DIR: hf download depth-anything/NAME "
-        "model.safetensors --local-dir DIR",
+        "gvtools weights fetch da3-small --to DIR, da3-base or da3-large",
         "gvtools reconstruct PROJECT --depth da3 --set da3.weights=DIR --out RUN",
     ),
     "gld": (
@@ -72,8 +69,8 @@ STEPS = {
         *GLD_STEPS,
         "without video/ the folder is gld, and base begins as that: nothing published is trained "
         "to use the video prior",
-        "for training: gvtools weights truncate-wan SOURCE DIR/video, then gvtools weights "
-        "empty-prompt TEXT_ENCODER DIR/video",
+        "for training: gvtools weights fetch wan-vace --to WAN, gvtools weights truncate-wan WAN "
+        "DIR/video, gvtools weights empty-prompt WAN DIR/video",
         "gvtools train base --init DIR --out TRAINING, then gvtools weights pack TRAINING WEIGHTS",
     ),
 }

@@ -1,6 +1,6 @@
 """``gvtools weights``: which checkpoints a configuration needs, whether a folder fits, making one.
 
-The actions: list, check, create, pack, truncate-wan, empty-prompt.
+The actions: list, fetch, check, create, pack, truncate-wan, empty-prompt.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from gvtools.errors import CheckpointError, GvError, OptionError, ProjectError
 from pipelines.options import Arguments
@@ -45,6 +45,43 @@ class ListWeights(Arguments):
                 print_depth(console)
             else:
                 print_needed(_config(name), console)
+
+
+class FetchWeights(Arguments):
+    """Download published weights into a folder; what was interrupted is continued."""
+
+    examples = (
+        "gld --to weights/gld",
+        "da3-base --to weights/da3 --from 'https://hf-mirror.com/{repo}/resolve/{revision}/{path}'",
+    )
+    positional = ("model",)
+
+    model: Literal["gld", "da3-small", "da3-base", "da3-large", "wan-vace"]
+    """Its published name."""
+    to: Path
+    """The folder to make or to complete. [DIR]"""
+    from_: str = ""
+    """Another source than the publishers: a folder that was fetched before, the address of one, or
+    an address with {repo}, {revision} and {path}. [URL|DIR]"""
+    optional: bool = False
+    """Files that the model can do without, too."""
+
+    def run(self, console: Console) -> None:
+        from pipelines.published import LICENCES, MODELS, NEXT, fetch
+        from pipelines.weights import size_text
+
+        every = MODELS[self.model]
+        files = [file for file in every if self.optional or not file.optional]
+        total = size_text(sum(file.size for file in files))
+        licence = LICENCES.get(self.model, "Apache-2.0")
+        console.line(f"{self.model}: {len(files)} files, {total}; licence {licence}")
+        for file in every:
+            if file not in files:
+                console.line(f"{file.place}: left out, not needed (--optional)")
+        progress = _progress(console, "fetched")
+        fetch(files, self.to, source=self.from_, say=console.line, progress=progress)
+        for step in NEXT.get(self.model, NEXT[""]):
+            console.line(f"next: {step.replace('DIR', str(self.to))}")
 
 
 class CheckWeights(Arguments):
@@ -180,7 +217,7 @@ class TruncateWan(Arguments):
         from gvtools.completers.geoverse.wan import EMPTY_PROMPT
         from gvtools.completers.geoverse.wan_checkpoint import truncate
 
-        progress = _progress(console)
+        progress = _progress(console, "written")
         truncate(self.source, self.folder, blocks=self.blocks, vae=self.vae, progress=progress)
         console.line(
             f"{self.folder} is written; it still needs {EMPTY_PROMPT}: gvtools weights "
@@ -225,12 +262,12 @@ class WeightsCommand(Arguments):
         "gvtools weights check weights/base --json check.json",
     )
     actions: ClassVar = {
-        "list": ListWeights, "check": CheckWeights, "create": CreateWeights, "pack": PackWeights,
-        "truncate-wan": TruncateWan, "empty-prompt": WriteEmptyPrompt,
+        "list": ListWeights, "fetch": FetchWeights, "check": CheckWeights, "create": CreateWeights,
+        "pack": PackWeights, "truncate-wan": TruncateWan, "empty-prompt": WriteEmptyPrompt,
     }  # fmt: skip
 
 
-def _progress(console: Console) -> Callable[[int, int], None]:
+def _progress(console: Console, what: str) -> Callable[[int, int], None]:
     """Bytes done of all, now and then."""
     from pipelines.weights import size_text
 
@@ -239,7 +276,7 @@ def _progress(console: Console) -> Callable[[int, int], None]:
     def report(done: int, total: int) -> None:
         if done >= total or time.monotonic() - last[0] > _INTERVAL:
             last[0] = time.monotonic()
-            console.line(f"{size_text(done)} of {size_text(total)} written")
+            console.line(f"{size_text(done)} of {size_text(total)} {what}")
 
     return report
 

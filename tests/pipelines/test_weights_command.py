@@ -20,7 +20,7 @@ from pipelines.cli import build_parser, main
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 PLAIN = micro.config()
-ACTIONS = ("list", "check", "create", "truncate-wan", "empty-prompt")
+ACTIONS = ("list", "fetch", "check", "create", "truncate-wan", "empty-prompt")
 
 
 def weights(*arguments: object) -> int:
@@ -49,7 +49,7 @@ PUBLISHED = {
     "pretrained_models/mae_decoder.pt": "1.69 GB, 456 tensors, 422,536,396 numbers",
     "model_stats/da3/normalization_stats_level0.pt": "12.3 kB, 2 tensors, 3,072 numbers",
     "model_stats/da3/normalization_stats_level1.pt": "12.3 kB, 2 tensors, 3,072 numbers",
-    "pretrained_models/da3/dpt_decoder.pt": "optional, 400 MB, ",
+    "pretrained_models/da3/dpt_decoder.pt": "optional, 470 MB, ",
 }
 
 

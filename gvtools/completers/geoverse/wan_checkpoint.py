@@ -27,7 +27,7 @@ from gvtools.completers.geoverse.wan import (
     read_config,
 )
 from gvtools.errors import CheckpointError, OptionError, ProjectError
-from gvtools.files import replaced_when_written
+from gvtools.files import check_space, replaced_when_written
 from gvtools.networks.tensors import INDEX, TensorFiles, check_fit
 from gvtools.untrusted import read_json
 
@@ -97,7 +97,7 @@ def truncate(
     sizes = {n: prod(shape) * dtype_of(n, dtype).itemsize for n, shape in expected.items()}
     copied = _vae_files(_vae(place, vae))
     needed = sum(sizes.values()) + sum(path.stat().st_size for path in copied)
-    _check_space(out, needed + _MARGIN)
+    check_space(out.parent, needed + _MARGIN)
 
     temporary = out.with_name(f".{out.name}.part")
     try:
@@ -150,18 +150,6 @@ def _write(
     if len(parts) > 1:
         index = {"metadata": {"total_size": sum(sizes.values())}, "weight_map": files}
         _write_json(folder / f"{_WEIGHTS}{INDEX}", index)
-
-
-def _check_space(out: Path, needed: int) -> None:
-    place = out.parent
-    while not place.exists():
-        place = place.parent
-    free = shutil.disk_usage(place).free
-    if free < needed:
-        raise ProjectError(
-            f"{out}: {needed / 1e9:.1f} GB are needed, {free / 1e9:.1f} GB are free; free some "
-            "space or choose another folder"
-        )
 
 
 def _write_json(path: Path, content: Mapping[str, Any]) -> None:

@@ -162,7 +162,7 @@ GEOMETRY_HEAD = Part(
     tied=da3.tied_norms(""),
     optional=True,
     lenient=True,
-    stated_bytes=400_000_000,
+    stated_bytes=470_000_000,
     note="GLD's geometry head, in place of Depth Anything 3's own",
 )
 
