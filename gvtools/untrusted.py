@@ -263,6 +263,17 @@ def unpack_gzip(data: bytes, most: int) -> bytes:
     return found
 
 
+def other_version(found: object, known: int, advice: str) -> str:
+    """What to do about a file of another version than the known one, older or newer.
+
+    >>> other_version(5, 4, "run it again")
+    'it is newer than this program: update gvtools, or save it in version 4'
+    """
+    if isinstance(found, int) and found > known:
+        return f"it is newer than this program: update gvtools, or save it in version {known}"
+    return advice
+
+
 class SupportsRead(Protocol):
     """What unpacks as it is read."""
 

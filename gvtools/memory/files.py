@@ -35,12 +35,13 @@ from gvtools.memory.store.tile import (
 )
 from gvtools.memory.store.views import SourceView, ViewTable
 from gvtools.memory.store.voxel_index import MOST_LEVEL
-from gvtools.untrusted import parse_json, read_array, regular
+from gvtools.untrusted import other_version, parse_json, read_array, regular
 
 S = TypeVar("S", bound=Store)
 
 FORMAT = "gvtools memory"
 VERSION = 4
+AGAIN = "run the reconstruction again"
 CONVENTION = "OpenCV axes (x right, y down, z forward); first pixel's centre at (0.5, 0.5)"
 
 
@@ -178,7 +179,7 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
             if version != VERSION:
                 raise MemoryFileError(
                     f"{path}: memory format version {version}; this gvtools reads version "
-                    f"{VERSION}; run the reconstruction again"
+                    f"{VERSION}; {other_version(version, VERSION, AGAIN)}"
                 )
             arrays = {}
             for name, (dtype, shape) in header["arrays"].items():
@@ -280,7 +281,7 @@ def load_tiles(
     if meta.get("version") != VERSION:
         raise MemoryFileError(
             f"{folder}: memory format version {meta.get('version')}; this gvtools reads version "
-            f"{VERSION}; run the reconstruction again"
+            f"{VERSION}; {other_version(meta.get('version'), VERSION, AGAIN)}"
         )
     try:
         memory = create_empty(

@@ -42,6 +42,7 @@ if TYPE_CHECKING:
 ATTEMPTS = 5
 
 
+MEMORIES = (".npz", ".ply")  # files of memories
 # Refinement turns no camera by more [rad]; other poses of the same names are another project's.
 FARTHEST_TURN = 0.5
 
@@ -405,6 +406,11 @@ def load_memory(
 
 def memory_path(path: Path) -> Path:
     """The memory that ``path``, a file, a folder of tiles or a run's folder, stands for."""
+    if path.is_file() and path.suffix.lower() not in ("", *MEMORIES):
+        raise ProjectError(
+            f"{path}: no memory by its suffix; expected a run's folder, or a file that ends with "
+            f"{', '.join(MEMORIES)}"
+        )
     if path.is_file() or (path / INDEX).is_file():
         return path
     if not path.is_dir():

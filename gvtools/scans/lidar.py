@@ -13,6 +13,7 @@ from gvtools.errors import MemoryFileError
 from gvtools.optional import require
 from gvtools.sandbox import Item, ReaderError, read_apart
 from gvtools.scans.points import CHUNK, GENERATED, Chunk, ScanFile, Station
+from gvtools.untrusted import regular
 
 # Classes of points that are no surface: noise, low and high.
 NOISE = (7, 18)
@@ -34,6 +35,7 @@ INTENSITY = "intensity"
 UNIT = 1e-3
 
 
+NEWEST_LAS = (1, 4)
 # Keys of GeoTIFF whose values are EPSG numbers, and the number of none.
 PROJECTED, GEOGRAPHIC, VERTICAL, OWN_CRS = 3072, 2048, 4096, 32767
 
@@ -47,6 +49,7 @@ def open_lidar(path: Path, *, generated: bool = False) -> ScanFile:
     if suffix == ".e57":
         items = read_apart(f"{__name__}:read_e57", path)
     else:
+        _check_version(path)
         items = read_apart(f"{__name__}:read_las", path, generated=generated)
     head = next(items, None)
     if head is None:
@@ -57,6 +60,18 @@ def open_lidar(path: Path, *, generated: bool = False) -> ScanFile:
     )
     chunks = (Chunk(**{**facts, **arrays}) for facts, arrays in items)
     return ScanFile(path, head[0]["count"], stations, chunks, head[0].get("crs", ""))
+
+
+def _check_version(path: Path) -> None:
+    """Refuse a LAS newer than its reader knows."""
+    with regular(path).open("rb") as file:
+        head = file.read(26)
+    if head[:4] == b"LASF" and tuple(head[24:26]) > NEWEST_LAS:
+        major, minor = head[24:26]
+        raise MemoryFileError(
+            f"{path}: LAS version {major}.{minor}; expected 1.4 at most; it is newer than this "
+            "program: update gvtools, or save it in version 1.4"
+        )
 
 
 def _sent(chunk: Chunk) -> Item:

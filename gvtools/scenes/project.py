@@ -97,6 +97,11 @@ def open_project(
     if told or path.is_file():
         if rgbd is not None:
             raise OptionError(f"{path}: no posed RGB-D folder; expected no RGB-D options")
+        if not told and path.suffix.lower() != ".json":
+            raise ProjectError(
+                f"{path}: no project by its suffix; expected a folder, or a transforms.json "
+                f"(gvtools capture also takes {', '.join(VIDEOS)} and {BAG})"
+            )
         if folder is None:
             return read_transforms(path, images=images, masks=masks)
         from gvtools.scenes.colmap import read_colmap

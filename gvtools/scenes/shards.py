@@ -35,6 +35,7 @@ from gvtools.untrusted import (
     load_arrays,
     named_file,
     open_picture,
+    other_version,
     read_bytes,
     reading,
     regular,
@@ -170,7 +171,7 @@ def read_index(folder: Path) -> ShardsIndex:
     if (index.format, index.version) != (FORMAT, VERSION):
         raise ProjectError(
             f"{path}: {index.format!r} of version {index.version}; expected {FORMAT!r} of version "
-            f"{VERSION}; convert again with this gvtools"
+            f"{VERSION}; {other_version(index.version, VERSION, 'convert again with this gvtools')}"
         )
     return index
 

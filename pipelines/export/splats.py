@@ -35,7 +35,7 @@ from gvtools.appearance.splat.project_kernels import (
 from gvtools.errors import MemoryFileError
 from gvtools.files import replaced_when_written
 from gvtools.ply import read_ply, write_ply
-from gvtools.untrusted import read_bytes, unpack_gzip
+from gvtools.untrusted import other_version, read_bytes, unpack_gzip
 from pipelines.export.formats import ExportOptions
 from pipelines.export.source import ExportSource, Splats
 
@@ -182,6 +182,12 @@ def read_spz(path: Path) -> Splats:
     """The Gaussians of a file, with the axes of a PLY; harmonics above degree 2 are left out."""
     try:
         packed = read_bytes(path)
+        if packed[:4] == HEADER.pack(MAGIC, *[0] * 6)[:4] and len(packed) >= 8:
+            version = int.from_bytes(packed[4:8], "little")
+            raise MemoryFileError(
+                f"{path}: SPZ version {version}; expected version 2 or 3; "
+                f"{other_version(version, VERSION, 'save it again')}"
+            )
         data = unpack_gzip(packed, MOST_RATIO * len(packed) + MOST_BYTES)
         magic, version, count, degree, fractional, _, _ = HEADER.unpack_from(data)
     except (OSError, ValueError, struct.error) as error:
@@ -191,7 +197,7 @@ def read_spz(path: Path) -> Splats:
     if magic != MAGIC or version not in (2, 3) or degree > 3:
         raise MemoryFileError(
             f"{path}: SPZ version {version}, harmonics of degree {degree}; expected version 2 or "
-            "3, degree 3 at most"
+            f"3, degree 3 at most; {other_version(version, VERSION, 'save it again')}"
         )
     if not count:
         raise MemoryFileError(f"{path}: no Gaussians; expected some")

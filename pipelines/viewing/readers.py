@@ -22,12 +22,12 @@ from gvtools.errors import MemoryFileError
 from gvtools.optional import require
 from gvtools.ply import read_header
 from gvtools.sandbox import Item, ReaderError, read_apart
-from gvtools.untrusted import PIXEL_BYTES, PIXEL_RATIO, parse_json, read_bytes
+from gvtools.untrusted import PIXEL_BYTES, PIXEL_RATIO, other_version, parse_json, read_bytes
 
 if TYPE_CHECKING:
     import trimesh
 
-GLB, JSON = b"glTF", b"JSON"
+GLB, JSON, GLB_VERSION = b"glTF", b"JSON", 2
 # What a vertex of a GLB takes in RAM, and how much there may be beside twice the file.
 VERTEX_BYTES, SPARE_BYTES = 128, 96 << 20
 # Of points without a colour.
@@ -103,6 +103,12 @@ def _checked_glb(path: Path, data: bytes) -> bytes:
 
     Arrays that are not in the file are refused, and more copies of meshes than it explains.
     """
+    version = int.from_bytes(data[4:8], "little")
+    if version > GLB_VERSION:
+        raise MemoryFileError(
+            f"{path}: glTF version {version}; expected {GLB_VERSION}; "
+            f"{other_version(version, GLB_VERSION, '')}"
+        )
     try:
         length, kind = struct.unpack_from("<I4s", data, 12)
         if kind != JSON or 20 + length > len(data):

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.errors import GvError, MemoryFileError, ProjectError
+from gvtools.errors import GvError, MemoryFileError, OptionError, ProjectError
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.optional import require
 from gvtools.ply import read_header
@@ -151,6 +151,11 @@ class ProjectFrames:
 def open_file(path: Path) -> RunView | None:
     """What a file shows; None where it is no export but, perhaps, a memory or a run."""
     suffix = path.suffix.lower()
+    if path.is_file() and suffix not in ("", ".npz", *OPENERS):
+        raise OptionError(
+            f"{path}: files that end with {suffix} are not opened; expected a run's folder, or "
+            f"{', '.join(('.npz', *OPENERS))}"
+        )
     if not path.is_file() or suffix not in OPENERS:
         return None
     try:
