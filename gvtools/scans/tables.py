@@ -226,6 +226,8 @@ def _pcd_table(given: Mapping[str, list[str]], offset: int) -> ScanTable:
     counts = [int(count) for count in given.get("COUNT", ["1"] * len(names))]
     columns: list[tuple[Any, ...]] = []
     for name, kind, size, count in zip(names, given["TYPE"], given["SIZE"], counts, strict=True):
+        if count == 0 and name not in READ:
+            continue
         if not 1 <= count <= 4096 or size not in SIZES:
             raise ValueError(f"COUNT {count}, SIZE {size[:9]}")
         # Gaps between fields have the name _, perhaps several times.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from gvtools.scenes.colmap_model import (
     sparse_points,
 )
 from gvtools.scenes.images import IMAGE_SUFFIXES
-from gvtools.scenes.matching import given_folder
+from gvtools.scenes.matching import given_folder, renamed
 from gvtools.scenes.photographs import PosedFrame, posed_scene
 from gvtools.scenes.scene import Finding, Scene
 from gvtools.scenes.undistort import LensParameters
@@ -69,8 +69,12 @@ def read_colmap(
     )
     depth_folder = _first([*homes, around], "stereo/depth_maps")
     frames = []
+    other = renamed(image_folder, [image.name for image in loaded.images])
     for frame in colmap_frames(
-        loaded, lambda image: named_file(image_folder, image.name, where=f"{folder}, an image")
+        loaded,
+        lambda image: named_file(
+            image_folder, other.get(image.name, image.name), where=f"{folder}, an image"
+        ),
     ):
         if mask_folder is not None:
             mask = named_file(mask_folder, f"{frame.name}.png", where=f"{mask_folder}, a mask")
@@ -82,7 +86,13 @@ def read_colmap(
     kinds = Counter(frame.depth.name.split(".")[-2] for frame in frames if frame.depth is not None)
     listed = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items()))
     findings = [Finding("info", f"depth maps: {listed}")] if listed else []
-    findings.append(_registered_finding(image_folder, loaded))
+    findings.append(_registered_finding(image_folder, loaded, other))
+    if other:
+        first = next(iter(other.items()))
+        line = (
+            f"{len(other)} pictures are named otherwise than in the model ({first[0]}: {first[1]})"
+        )
+        findings.append(Finding("info", f"{line}: taken, as each fits one name alone"))
     return replace(scene, findings=(*scene.findings, *findings))
 
 
@@ -164,9 +174,12 @@ def _first(homes: list[Path], name: str) -> Path | None:
     return next((home / name for home in homes if (home / name).is_dir()), None)
 
 
-def _registered_finding(image_folder: Path, model: ColmapModel) -> Finding:
+def _registered_finding(
+    image_folder: Path, model: ColmapModel, other: Mapping[str, str]
+) -> Finding:
     """How many of the pictures on disk the model knows, and through which cameras."""
-    known = {Path(image.name).as_posix() for image in model.images}
+    names = (other.get(image.name, image.name) for image in model.images)
+    known = {Path(name).as_posix() for name in names}
     others = 0
     for folder, _, files in os.walk(image_folder):
         relative = Path(folder).relative_to(image_folder)

@@ -8,7 +8,7 @@ longer fit its camera.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -74,8 +74,14 @@ def read_header(path: Path) -> ImageHeader:
     with _picture(path) as image:
         # Other formats are decoded whole when asked for EXIF.
         exif = image.getexif() if image.format in ("JPEG", "MPO") else {}
-        orientation = int(exif.get(_EXIF_ORIENTATION, 1) or 1)
-        return ImageHeader(image.width, image.height, image.mode, orientation)
+        return ImageHeader(image.width, image.height, image.mode, orientation_of(exif))
+
+
+def orientation_of(exif: Mapping[int, Any]) -> int:
+    """From 1 to 8, whatever type a program gave the tag; 1 where it says nothing."""
+    told = exif.get(_EXIF_ORIENTATION)
+    told = told[0] if isinstance(told, tuple | bytes) and told else told
+    return int(told) if str(told) in list("12345678") else 1  # type: ignore[arg-type]
 
 
 def read_image(path: Path, *, white: float = 65535) -> Frame:

@@ -161,6 +161,25 @@ def paired(first: Sequence[str], second: Sequence[str]) -> list[tuple[int, int]]
     return sorted(pairs.items())
 
 
+def renamed(folder: Path, names: Sequence[str]) -> dict[str, str]:
+    """For names that a folder does not hold, its one picture whose name is another form of it.
+
+    Separators, suffixes, case, Unicode's forms and leading folders may differ.
+    """
+    missing = [name for name in names if not is_file(folder / name)]
+    if not missing:
+        return {}
+    files = (path for path in sorted(folder.rglob("*")) if path.suffix.lower() in IMAGE_SUFFIXES)
+    others = {path.relative_to(folder).as_posix() for path in files} - {*names}
+    held = sorted(others)
+    try:
+        pairs = paired([stem(name).casefold() for name in missing],
+                       [stem(name).casefold() for name in held])  # fmt: skip
+    except DegenerateError:
+        return {}
+    return {missing[i]: held[row] for i, row in pairs}
+
+
 def listed_file(folder: Path, name: str, *, where: str) -> Path:
     r"""The path of a file that a list names, which has to lie in a folder, on disk or not.
 

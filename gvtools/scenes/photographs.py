@@ -50,6 +50,7 @@ Depth = NDArray[np.float32]
 MASKS = 8
 NO_PICTURE = "have no picture"
 NO_POSE = "have no pose"
+NAN_POSE = "have NaN in their pose"
 LOST = "were lost by the tracker"
 NO_LENS = "have no intrinsics"
 UNREADABLE = "have a damaged picture"
@@ -229,6 +230,8 @@ def _rigid(frame: PosedFrame, sieve: _Sieve, *, unposed: str) -> Float64:
         raise _LeftOut(unposed)
     if np.isinf(frame.pose).any():
         raise _LeftOut(LOST)
+    if np.isnan(frame.pose).any():
+        raise _LeftOut(NAN_POSE, frame.where or frame.name)
     try:
         rigid, defect = rigid_transform(frame.pose, what=frame.where or frame.name)
     except GvError as error:

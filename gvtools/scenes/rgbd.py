@@ -217,14 +217,28 @@ class _Tum(RgbdFolder):
     unit = 1 / 5000
 
     def matches(self, root: Path, *, posed: bool = True) -> bool:
-        return all((root / name).is_file() for name in self.holds[not posed].split(", "))
+        names = self.holds[not posed].split(", ")
+        if self._associated(root) is not None:
+            names = names[2:]
+        return all((root / name).is_file() for name in names)
+
+    def _associated(self, root: Path) -> Path | None:
+        """A list of pictures and their depth maps, where there is none of each."""
+        if (root / "rgb.txt").is_file():
+            return None
+        names = ("associations.txt", "associate.txt", "association.txt")
+        return next((root / name for name in names if (root / name).is_file()), None)
 
     def frames(self, root: Path, options: RgbdOptions) -> list[PosedFrame]:
         return [frame for _, frame in self._stamped(root, options)]
 
     def _stamped(self, root: Path, options: RgbdOptions) -> list[tuple[float, PosedFrame]]:
         lists = root / "rgb.txt", root / "depth.txt"
-        colors, depths = (_stamped_files(path) for path in lists)
+        if (both := self._associated(root)) is not None:
+            lists = both, both
+            colors, depths = _associated_files(both)
+        else:
+            colors, depths = (_stamped_files(path) for path in lists)
         times, depth_times = (np.array([time for time, _ in found]) for found in (colors, depths))
         depth_of = associate(times, depth_times, options.max_time_difference)
         frames = []
@@ -264,6 +278,19 @@ class _Tum(RgbdFolder):
         if off:
             unposed += f" (the nearest is {min(off):.3g} to {max(off):.3g} s off)"
         return replace(recording, frames=frames, unposed=unposed)
+
+
+def _associated_files(path: Path) -> tuple[list[tuple[float, str]], list[tuple[float, str]]]:
+    """Pictures and depth maps of a list of pairs, each with its stamp, in either order."""
+    lists: tuple[list[tuple[float, str]], list[tuple[float, str]]] = ([], [])
+    for stamp, rest in _stamped_files(path):
+        words = rest.split()
+        with reading(path, "expected stamp, picture, stamp and depth map in each line"):
+            pair = (stamp, words[0]), (float(words[1]), words[2])
+        depth_first = "depth" in pair[0][1]
+        lists[0].append(pair[depth_first])
+        lists[1].append(pair[not depth_first])
+    return lists
 
 
 def _stamped_files(path: Path) -> list[tuple[float, str]]:

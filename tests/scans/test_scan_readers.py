@@ -57,8 +57,8 @@ def test_pcd_keeps_double_coordinates_and_colours_packed_as_float(tmp_path):
         table[axis] = positions[:, k] + FAR[k]
     packed = colors.astype(np.uint32) @ np.array([1 << 16, 1 << 8, 1], np.uint32)
     table["rgb"] = packed.astype(np.uint32).view(np.float32)
-    lines = ["# .PCD v0.7", "VERSION 0.7", "FIELDS x y z _ rgb", "SIZE 8 8 8 1 4",
-             "TYPE F F F U F", "COUNT 1 1 1 4 1", "WIDTH 25", "HEIGHT 2",
+    lines = ["# .PCD v0.7", "VERSION 0.7", "FIELDS x y z _ normal rgb", "SIZE 8 8 8 1 4 4",
+             "TYPE F F F U F F", "COUNT 1 1 1 4 0 1", "WIDTH 25", "HEIGHT 2",
              "VIEWPOINT 0 0 0 1 0 0 0", "POINTS 50", "DATA binary", ""]  # fmt: skip
     path = tmp_path / "scan.pcd"
     path.write_bytes("\n".join(lines).encode() + table.tobytes())

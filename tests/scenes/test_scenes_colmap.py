@@ -253,3 +253,27 @@ def test_a_text_model_that_contradicts_the_binary_one_beside_it_is_said(tmp_path
     said = [found.message for found in read_colmap(tmp_path).findings]
     line = "cameras.bin is read, and cameras.txt beside it differs: camera 1 is PINHOLE [96.0, "
     assert any(line in message for message in said) == (focal != 90)
+
+
+@pytest.mark.parametrize(
+    "form",
+    [
+        lambda name: name.replace("/", "\\"),
+        lambda name: f"project/{name}",
+        lambda name: name.replace(".png", ".JPG"),
+        str.upper,
+        lambda name: name.rpartition("/")[2],
+    ],
+)
+def test_names_of_another_form_find_the_one_picture_that_fits(tmp_path, form):
+    reconstruction = workspace(tmp_path, "PINHOLE")
+    for number, image in enumerate(reconstruction.images.values()):
+        name = f"left/view{number}.png"
+        (tmp_path / "images" / image.name).rename(save(tmp_path / "images" / name, ramp()))
+        image.name = form(name)
+    reconstruction.write_binary(tmp_path / "sparse/0")
+    scene = read_colmap(tmp_path)
+    assert len(scene) == 4 and scene.views[0].load().rgb.shape == (HEIGHT, WIDTH, 3)
+    said = [found for found in scene.findings if "named otherwise" in found.message]
+    assert len(said) == 1 and said[0].message.startswith("4 pictures")
+    assert not [found for found in scene.findings if found.level == "warning"]

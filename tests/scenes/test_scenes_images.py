@@ -12,6 +12,7 @@ from gvtools.errors import ProjectError
 from gvtools.scenes.images import (
     check_size,
     fit_depth,
+    orientation_of,
     read_depth,
     read_header,
     read_image,
@@ -183,3 +184,13 @@ def test_what_is_no_picture_is_named_by_its_bytes(tmp_path, head, said):
     (tmp_path / "a.jpg").write_bytes(head + bytes(200))
     with pytest.raises(ProjectError, match=re.escape(said)):
         read_image(tmp_path / "a.jpg")
+
+
+@pytest.mark.parametrize("told", [6, (6,), b"\x06", "6", 0, 9, "x", b""])
+def test_orientation_tags_of_odd_types(tmp_path, told):
+    image = Image.fromarray(ramp())
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    image.save(tmp_path / "a.jpg", exif=exif)
+    assert orientation_of({0x0112: told}) == (6 if told not in (0, 9, "x", b"") else 1)
+    assert read_header(tmp_path / "a.jpg").orientation == 6

@@ -10,6 +10,7 @@ from scenes_workspace import HEIGHT, WIDTH, pose_matrix, ramp, save, sevenscenes
 
 from gvtools.errors import GvError, OptionError, ProjectError, ShapeError
 from gvtools.scenes.matching import associate
+from gvtools.scenes.project import open_project
 from gvtools.scenes.rgbd import PUBLISHED, REDWOOD, SCANNET, SEVENSCENES, TUM, RgbdOptions
 
 
@@ -65,7 +66,6 @@ def test_sevenscenes_intrinsics_in_the_parent_or_nowhere(tmp_path):
     [
         (lambda pose: pose * np.array([[2.0], [2], [2], [1]]), r"scale 2"),
         (lambda pose: pose * np.array([1, 1, -1.0, 1]), "determinant -1"),
-        (lambda pose: pose + np.where(np.eye(4) > 0, np.nan, 0), "NaN"),
         (lambda pose: pose[:2], "2x4 numbers\\); expected 4x4 or 3x4"),
     ],
 )
@@ -76,6 +76,31 @@ def test_impossible_poses_name_their_file(tmp_path, change, told):
         SEVENSCENES.read(root)
     assert "frame-000001.pose.txt" in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_a_pose_with_nan_leaves_its_frame_out(tmp_path):
+    root = sevenscenes(tmp_path)
+    np.savetxt(root / "frame-000001.pose.txt", pose_matrix() * np.nan)
+    scene = SEVENSCENES.read(root)
+    assert len(scene) == 2
+    assert "1 of 3 frames have NaN in their pose: dropped (frame-000001" in messages(scene)
+
+
+@pytest.mark.parametrize("order", ["rgb depth", "depth rgb"])
+def test_tum_of_associations_alone(tmp_path, order):
+    whole = TUM.read(tum(tmp_path / "whole"))
+    root = tum(tmp_path / "recording")
+    lists = {}
+    for name in ("rgb", "depth"):
+        lines = (root / f"{name}.txt").read_text().splitlines()
+        lists[name] = [line for line in lines if not line.startswith("#")]
+        (root / f"{name}.txt").unlink()
+    first, second = (lists[name] for name in order.split())
+    lines = [f"{a} {b}" for a, b in zip(first, second, strict=False)]
+    (root / "associations.txt").write_text("\n".join(lines))
+    scene = open_project(root)
+    assert scene.names == whole.names and all(view.has_depth for view in scene)
+    np.testing.assert_array_equal(scene.cameras.K, whole.cameras.K)
 
 
 @pytest.mark.parametrize("codes", [[[90, 5, 0], [0, 90, 0], [0, 0, 1]], [[0, 0, 0]] * 3])
