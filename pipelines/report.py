@@ -26,7 +26,7 @@ from gvtools.runs.run import Run, load_run
 from gvtools.runs.target_files import SUPPORT_SCANNED, entry_camera, read_picture
 from gvtools.settings import dotted
 from gvtools.untrusted import read_json
-from gvtools.view_selection import nearest_views
+from gvtools.view_selection import evenly_spread, nearest_views
 from pipelines.reconstruction.plan import scan_line
 from pipelines.reconstruction.settings import RunSettings
 from viz.plots.trajectories import Trajectories
@@ -43,6 +43,8 @@ if TYPE_CHECKING:
 PAGE, GROWTH = "report.html", "growth.png"
 EVALUATION = "evaluation/evaluation.json"
 PICTURES = 12
+# Of a round, from 1, that the paper's figure shows.
+FRAMES = (1, 3, 5)
 # Decoding and compressing leave the interpreter alone.
 READERS = 2
 
@@ -451,6 +453,28 @@ def _pictures(
         context=None if given is None else given[1],
         context_name="" if given is None else given[0],
     )
+
+
+def frame_rows(run: Run) -> list[tuple[str, list[NDArray[np.uint8] | None]]]:
+    """Labels, and completed and true picture of each: two context views, then FRAMES of a round."""
+    if not run.views:
+        raise ProjectError(
+            f"{run.path}: no target is completed yet; expected a round; add --resume"
+        )
+    sources = open_sources(run)
+    columns: list[tuple[str, list[NDArray[np.uint8] | None]]] = []
+    if sources.scene is not None:
+        for name in evenly_spread(run.context, 2):
+            columns.append((f"given: {name}", [sources.scene[name].load().rgb] * 2))
+    for number in range(1, len(run.rounds)):
+        of_round = [target for target in run.views if target.round == number]
+        for frame in FRAMES:
+            if frame <= len(of_round):
+                target = of_round[frame - 1]
+                truth = sources.truths.get(target.name)
+                pictures = [target.read().picture, None if truth is None else truth.load().rgb]
+                columns.append((f"round {number}, {frame}: {target.name}", pictures))
+    return columns
 
 
 def _nearest_context(

@@ -67,8 +67,8 @@ STEPS = {
     ),
     "base": (
         *GLD_STEPS,
-        "without video/ the folder is gld, and base begins as that: nothing published is trained "
-        "to use the video prior",
+        "these files are gld, with or without video/, and base begins as that: nothing published "
+        "is trained to use the video prior",
         "for training: gvtools weights fetch wan-vace --to WAN, gvtools weights truncate-wan WAN "
         "DIR/video, gvtools weights empty-prompt WAN DIR/video",
         "gvtools train base --init DIR --out TRAINING, then gvtools weights pack TRAINING WEIGHTS",

@@ -12,7 +12,7 @@ from gvtools.errors import OptionError, ProjectError
 from gvtools.scenes.scene import Scene, View
 from gvtools.settings import changes
 
-CHOICES = ("auto", "sensor", "colmap", "plane-sweep", "da3")
+CHOICES = ("auto", "sensor", "colmap", "plane-sweep", "da3", "sensor-or-da3")
 # Of a rough estimate: longer side of the pictures that are compared, pixels, and their levels.
 # The voxel edge from eight views is then within 10 % of that from sparse points or from full depth,
 # measured on four scenes.
@@ -43,8 +43,8 @@ def choose_source(
     "auto" takes recorded depth where there is some and computes the rest: by Depth Anything 3 where
     its weights are given, by COLMAP's PatchMatch where pycolmap has CUDA, otherwise by plane-sweep
     stereo. Of CHOICES, ``sensor`` wants RGB-D, ``colmap`` COLMAP's stereo maps, on disk or computed
-    now, ``plane-sweep`` photographs alone, ``da3`` a foundation model's weights. Nothing but
-    ``views`` is looked at.
+    now, ``plane-sweep`` photographs alone, ``da3`` a foundation model's weights, ``sensor-or-da3``
+    these for what has no recorded depth. Nothing but ``views`` is looked at.
     """
     chosen = _chosen(
         scene, views, choice, stereo=stereo, foundation=foundation or FoundationOptions()
@@ -102,11 +102,11 @@ def _chosen(
         return ChosenSource(_stereo(scene, views, stereo), "asked for")
     if recorded == len(views):
         return ChosenSource(RecordedDepth(views), "every context view has recorded depth")
-    if recorded and len(views) < 2 and foundation.weights is None:
+    if recorded and len(views) < 2 and foundation.weights is None and choice == "auto":
         return ChosenSource(RecordedDepth(), "a single view leaves nothing to compute from")
-    if foundation.weights is not None:
+    if choice == "sensor-or-da3" or foundation.weights is not None:
         source = _foundation(scene, views, foundation)
-        how = "Depth Anything 3, as weights are given"
+        how = f"Depth Anything 3, as weights are given: {foundation.weights}"
     elif has_patch_match() and scene.points is not None and len(views) > 1:
         source, how = ColmapPatchMatch(scene, views), "COLMAP's PatchMatch, as there is CUDA"
     else:

@@ -71,13 +71,15 @@ class Pass:
     unit: float  # scene units a unit of the known cameras that the network saw; 1 without them
 
 
-def fit_scale(scene: Scene, passes: Sequence[Pass]) -> FoundationScale:
+def fit_scale(
+    scene: Scene, passes: Sequence[Pass], *, min_centres: int = MIN_CENTRES
+) -> FoundationScale:
     """One scale for some passes: by their sparse points, or by their cameras' centres."""
     by_points = _fit_points(scene, passes)
     # Points that fit no scale refuse the depth itself; what the centres say does not mend it.
     if by_points.ok or by_points.count >= MIN_POINTS_IN_ALL:
         return by_points
-    by_cameras = _fit_cameras(scene, passes)
+    by_cameras = _fit_cameras(scene, passes, min_centres=min_centres)
     if by_cameras.ok or scene.points is None:
         return by_cameras
     return by_points
@@ -99,7 +101,7 @@ def _fit_points(scene: Scene, passes: Sequence[Pass]) -> FoundationScale:
     return FoundationScale(fitted.status, "points", fitted.scale, fitted.support)
 
 
-def _fit_cameras(scene: Scene, passes: Sequence[Pass]) -> FoundationScale:
+def _fit_cameras(scene: Scene, passes: Sequence[Pass], *, min_centres: int) -> FoundationScale:
     """The median of the passes' own fits, weighted by their views; see ``MIN_CENTRES``."""
     import torch
 
@@ -118,11 +120,11 @@ def _fit_cameras(scene: Scene, passes: Sequence[Pass]) -> FoundationScale:
         else:
             scales.append(float(fitted.scale[0]))
             weights.append(len(part.names))
-    if scales and max(weights) < MIN_CENTRES:
+    if scales and max(weights) < min_centres:
         # Each of them would fit by chance; several that agree do not.
         agree = len(scales) >= MIN_PASSES and max(scales) <= PASSES_AGREE * min(scales)
         if not agree:
-            reason = f"{max(weights)} views a pass, at least {MIN_CENTRES} are needed"
+            reason = f"{max(weights)} views a pass, at least {min_centres} are needed"
             scales = []
     if not scales:
         return FoundationScale(f"unsupported: {reason}", "cameras", np.nan, 0)
@@ -213,7 +215,7 @@ class FoundationDepth:
             self._passes |= dict.fromkeys(made.names, made)
         sharing = [passes] if self.options.cameras else [[made] for made in passes]
         for together in sharing:
-            fitted = fit_scale(self._scene, together)
+            fitted = fit_scale(self._scene, together, min_centres=self.options.min_centres)
             for made in together:
                 self._scales |= dict.fromkeys(made.names, fitted)
 

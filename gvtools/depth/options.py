@@ -86,6 +86,9 @@ class FoundationOptions(Settings):
     cameras: bool = True
     """The known cameras go into the network. Without them every pass has a unit of its own, and
     each needs its own support for a scale."""
+    min_centres: int = Field(4, ge=2)
+    """A pass whose scale rests on camera centres alone needs so many; 2 are the fewest that have a
+    scale (the paper), and any two fit."""
     min_confidence: float = Field(0.2, ge=0, lt=1)
     """Pixels below this, of 1 - 1 / (the head's confidence), are left empty."""
     precision: Precision = "auto"

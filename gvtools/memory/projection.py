@@ -139,7 +139,8 @@ class Projection:
             np.zeros(shape, flag), np.zeros(shape, single), np.zeros(shape, flag),
             np.zeros(shape, flag),
         )  # fmt: skip
-        self.scale, self.tiers, self.size = 0.0, 0, options.nearest_views
+        self.scale, self.tiers = 0.0, 0
+        self.size = options.nearest_views or max(1, len(store.views))
         self.tier = np.full(len(store.views), -1)
         if observed is None:
             self.observe()

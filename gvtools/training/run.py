@@ -237,19 +237,20 @@ class StageRun:
                 own, flow = self.model_config.flow, made_for.flow
                 flow = replace(own, level1=flow.level1, cfg_scale=flow.cfg_scale)
                 self.model_config = replace(self.model_config, flow=flow)
-        model = self._model_of(source)
-        if model.without_video:
+        if self.model_config.video is not None and not (source / VIDEO_FOLDER).is_dir():
             raise CheckpointError(
                 f"{source}: no {VIDEO_FOLDER}/; training {self.model_config.name} needs the video "
                 "prior; make it with gvtools weights truncate-wan, or train a model with injection "
                 "= 'none'"
             )
-        return model
+        return self._model_of(source)
 
     def _model_of(self, source: Path) -> GeoVerse:
         """The model of a weights folder: its refiner is left out, or a fresh one put in."""
         wanted, found = self.model_config.refiner, config_of(source).refiner
-        model = from_pretrained(source, config=replace(self.model_config, refiner=found))
+        model = from_pretrained(
+            source, config=replace(self.model_config, refiner=found), video=True
+        )
         if wanted == found:
             return model
         with torch.random.fork_rng(devices=[]):

@@ -152,11 +152,12 @@ class PlotCommand(Arguments):
     )
     positional = ("what", "folder")
 
-    what: Literal["growth", "coverage", "timing", "trajectories", "losses"]
+    what: Literal["growth", "coverage", "timing", "trajectories", "frames", "losses"]
     """growth: of a run: what is stored, what became of the points, coverage, time; coverage: of a
     run: coverage against round; timing: of a run: time by stage and by round; trajectories: of a
-    run: given, requested and estimated cameras; losses: of a training, or of one stage's folder:
-    loss curves."""
+    run: given, requested and estimated cameras; frames: of a run: two context views, then targets
+    1, 3 and 5 of each round, and their photographs (the paper's figure); losses: of a training, or
+    of one stage's folder: loss curves."""
     folder: Path
     """Of the run or training. [DIR]"""
     out: Path
@@ -196,6 +197,11 @@ def _figure(what: str, folder: Path) -> Figure:
         if poses is None:
             raise ProjectError(f"{folder}: no cameras to draw ({sources.problem or 'no rounds'})")
         return draw_trajectories(poses, title=title)
+    if what == "frames":
+        from pipelines.report import frame_rows
+        from viz.plots.frames import draw_frames
+
+        return draw_frames(frame_rows(run), title=title)
     if what in ("growth", "coverage"):
         from viz.plots.rounds import draw_growth
 

@@ -172,7 +172,7 @@ class CreateWeights(Arguments):
         )
         if config.video is not None and not (folder / VIDEO_FOLDER).is_dir():
             console.line(
-                f"it needs the video prior as well: gvtools weights truncate-wan SOURCE "
+                f"its training needs the video prior as well: gvtools weights truncate-wan SOURCE "
                 f"{folder / VIDEO_FOLDER}"
             )
 

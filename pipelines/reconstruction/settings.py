@@ -99,18 +99,20 @@ ACCURATE: Mapping[str, Any] = {
 
 
 # The paper's: GeoVerse alone, whole decoded views, all of their pixels fused at the scale that maps
-# generated camera centres onto the given ones, no shortcuts.
+# generated camera centres onto the given ones, no shortcuts. How a model samples is its own. The
+# table of docs/concepts/protocol.md has a row for each, with its place in the paper.
 PAPER: Mapping[str, Any] = {
     "completer": "geoverse",
+    "depth": "sensor-or-da3",
+    "da3.min_centres": 2,
     "completer.output": "views",
     "completer.composition": "decoded",
-    "completer.alignment": "centres",
+    "completer.alignment": "centres-alone",
     "completer.color_alignment": "unchanged",
-    "completer.steps": 3,
-    "completer.cascade_steps": 1,
-    "completer.cfg_scale": 1.0,
-    "completer.cascade_cfg_scale": 1.0,
     "completer.temperature": 1.0,
+    "splat.nearest_views": None,
+    "splat.view_weight": 0.0,
+    "splat.occluders": False,
     "effort.inpaint_below": 0.0,
     "fusion.pixels": "all",
     "fusion.generated_as_observed": True,
@@ -161,7 +163,8 @@ class RunSettings(Settings):
     max_side: int | None = Field(1600, ge=SMALLEST)
     """Longer side that larger pictures are reduced to; none keeps all. [px]"""
     depth: str = "auto"
-    """Where the context's depth comes from: auto, sensor, colmap, plane-sweep or da3."""
+    """Where the context's depth comes from: auto, sensor, colmap, plane-sweep, da3, or (the paper)
+    sensor-or-da3, whose weights are the completer's unless ``da3.weights`` says otherwise."""
     completer: str = "inpaint"
     """What fills the holes, by registered name; ``completer.KEY`` is an option of its own."""
     profile: str = "balanced"

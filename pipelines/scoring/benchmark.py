@@ -57,7 +57,11 @@ if TYPE_CHECKING:
 
 MEASURED = "measured"
 DEFAULT = "default"
-PAPER = "paper"
+# Settings of the paper's protocol, and of its ablation "w/o spatial memory".
+PAPER: Mapping[str, Mapping[str, Any]] = {
+    "paper": {"protocol": "paper"},
+    "paper-without-memory": {"protocol": "paper", "completer.memory": False},
+}
 # Names become names of files.
 _NAME = re.compile(r"\w[\w+. -]*")
 # Figures of poses and of consistency between views; the others compare pictures with their truth.
@@ -86,8 +90,9 @@ class Method:
 def parse_methods(text: str) -> tuple[Method, ...]:
     """Methods with commas between them.
 
-    Each is ``default``, a profile, a completer, ``paper`` (its protocol), ``NAME=FILE.json`` (a
-    file of settings) or ``NAME=DIR`` (pictures of another method).
+    Each is ``default``, a profile, a completer, ``paper`` (its protocol), ``paper-without-memory``
+    (its ablation), ``NAME=FILE.json`` (a file of settings) or ``NAME=DIR`` (pictures of another
+    method).
     """
     methods = tuple(_parsed(part.strip()) for part in text.split(",") if part.strip())
     names = [method.name for method in methods]
@@ -106,14 +111,14 @@ def _parsed(text: str) -> Method:
         return _of_path(name.strip(), Path(path.strip()).expanduser())
     if text == DEFAULT:
         return Method(name=text)
-    if text == PAPER:
-        return Method(name=text, settings={"protocol": "paper"})
+    if text in PAPER:
+        return Method(name=text, settings=PAPER[text])
     profiles = RunSettings.presets["profile"]
     if text in profiles:
         return Method(name=text, settings={"profile": text})
     if text in available():
         return Method(name=text, settings={"completer": text})
-    known = (DEFAULT, PAPER, *profiles, *available())
+    known = (DEFAULT, *PAPER, *profiles, *available())
     raise OptionError(f"{unknown('method', text, known)}; NAME=DIR gives pictures")
 
 

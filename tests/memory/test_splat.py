@@ -218,6 +218,20 @@ def test_an_object_that_only_a_far_view_saw_is_let_through(center, backend):
     assert (unseen.rgb[0, ..., 0] == 0).all()
 
 
+@pytest.mark.parametrize("backend", ["cpu", "torch"])
+def test_in_one_tier_the_z_buffer_alone_decides(backend):
+    """As the paper projects: what is nearest shows, whichever view saw it and whatever it saw."""
+    memory, target = _scene_with_a_far_witness(saw_through=True)
+    options = SplatOptions(
+        nearest_views=None, view_weight=0, occluders=False, backend=backend, device="cpu"
+    )
+    seen = project(memory, target, options=options)
+    thing = (abs(2 * target.rays()[..., :2]) < 0.27).all(-1)
+    assert (seen.rgb[0, ..., 0] > 0.9)[thing].all()
+    np.testing.assert_allclose(seen.depth[0][thing], 2, rtol=1e-5)
+    assert_same(seen, reference_project(memory, target, options))
+
+
 def test_an_object_whose_place_a_near_view_saw_to_be_free_is_not():
     memory, target = _scene_with_a_far_witness(saw_through=True)
     seen = project(memory, target, options=SplatOptions(nearest_views=1))

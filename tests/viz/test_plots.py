@@ -189,7 +189,7 @@ def test_a_panel_that_is_not_there():
     assert Image.open(io.BytesIO(png(draw_growth(rounds(), panels=["time"])))).size == (564, 408)
 
 
-@pytest.mark.parametrize("kind", ["growth", "coverage", "timing", "trajectories"])
+@pytest.mark.parametrize("kind", ["growth", "coverage", "timing", "trajectories", "frames"])
 def test_each_figure_of_a_run_from_the_command_line(small_run, tmp_path, kind):
     assert main(["plot", kind, str(small_run), "--out", str(tmp_path / "f.png"), "--quiet"]) == 0
     assert np.asarray(Image.open(tmp_path / "f.png").convert("L")).std() > 10

@@ -36,7 +36,11 @@ from gvtools.completers.geoverse.conditioning import fill_holes
 from gvtools.completers.geoverse.flow import interval_bounds
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.completers.geoverse.views import choose_views, context_depth, model_size, view_batch
-from gvtools.completers.geoverse.weights import check_headers, from_pretrained
+from gvtools.completers.geoverse.weights import (
+    check_headers,
+    from_pretrained,
+    untrained_branches,
+)
 from gvtools.completers.push_pull import Filled
 from gvtools.completers.settings import CompleterSettings
 from gvtools.errors import OptionError
@@ -52,8 +56,8 @@ class GeoVerseSettings(CompleterSettings):
     """Folder of a GeoVerse model, see ``gvtools weights list``; none takes the small model that
     ships."""
     steps: int | None = Field(None, ge=0)
-    """Level-1 steps, equally spaced in time before the model's time shift; 0 decodes the features
-    of the filled projections."""
+    """Level-1 steps, equally spaced in time before the model's time shift, but for the model's own
+    number of them, which keeps its own times; 0 decodes the features of the filled projections."""
     cascade_steps: int | None = Field(None, ge=1)
     """Level-0 steps, likewise."""
     cfg_scale: float | None = Field(None, ge=0)
@@ -72,9 +76,13 @@ class GeoVerseSettings(CompleterSettings):
     stand and look most like them."""
     views: int | None = Field(None, ge=2)
     """Most views in a pass, photographs and targets."""
-    alignment: Literal["centres", "hint", "field"] | None = None
+    memory: bool = True
+    """Whether the targets' projections enter the model; without, whole views are generated from
+    the photographs and the cameras (the paper's ablation), so ``output`` has to be ``views``."""
+    alignment: Literal["centres", "centres-alone", "hint", "field"] | None = None
     """How decoded depth gets the memory's scale: by camera centres, by one factor to the memory's
-    depth, or by a smooth field of factors."""
+    depth, or by a smooth field of factors, each where nothing known contradicts it; or by camera
+    centres whatever is known (the paper)."""
     color_alignment: Literal["unchanged", "field"] | None = None
     """Whether decoded colours follow the memory's by a smooth field."""
     composition: Literal["decoded", "correction"] | None = None
@@ -128,6 +136,11 @@ class GeoVerseCompleter(Completer):
         # A folder that cannot be a model is refused before anything is computed.
         self.config = check_headers(str(self.folder.resolve()))
         form = self.config.composition
+        if not self.settings.memory and self.settings.output != "views":
+            raise OptionError(
+                "completer.memory = false with completer.output = 'holes': nothing tells what the "
+                "holes are; give completer.output=views too (--protocol paper has it)"
+            )
         if self.settings.composition == "correction" and form != "correction":
             raise OptionError(
                 f"completer.composition = 'correction', and the model in {self.folder} is of the "
@@ -154,10 +167,10 @@ class GeoVerseCompleter(Completer):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """A warning if the weights are untrained."""
-        if self.config.trained:
-            return ()
-        return (f"the weights in {self.folder} are untrained: what they complete is noise",)
+        """Warnings of weights, or branches of them, that are untrained."""
+        if not self.config.trained:
+            return (f"the weights in {self.folder} are untrained: what they complete is noise",)
+        return untrained_branches(self.folder, self.config)
 
     @property
     def files(self) -> tuple[Path, ...]:
@@ -177,6 +190,8 @@ class GeoVerseCompleter(Completer):
             raise OptionError("completer geoverse needs at least one context view, and got none")
         check_views(context, guidance)
         whole = self.settings.output == "views"
+        if not self.settings.memory:
+            guidance = guidance.blank()
         has_holes = ~guidance.valid.all(axis=(1, 2)) | whole
         incomplete, complete = (np.flatnonzero(which).tolist() for which in (has_holes, ~has_holes))
         # A pass is one run of the model over at most ``views`` views: first the context views,
@@ -223,7 +238,7 @@ class GeoVerseCompleter(Completer):
 
         def bounds(steps: int | None, own: tuple[float, ...]) -> tuple[float, ...]:
             """Times 1 = tau_0 > ... > tau_K = 0 of K Euler steps; empty if nothing is denoised."""
-            if steps is None:
+            if steps is None or steps == len(own) - 1:
                 return own
             return interval_bounds(steps, shift=flow.sampling_shift) if steps else ()
 

@@ -171,7 +171,7 @@ def to_scene_scale(
         rgb = align_color(rgb, hint, torch.from_numpy(guidance.valid)[:, None])
     depth = resample_depth(generated.decoded.depth[0].float().cpu(), full)
     world_from_cam = cameras.world_from_cam
-    whole = pass_scale(geometry, world_from_cam, known)
+    whole = pass_scale(geometry, world_from_cam, known, alignment=alignment)
     # A pixel without a colour has no depth either: nothing of it enters the memory.
     depth = torch.where(rgb.isfinite().all(1), depth, torch.nan)
     scaled = scale_depth(depth, guidance.depth, guidance.valid, whole=whole, alignment=alignment)

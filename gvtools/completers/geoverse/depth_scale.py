@@ -1,8 +1,9 @@
 """The model's depth in the memory's scale.
 
-Three ways, the first the paper's: one scale a pass from camera centres (Eq. "scale-aligned"), one
-robust scale a view from the projected memory, or a smooth field of log ratios to it. Each is
-refused where nothing supports it, and then the next one is tried.
+Three ways: one scale a pass from camera centres (Eq. "scale-aligned"), one robust scale a view from
+the projected memory, or a smooth field of log ratios to it. Each is refused where nothing supports
+it, and then the next one is tried. "centres-alone" is the paper's: always the first, whatever is
+known; there is none where fewer than two centres stand apart.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from gvtools.similarity import ScaleFit, align_depth_scale
 # Fewer centres fit each other by chance: of four at random, one set in a hundred correlates by more
 # than 0.956, of three by 0.998, of two by 1.
 MIN_CENTRES, MIN_CORRELATION = 4, 0.97
+CENTRES_ALONE = "centres-alone"
 # Depth that is off what is known by more than this factor, in the median, is refused where at least
 # so many pixels know both.
 MAX_FACTOR, MIN_SUPPORT = 1.35, 200
@@ -65,8 +67,12 @@ def pass_scale(
     world_from_cam: NDArray[np.float64],  # (V, 4, 4), scene units
     # (C, H, W) depth of the context views at the model's size, scene units; 0 = none.
     known: NDArray[np.float32],
+    *,
+    alignment: str = "centres",
 ) -> PassScale:
     """s* from the camera centres, unless the context's own depth says otherwise."""
+    if alignment == CENTRES_ALONE:
+        return centre_scale(geometry, world_from_cam, min_centres=2, min_correlation=-1)
     centres = centre_scale(geometry, world_from_cam)
     generated = geometry.depth[0, : len(known)].float().cpu().numpy().astype(np.float64)
     fit = _fit_scale(generated, known, known > 0)
@@ -80,7 +86,13 @@ def pass_scale(
     return replace(centres, scale=fit.scale, status=ScaleStatus.CONTEXT_DEPTH)
 
 
-def centre_scale(geometry: ViewGeometry, world_from_cam: NDArray[np.float64]) -> PassScale:
+def centre_scale(
+    geometry: ViewGeometry,
+    world_from_cam: NDArray[np.float64],
+    *,
+    min_centres: int = MIN_CENTRES,
+    min_correlation: float = MIN_CORRELATION,
+) -> PassScale:
     """s* between predicted and requested camera centres (V), where they support it."""
     refused = PassScale(float("nan"), ScaleStatus.UNSUPPORTED)
     try:
@@ -94,7 +106,7 @@ def centre_scale(geometry: ViewGeometry, world_from_cam: NDArray[np.float64]) ->
     found = PassScale(
         float(fit.scale[0]), centres=int(fit.used[0]), correlation=float(fit.correlation[0])
     )
-    if found.centres < MIN_CENTRES or found.correlation < MIN_CORRELATION:
+    if found.centres < min_centres or found.correlation < min_correlation:
         return replace(found, scale=float("nan"), status=ScaleStatus.UNSUPPORTED)
     return found
 
@@ -105,7 +117,7 @@ def scale_depth(
     valid: NDArray[np.bool_],  # (T, H, W) where it is known
     *,
     whole: PassScale,  # the scale of the pass
-    alignment: str,  # "centres", "hint" or "field"
+    alignment: str,  # "centres", "centres-alone", "hint" or "field"
 ) -> ScaledDepth:
     """Depth of target views in scene units."""
     unscaled = depth.float().cpu().numpy().astype(np.float32)
@@ -116,7 +128,7 @@ def scale_depth(
     # One scale a pass: a view that contradicts it refutes it for the others too.
     # No scale helps where scaled depth is far from the memory's.
     far = (_deviation(view * whole.scale, h, v)[0] > np.log(MAX_FACTOR) for view, h, v in views)
-    if any(far):
+    if alignment != CENTRES_ALONE and any(far):
         whole = replace(whole, scale=float("nan"), status=ScaleStatus.CONTRADICTED)
     for index, (view, known, where) in enumerate(views):
         scale[index], outcome = _view_scale(view, known, where, whole=whole, alignment=alignment)
@@ -149,6 +161,7 @@ def _view_scale(
         "centres": ("centres", "hint"),
         "hint": ("hint", "centres"),
         "field": ("field", "hint", "centres"),
+        CENTRES_ALONE: ("centres",),
     }[alignment]
 
     def outcome(
@@ -159,7 +172,8 @@ def _view_scale(
 
     for scale, status in (candidates[name] for name in order):
         deviation, overlap = _deviation(depth * scale, hint, valid)
-        if np.isfinite(scale) and not deviation > np.log(MAX_FACTOR):
+        near = alignment == CENTRES_ALONE or not deviation > np.log(MAX_FACTOR)
+        if np.isfinite(scale) and near:
             return scale, outcome(status, 1.0, float(np.expm1(deviation)), overlap=overlap)
     contradicted = np.isfinite(fit.residual) or whole.status is ScaleStatus.CONTRADICTED
     status = ScaleStatus.CONTRADICTED if contradicted else ScaleStatus.UNSUPPORTED

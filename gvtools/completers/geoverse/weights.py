@@ -2,7 +2,8 @@
 
 A weights folder is one of two: our own (``config.json`` and ``geoverse.safetensors`` with every
 tensor), or one of published files as they were downloaded, which make ``gld`` and ``base``. The
-video prior lies in ``video/`` of either. Loading and checking both go through ``examine``, so that
+video prior lies in ``video/`` of either, and is not needed before a branch of the model is trained
+to take its features. Loading and checking both go through ``examine``, so that
 what passes the check can be loaded.
 
 Facts about published files (names, sizes, licences, key prefixes) are those of their publishers'
@@ -273,7 +274,7 @@ def check_is_folder(folder: Path) -> None:
 
 
 def config_of(folder: Path) -> GeoVerseConfig:
-    """The folder's own, or that of published files: ``base`` with a video prior, else ``gld``."""
+    """The folder's own, or that of published files: ``gld``, as which alone they are trained."""
     check_is_folder(folder)
     if (folder / CONFIG_FILE).is_file():
         return configs.read(folder / CONFIG_FILE)
@@ -282,7 +283,7 @@ def config_of(folder: Path) -> GeoVerseConfig:
             f"{folder}: {WHOLE_FILE} without its {CONFIG_FILE}; expected both; save or copy the "
             "model again"
         )
-    config = configs.named("base" if (folder / VIDEO_FOLDER).is_dir() else "gld")
+    config = configs.named("gld")
     if any(part.find(folder) for part in parts_of(config)):
         return config
     raise CheckpointError(
@@ -359,14 +360,21 @@ def check_folder(folder: Path | str, config: GeoVerseConfig | None = None) -> li
     config = config or config_of(folder)
     model = empty_model(config, where=folder)
     reports = [examine(folder, part, model)[0] for part in parts_in(folder, config)]
-    if config.video is not None and not needs_video(folder, config):
+    video, expected = folder / VIDEO_FOLDER, config.video
+    if expected is None and video.is_dir() and not (folder / CONFIG_FILE).is_file():
+        # Beside published files it waits for a training of ``base``.
+        expected = configs.named("base").video
+    needed = needs_video(folder, config)
+    if expected is not None and not needed and not video.is_dir():
         absent = "absent, and not needed before the branch that takes its features is trained"
         reports.append(PartReport("video", None, True, absent))
-    elif config.video is not None:
-        video = folder / VIDEO_FOLDER
+    elif expected is not None:
         try:
             check_video_folder(video)
-            summary = VideoPrior.from_pretrained(video, config=config.video, device="meta").summary
+            summary = VideoPrior.from_pretrained(video, config=expected, device="meta").summary
+            summary += (
+                "" if needed else "; not run: the branch that takes its features is untrained"
+            )
             size = sum(path.stat().st_size for path in video.rglob("*.safetensors"))
             reports.append(PartReport("video", video, True, summary, bytes=size))
         except CheckpointError as error:
@@ -389,13 +397,44 @@ def check_headers(folder: Path | str) -> GeoVerseConfig:
 def needs_video(folder: Path, config: GeoVerseConfig) -> bool:
     """Whether a model is to be loaded with its video prior.
 
-    Published files come without the control branch, whose outputs are then zero: without features
-    of a video model the result is the same to the bit, and 15 GB are not needed.
+    Published files come without the branch that takes its features, and a branch of one's own may
+    be untrained: its outputs are then zero, without features the result is the same to the bit,
+    and 15 GB are not needed.
     """
     if config.video is None:
         return False
-    there = (folder / VIDEO_FOLDER).is_dir()
-    return there or config.injection != "control" or WHOLE.find(folder) is not None
+    if config.injection == "control":
+        return not _is_zero(folder, "control.outputs.")
+    return not (config.shared.gated and _is_zero(folder, "shared.gates"))
+
+
+def _is_zero(folder: Path, start: str) -> bool:
+    """Whether an extension's tensors are zero, as they begin: published files hold none of them."""
+    path = WHOLE.find(folder)
+    if path is None:
+        return True
+    files = TensorFiles.find(path)
+    names = [name for name in files.places if name.startswith(start)]
+    return bool(names) and not any(bool(files.read(name).any()) for name in names)
+
+
+def untrained_branches(folder: Path, config: GeoVerseConfig) -> tuple[str, ...]:
+    """A note for every part of a folder whose branch no training has made useful yet."""
+    notes, video = [], folder / VIDEO_FOLDER
+    published = WHOLE.find(folder) is None
+    if published and config.hints.encode == "context":
+        notes.append(
+            f"{folder}: published files, trained without a memory: they complete from the "
+            "photographs and the cameras alone, and the memory only keeps what was completed"
+        )
+    elif config.level1.depth_condition and _is_zero(folder, "level1.depth_embedder."):
+        notes.append(f"{folder}: the embedder of projected depth is untrained and has no effect")
+    if video.is_dir() and not needs_video(folder, config):
+        notes.append(
+            f"{video}: neither loaded nor run, as the branch that takes its features is "
+            f"untrained; gvtools train base --init {folder} trains it"
+        )
+    return tuple(notes)
 
 
 def check_video_folder(folder: Path) -> None:
@@ -415,8 +454,9 @@ def from_pretrained(
     device: torch.device | str = "cpu",  # of the weights
     # Of the autocast that the model is run in, see ``GeoVerse.hold_in``.
     dtype: torch.dtype = torch.float32,
-    # Load the video prior, where the configuration has one; see ``needs_video``.
-    video: bool = True,
+    # Load the video prior: where it has an effect (``needs_video``), or wherever the configuration
+    # has one, as a training needs it, or not.
+    video: bool | None = None,
     # Whether its weights leave the device between passes, see ``VideoPrior``.
     offload: str = "auto",
 ) -> GeoVerse:
@@ -428,7 +468,8 @@ def from_pretrained(
     check_is_folder(folder)
     config = config or config_of(folder)
     model = empty_model(config, where=folder)
-    wanted, video = video, video and needs_video(folder, config)
+    wanted, has = video is not False, config.video is not None
+    video = has and (needs_video(folder, config) if video is None else video)
     if video:
         check_video_folder(folder / VIDEO_FOLDER)
     tensors = _tensors(folder, model)
@@ -444,7 +485,7 @@ def from_pretrained(
             folder / VIDEO_FOLDER, config=config.video, device=device, offload=offload
         )
         model.attach_video(prior)
-    model.without_video = wanted and config.video is not None and not video
+    model.without_video = wanted and has and not video
     return model
 
 

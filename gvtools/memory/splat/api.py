@@ -25,8 +25,9 @@ class SplatOptions(Settings):
 
     section = "splat"
 
-    nearest_views: int = Field(2, ge=1)
-    """Views in the first tier; each later tier takes twice as many."""
+    nearest_views: int | None = Field(2, ge=1)
+    """Views in the first tier; each later tier takes twice as many. None takes all as one: which
+    views are nearest then plays no part."""
     view_weight: float = Field(4.0, ge=0)
     """Weight of a view is exp(-view_weight x (d - d_nearest)), see ``projection.view_distance``;
     confidence x weight counts, and is reported, as no less than 1e-36."""

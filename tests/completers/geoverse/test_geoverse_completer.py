@@ -98,6 +98,41 @@ def test_observed_pixels_are_kept_bit_for_bit_and_holes_are_filled(weights, size
     np.testing.assert_allclose((direction * moment).sum(-1), 0, atol=1e-3)
 
 
+def test_without_memory_the_model_sees_no_projection(weights, monkeypatch):
+    seen = watched(monkeypatch)
+    context, known = micro.context_views(2), micro.guidance(2, size=(24, 32))
+    completer = create("geoverse", weights=str(weights), memory="false", output="views",
+                       alignment="centres-alone")  # fmt: skip
+    result = run_completer(completer, context, known)
+    (batch, _, _), other = seen[0], micro.guidance(2, size=(24, 32), share=-1.0)
+    assert batch.valid[:, :2].all()
+    for image in (batch.valid, batch.images, batch.depth):
+        assert not image[:, 2:].any()
+    assert result.whole and np.array_equal(result.rgb, completer.complete(context, other).rgb)
+    with pytest.raises(OptionError, match=r"give completer\.output=views too"):
+        create("geoverse", weights=str(weights), memory=False)
+
+
+def test_a_models_own_number_of_steps_has_its_own_times(weights, monkeypatch):
+    given = []
+    generate = GeoVerse.generate
+
+    def noted(self: GeoVerse, batch: ViewBatch, **options: Any) -> Generated:
+        given.append((options["bounds"], options["cascade_bounds"], self.config.flow))
+        return generate(self, batch, **options)
+
+    monkeypatch.setattr(GeoVerse, "generate", noted)
+    completer = GeoVerseCompleter(weights=str(weights), alignment="hint")
+    own = (1.0, 0.3, 0.1, 0.0)
+    completer.config = replace(
+        completer.config, flow=replace(completer.config.flow, level1=own, cascade=(1.0, 0.5, 0.0))
+    )
+    for options, expected in (({}, own), ({"steps": 3}, own), ({"steps": 2}, (1.0, 0.5, 0.0))):
+        completer.settings = completer.settings.replaced(**options)
+        completer.complete(micro.context_views(1), micro.guidance(1))
+        assert given[-1][0] == pytest.approx(expected) and given[-1][1] == (1.0, 0.5, 0.0)
+
+
 def test_whole_views_are_the_models_pixels_everywhere(weights, monkeypatch):
     seen = watched(monkeypatch)
     context, known = micro.context_views(2), micro.guidance(2, size=(24, 32))
@@ -249,7 +284,7 @@ def test_without_any_support_for_a_scale_there_is_no_depth(weights, monkeypatch)
     """The requested cameras' rays stand where the predicted ones have no unit."""
     monkeypatch.setattr(
         "gvtools.completers.geoverse.composition.pass_scale",
-        lambda *a: PassScale(float("nan"), ScaleStatus.UNSUPPORTED),
+        lambda *a, **k: PassScale(float("nan"), ScaleStatus.UNSUPPORTED),
     )
     known = micro.guidance(2, share=-1.0)
     result = complete(weights, micro.context_views(2), known)
@@ -383,7 +418,7 @@ def test_a_folder_that_is_not_there_is_refused_in_one_line_at_creation(
         ({"cfg_scale": -1.0}, "expected at least 0"),
         ({"precision": "float64"}, "expected 'auto', 'float32', 'bfloat16' or 'float16'"),
         ({"device": "tpu"}, "expected 'auto', 'cpu' or 'cuda'"),
-        ({"alignment": "best"}, "expected 'centres', 'hint' or 'field'"),
+        ({"alignment": "best"}, "expected 'centres', 'centres-alone', 'hint' or 'field'"),
         ({"step": 3}, "did you mean 'completer.steps'"),
     ],
 )

@@ -156,6 +156,25 @@ def test_each_alignment_uses_its_own_evidence():
     np.testing.assert_allclose(found["centres"].depth, 3.3 * made.numpy(), rtol=1e-6)
 
 
+@pytest.mark.parametrize("views", [2, 3, 4])
+def test_the_papers_scale_is_s_star_whatever_is_known(views):
+    """Two centres suffice; neither the context's depth nor the memory's replaces or refuses it."""
+    known = poses(views)
+    made = geometry(model_centres(known, 2.0))
+    deep = np.full((1, 8, 10), 30.0, np.float32)
+    whole = pass_scale(made, known, np.tile(deep, (1, 4, 4)), alignment="centres-alone")
+    assert whole.scale == pytest.approx(2) and whole.status is ScaleStatus.CAMERA_CENTRES
+    depth, truth, valid = scene(scale=9.0)
+    hint = np.where(valid, truth, 0)
+    found = scale_depth(depth, hint, valid, whole=whole, alignment="centres-alone")
+    np.testing.assert_allclose(found.depth, 2 * depth.numpy(), rtol=1e-5)
+    assert statuses(found) == [ScaleStatus.CAMERA_CENTRES] * 2
+    other = scale_depth(depth, hint, valid, whole=whole, alignment="centres")
+    assert statuses(other) == [ScaleStatus.MEMORY_DEPTH] * 2
+    one = pass_scale(geometry(np.zeros((1, 3))), poses(1), deep, alignment="centres-alone")
+    assert one.status is ScaleStatus.UNSUPPORTED
+
+
 def test_a_field_follows_the_memory_and_stays_within_its_limit():
     made, truth, valid = scene(views=1)
     x = np.linspace(0, 1, SIZE[1])

@@ -26,7 +26,12 @@ from gvtools.completers.geoverse.flow import (
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.completers.geoverse.objective import center_similarity, depth_loss, rgb_loss
 from gvtools.completers.geoverse.video_prior import VideoFeatures
-from gvtools.completers.geoverse.weights import config_of, from_pretrained, save_pretrained
+from gvtools.completers.geoverse.weights import (
+    config_of,
+    from_pretrained,
+    save_pretrained,
+    untrained_branches,
+)
 from gvtools.errors import CheckpointError, ShapeError
 from gvtools.networks.depth_anything.network import DepthAnything3
 from gvtools.networks.depth_anything.rays import camera_centres
@@ -442,12 +447,16 @@ def test_it_sees_the_context_and_no_projections():
     assert not torch.equal(jointly.generate(views).level1, jointly.generate(empty).level1)
 
 
-def test_published_files_alone_are_gld_and_with_a_video_model_base(tmp_path: Path):
+def test_published_files_are_gld_with_and_without_a_video_model(tmp_path: Path):
     (tmp_path / published.LEVEL1).parent.mkdir()
     (tmp_path / published.LEVEL1).touch()
     assert config_of(tmp_path).name == "gld"
     (tmp_path / "video").mkdir()
-    assert config_of(tmp_path).name == "base"
+    config = config_of(tmp_path)
+    assert config.name == "gld" and len(config.flow.level1) == 50 and config.flow.cfg_scale == 1.5
+    notes = untrained_branches(tmp_path, config)
+    assert "trained without a memory" in notes[0] and "neither loaded nor run" in notes[1]
+    assert untrained_branches(tmp_path, CONTROL)[0].endswith("untrained and has no effect")
 
 
 def test_a_base_begins_as_the_published_networks_without_a_video_model(tmp_path: Path):
@@ -463,11 +472,28 @@ def test_a_base_begins_as_the_published_networks_without_a_video_model(tmp_path:
                        output(from_pretrained(folder, config=BARE))[0])  # fmt: skip
     save_pretrained(base, tmp_path / "own")
     assert equal(from_pretrained(tmp_path / "own", video=False), base)
-    assert not report(tmp_path / "own", "video").ok
+    own = tmp_path / "own"
+    (own / "video").mkdir()
+    assert from_pretrained(own).without_video
+    assert [note.partition(":")[2][:29] for note in untrained_branches(own, CONTROL)] == [
+        " the embedder of projected de", " neither loaded nor run, as t",
+    ]  # fmt: skip
+    assert base.control is not None
+    torch.nn.init.ones_(next(base.control.outputs.parameters()))
+    torch.nn.init.ones_(next(iter(base.level1.depth_embedder.parameters())))
+    save_pretrained(base, own)
+    assert not report(own, "video").ok and not untrained_branches(own, CONTROL)
+    with pytest.raises(CheckpointError):
+        from_pretrained(own)
 
 
-def test_the_other_injection_needs_its_video_model(tmp_path: Path):
+@pytest.mark.parametrize("gated", [False, True])
+def test_the_other_injection_needs_its_video_model_where_its_gates_are_open(tmp_path, gated):
     folder = published.write_published(micro.model(BARE), tmp_path)
-    assert not report(folder, "video", SHARED).ok
-    with pytest.raises(CheckpointError, match=r"expected the truncated Wan2\.2-VACE"):
-        from_pretrained(folder, config=SHARED)
+    config = replace(SHARED, shared=replace(SHARED.shared, gated=gated))
+    assert report(folder, "video", config).ok == gated
+    if gated:
+        assert from_pretrained(folder, config=config).without_video
+    for video in (True,) if gated else (True, None):
+        with pytest.raises(CheckpointError, match=r"expected the truncated Wan2\.2-VACE"):
+            from_pretrained(folder, config=config, video=video)

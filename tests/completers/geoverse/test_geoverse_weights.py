@@ -459,10 +459,13 @@ def test_a_damaged_configuration_is_refused(own: Path, text: str, message: str) 
         assert "\n" not in str(caught.value)
 
 
+UNGATED = replace(SHARED, shared=replace(SHARED.shared, gated=False))
+
+
 def test_an_absent_video_folder_is_named(folder: Path) -> None:
     with pytest.raises(CheckpointError, match=r"video: absent; .*truncate-wan"):
-        from_pretrained(folder, config=SHARED)
-    found = report(folder, "video", SHARED)
+        from_pretrained(folder, config=UNGATED)
+    found = report(folder, "video", UNGATED)
     assert not found.ok
     assert "truncate-wan" in found.summary
     assert load(folder, SHARED).video is None
@@ -475,7 +478,9 @@ def test_the_video_folder_is_checked_as_it_is_loaded(folder: Path) -> None:
     tiny_wan.transformer().save_pretrained(folder / "video" / "transformer")
     tiny_wan.vae().save_pretrained(folder / "video" / "vae")
     zeros = replace(CONTROL, video=replace(tiny_wan.CONFIG, prompt="zeros"))
-    model = from_pretrained(folder, config=zeros)
+    assert from_pretrained(folder, config=zeros).video is None
+    assert "not run" in report(folder, "video", zeros).summary
+    model = from_pretrained(folder, config=zeros, video=True)
     assert model.video is not None
     model.generate(micro.batch(), seed=1)
     assert all(part.ok for part in check_folder(folder, zeros))
@@ -487,4 +492,4 @@ def test_the_video_folder_is_checked_as_it_is_loaded(folder: Path) -> None:
         config = replace(CONTROL, video=video)
         assert message in report(folder, "video", config).summary
     with pytest.raises(CheckpointError, match=message):
-        from_pretrained(folder, config=config)
+        from_pretrained(folder, config=config, video=True)

@@ -6,6 +6,7 @@ import contextlib
 import errno
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -217,6 +218,23 @@ def test_every_setting_of_the_protocol_holds_with_every_profile(profile):
         found = dotted(config.to_dict())
         for key, value in PAPER.items():
             assert found[key.replace("completer.", "completer_options.")] == value, key
+
+
+def test_every_setting_of_the_protocol_is_in_the_papers_table_and_no_other():
+    page = Path(__file__).parents[3] / "docs" / "concepts" / "protocol.md"
+    table = page.read_text(encoding="utf-8").split("| switch | in the paper |")[1].split("\n\n")[0]
+    rows = [line.strip("| ").split(" | ") for line in table.splitlines()[2:]]
+    stated: list[str] = []
+    for *_, switches, place in rows:
+        stated += re.findall(r"`([\w.]+=[^`]+)`", switches)
+        assert place.startswith(("Sec. ", "App. ", "Eq. ", "not stated")), place
+    texts = {
+        f"{key}={'none' if value is None else str(value).lower()}" for key, value in PAPER.items()
+    }
+    assert set(stated) == texts and len(stated) == len(texts)
+    # How a model samples is its own: 49 guided steps of gld, a student's own bounds.
+    for own in ("steps", "cascade_steps", "cfg_scale", "cascade_cfg_scale"):
+        assert f"completer.{own}" not in PAPER
 
 
 def test_a_setting_of_ones_own_stands_above_the_protocol():

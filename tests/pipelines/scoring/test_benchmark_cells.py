@@ -63,8 +63,10 @@ def test_methods_are_settings_of_runs(tmp_path):
     """The time of a fit is that of methods that fit."""
     file = tmp_path / "mine.json"
     file.write_text(json.dumps({"splat": {"nearest_views": 2}, "completer": "none"}))
-    methods = parse_methods(f"default, fast, none, paper, mine={file}")
+    methods = parse_methods(f"default, fast, none, paper, mine={file}, paper-without-memory")
     found = {method.name: method.config(seconds=7) for method in methods}
+    ablation = found.pop("paper-without-memory").completer_options
+    assert ablation == found["paper"].completer_options | {"memory": False}
     seconds = {name: config.refine.seconds for name, config in found.items()}
     assert seconds == {"default": 7, "fast": None, "none": 7, "paper": None, "mine": 7}
     assert found["none"].completer == found["mine"].completer == "none"
