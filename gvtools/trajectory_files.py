@@ -24,9 +24,13 @@ Float64 = NDArray[np.float64]
 # A quaternion written with few digits may be this far from unit length; farther, it is none.
 QUATERNION_TOLERANCE = 1e-2
 EUROC = 17  # numbers in a line of EuRoC's ground truth
+# Of a matrix, without or with its last row and a number or time of its own in front.
+MATRICES = (12, 13, 16, 17)
 # Where time, position and quaternion (x, y, z, w) stand, and what the columns are called.
 _COLUMNS = {"tum": (0, 1, 2, 3, 4, 5, 6, 7), "euroc": (0, 1, 2, 3, 5, 6, 7, 4)}
 _NAMES = {"tum": "timestamp tx ty tz qx qy qz qw", "euroc": "nanoseconds, x, y, z, qw, qx, qy, qz"}
+_DECIMAL = re.compile(r"[+-]?\d+(,\d+)?(e[+-]?\d+)?", re.IGNORECASE)
+_ZERO = re.compile(r"[+-]?0*\.?0*(e[+-]?\d+)?", re.IGNORECASE)
 _UNIT = re.compile(r"\s*[\[(]\s*([^\])]*?)\s*[\])]")
 _TIME = re.compile(r"(?:\w+_)?(?:time|(?:time_?)?stamps?|n?secs?|seconds|t)(?:_(ns|us|ms|s))?")
 _TURN = re.compile(r"(?:q|quat\w*?|rot\w*?|ori\w*?)(?:[._]\w+)??[._]?([xyzw])(?:_world\w*)?")
@@ -55,9 +59,10 @@ def read_poses(path: str | Path, *, layout: str = "auto") -> Trajectory:
 
     Args:
         path: a text file; blank lines and lines that start with # are passed over.
-        layout: "tum" (timestamp tx ty tz qx qy qz qw), "kitti" (12 numbers, a 3x4 matrix by rows),
-            "euroc" (CSV: nanoseconds, x, y, z, qw, qx, qy, qz, and more that is not read) or
-            "auto": the columns that the head names, else what the numbers tell.
+        layout: "tum" (timestamp tx ty tz qx qy qz qw), "kitti" (12 or 16 numbers, a matrix by rows,
+            with or without a number or time in front, or a line for each row), "euroc" (CSV:
+            nanoseconds, x, y, z, qw, qx, qy, qz, and more that is not read) or "auto": the columns
+            that the head names, else what the numbers tell.
 
     Returns:
         N poses in the order of the file, with stamps for TUM and EuRoC. Rotations that are off by
@@ -83,7 +88,7 @@ def read_poses(path: str | Path, *, layout: str = "auto") -> Trajectory:
     for i, (number, words) in enumerate(rows):
         where = f"{path}:{number}"
         if form.columns is None:
-            poses[i, :3] = _numbers(words, 12, where=where).reshape(3, 4)
+            stamps[i], poses[i] = _matrix(words, len(rows[0][1]), where=where)
         else:
             if len(words) > max(form.columns) and (len(words) == 8 or form.more):
                 words = [words[column] for column in form.columns]
@@ -96,7 +101,7 @@ def read_poses(path: str | Path, *, layout: str = "auto") -> Trajectory:
             raise ProjectError(str(error)) from None
         if defect > ROTATION_ROUNDING:
             poses[i] = nearest
-    if form.columns is None:
+    if form.columns is None and len(rows[0][1]) % 4 == 0:
         return Trajectory(poses)
     unit = form.unit or unit_of(stamps)
     seconds = stamps * _UNITS.get(unit, (1.0,))[0]
@@ -136,14 +141,17 @@ def _form(path: Path, layout: str) -> tuple[_Form, list[tuple[int, list[str]]]]:
                 f"({_NAMES[order]}); leave --layout out, or mend the head"
             )
         return _Form(columns, True, unit), rows
-    if layout == "kitti" or (layout == "auto" and count == 12 and not commas):
+    matrix = count in MATRICES[:2] and not commas
+    if count in MATRICES[2:]:
+        matrix = all(map(_ZERO.fullmatch, rows[0][1][-4:-1]))
+    if layout == "kitti" or (layout == "auto" and matrix):
         return _Form(None), rows
     if layout != "auto":
         return _Form(_COLUMNS[layout], layout == "euroc"), rows
     if count < 8 or (count not in (8, EUROC) and not commas):
         raise ProjectError(
-            f"{path}:{rows[0][0]}: {count} numbers; expected 8 (tum: {_NAMES['tum']}), 12 (kitti: "
-            f"a 3x4 matrix), or 8 and more with commas (euroc: {_NAMES['euroc']})"
+            f"{path}:{rows[0][0]}: {count} numbers; expected 8 (tum: {_NAMES['tum']}), 12 or "
+            f"16 (kitti: a matrix), or 8 and more with commas (euroc: {_NAMES['euroc']})"
         )
     return _by_numbers(path, rows, commas=commas), rows
 
@@ -241,6 +249,7 @@ def read_trajectory(path: str | Path, like: Cameras, *, layout: str = "auto") ->
     form, rows = _form(path, layout)
     for _, words in rows:
         name = words[form.columns[0]] if form.columns else f"{len(names):06d}"
+        name = words[0] if form.columns is None and len(words) % 4 else name
         # Published ground truth holds repeated timestamps; names have to differ.
         repeats[name] = repeats.get(name, -1) + 1
         if repeats[name]:
@@ -266,8 +275,26 @@ def _rows(
     kept = [(number, line) for number, line in lines[data:] if not line.lstrip().startswith("#")]
     if not kept:
         raise ProjectError(f"{path}: no poses; expected one line for each camera")
+    for number, line in kept[:1]:
+        words = re.split(r"[;\s]+", line.strip(" \t;"))
+        if len(words) > 3 and any("," in w for w in words) and all(map(_DECIMAL.fullmatch, words)):
+            raise ProjectError(
+                f"{path}:{number}: numbers with decimal commas, such as {words[1][:40]!r}; "
+                "expected decimal points; export it again with another locale"
+            )
     rows = [(number, re.split(r"[,;\s]+", line.strip(" \t,;"))) for number, line in kept]
-    return named, rows, bool(re.search("[,;]", kept[0][1]))
+    return named, _joined(rows), bool(re.search("[,;]", kept[0][1]))
+
+
+def _joined(rows: list[tuple[int, list[str]]]) -> list[tuple[int, list[str]]]:
+    """Matrices that have a line for each row, in one line each; numbers in front are left out."""
+    lengths = [len(words) for _, words in rows]
+    for step in (4, 5):
+        pattern = [*lengths[: step - 4], 4, 4, 4, 4]
+        if pattern[0] < 5 and lengths == pattern * (len(rows) // step):
+            starts = range(step - 4, len(rows), step)
+            return [(rows[k][0], [w for _, line in rows[k : k + 4] for w in line]) for k in starts]
+    return rows
 
 
 def _head(line: str) -> tuple[tuple[int, ...], str] | None:
@@ -288,6 +315,18 @@ def _head(line: str) -> tuple[tuple[int, ...], str] | None:
             found[match[1]] = column
     keys = ("time", "x", "y", "z", "qx", "qy", "qz", "qw")
     return (tuple(found[key] for key in keys), unit) if set(keys) <= set(found) else None
+
+
+def _matrix(words: list[str], count: int, *, where: str) -> tuple[float, Float64]:
+    """What stands in front, and the (4, 4) matrix of 12 or 16 numbers."""
+    if count not in MATRICES:
+        _numbers(words, 12, where=where)
+    values = _numbers(words, count, where=where)
+    matrix = np.eye(4)
+    matrix[: count // 4 if count > 13 else 3] = values[count % 4 :].reshape(-1, 4)
+    if matrix[3].tolist() != [0, 0, 0, 1]:
+        raise ProjectError(f"{where}: the last row is {matrix[3].tolist()}; expected 0 0 0 1")
+    return float(values[0]), matrix
 
 
 def _numbers(words: list[str], count: int, *, where: str) -> Float64:

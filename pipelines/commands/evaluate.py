@@ -253,6 +253,7 @@ class TrajectoryCommand(RootArguments):
     """Write the figures there. [FILE]"""
 
     def run(self, console: Console) -> None:
+        from gvtools.evaluation.conventions import wrong_conventions
         from gvtools.evaluation.trajectories import absolute_errors, pose_auc, relative_errors
         from gvtools.files import write_json
         from pipelines.inputs.trajectory_source import associate, open_trajectory
@@ -299,6 +300,9 @@ class TrajectoryCommand(RootArguments):
             for note in track.notes:
                 console.warn(f"{path}: {note}")
                 figures["notes"].setdefault("reading", []).append(f"{path}: {note}")
+        for note in wrong_conventions(*poses, align=self.align):
+            console.warn(note)
+            figures["notes"].setdefault("conventions", []).append(note)
         if self.json_ is not None:
             write_json(self.json_, figures)
         elif errors.ok:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -189,3 +190,76 @@ def test_wrong_input_ends_in_one_line(tmp_path, capsys):
     assert "no names" in refused(capsys, "trajectory", "ate", a, b, "--associate", "name")
     assert "--layout" in refused(capsys, "trajectory", "ate", a, a, "--layout", "ros")
     assert "expected 1 frame" in refused(capsys, "trajectory", "rpe", a, a, "--delta", "0")
+
+
+MATRICES: dict[str, Callable[[int, np.ndarray], str]] = {
+    "16 numbers": lambda i, m: " ".join(map(repr, m.ravel().tolist())),
+    "16 with commas": lambda i, m: ",".join(f"{v:.17e}" for v in m.ravel()),
+    "17, a number in front": lambda i, m: f"{i} " + " ".join(map(repr, m.ravel().tolist())),
+    "13, a time in front": lambda i, m: f"{i}.0 " + " ".join(map(repr, m[:3].ravel().tolist())),
+    "blocks": lambda i, m: "\n".join(" ".join(map(repr, row)) for row in m.tolist()) + "\n",
+    "log": lambda i, m: f"{i} {i} {i + 1}\n" + MATRICES["blocks"](i, m).rstrip(),
+}
+
+
+@pytest.mark.parametrize("kind", MATRICES)
+def test_matrices_of_every_writing(tmp_path, kind):
+    write_tum(tmp_path / "tum.txt", cameras(path()))
+    lines = [MATRICES[kind](i, pose) for i, pose in enumerate(path())]
+    (tmp_path / "a.txt").write_text("\n".join(lines))
+    figures = measured(tmp_path, "ate", tmp_path / "tum.txt", tmp_path / "a.txt")
+    assert (figures["associated"], figures["notes"]) == (40, {})
+    assert max(figures["rmse"], figures["rotation_deg"]["max"]) < 1e-5
+    assert figures["association"] == ("time" if "front" in kind else "index")
+
+
+@pytest.mark.parametrize("between", [" ", ";"])
+def test_decimal_commas_are_refused_by_name(tmp_path, capsys, between):
+    file = tmp_path / "a.txt"
+    lines = (between.join(row).replace(".", ",") for row in rows(path()))
+    file.write_text("\n".join(lines))
+    assert "decimal commas" in refused(capsys, "trajectory", "ate", file, file)
+
+
+def lost(poses: np.ndarray) -> np.ndarray:
+    poses = poses.copy()
+    poses[10:15] = np.eye(4)
+    return poses
+
+
+def mounted(poses: np.ndarray) -> np.ndarray:
+    mount = np.eye(4)
+    mount[:3, :3] = Rotation.from_rotvec([0.3, -0.9, 0.4]).as_matrix()
+    mount[:3, 3] = 0.05
+    return poses @ mount
+
+
+def other_order(poses: np.ndarray) -> np.ndarray:
+    poses = poses.copy()
+    turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat()[:, [3, 0, 1, 2]]
+    poses[:, :3, :3] = Rotation.from_quat(turns).as_matrix()
+    return poses
+
+
+@pytest.mark.parametrize(
+    ("change", "align", "said"),
+    [
+        (invert_rigid, "sim3", "camera from world"),
+        (lambda poses: poses @ np.diag([1, -1, -1, 1]), "sim3", "turned by 180 degrees"),
+        (mounted, "se3", "another sensor"),
+        (lambda poses: moved(poses, scale=1000), "se3", "times 0.001"),
+        (other_order, "none", "other order"),
+        (lost, "se3", "5 poses of the estimate are exactly one"),
+        (lambda poses: moved(poses, scale=1000), "sim3", ""),
+        (lambda poses: disturbed(poses, metres=0.3, degrees=10), "se3", ""),
+    ],
+)
+def test_conventions_that_would_mend_the_errors_are_named(tmp_path, change, align, said):
+    walk = disturbed(path(), degrees=20)
+    write_tum(tmp_path / "a.txt", cameras(walk))
+    write_tum(tmp_path / "b.txt", cameras(change(walk)))
+    arguments = (tmp_path / "a.txt", tmp_path / "b.txt", "--align", align)
+    for metric in ("ate", "rpe"):
+        notes = measured(tmp_path, metric, *arguments)["notes"].get("conventions", [])
+        assert len(notes) == bool(said)
+        assert said in "".join(notes)

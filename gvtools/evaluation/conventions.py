@@ -1,0 +1,110 @@
+"""Conventions that an estimated trajectory seems to have wrong, told by what mends its errors."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gvtools.cameras import invert_rigid
+from gvtools.evaluation.trajectories import PoseErrors, absolute_errors, center_extent
+from gvtools.similarity import fit_similarity
+
+Float64 = NDArray[np.float64]
+
+# Fewer poses tell nothing; so many that are exactly one were held.
+FEW, HELD = 8, 3
+# A reading explains an error where it leaves less than this share of it; errors are worth it from
+# this share of the path's extent, and from so many degrees.
+EXPLAINED, NOTABLE, TURNED = 0.2, 0.01, 10.0
+# Where the path's spread across itself is less than so many errors, the turn of the fit is open.
+ACROSS = 10.0
+
+
+def wrong_conventions(
+    reference: ArrayLike, estimate: ArrayLike, *, align: str = "sim3"
+) -> tuple[str, ...]:
+    """A line for each convention of which another reading would take most of the error away.
+
+    Tried are camera from world, another unit, the other order of quaternions and other axes of the
+    cameras; and poses that stay exactly one while the reference moves are counted.
+
+    Args:
+        reference: (N, 4, 4) world_from_cam, scene units.
+        estimate: (N, 4, 4), row by row the same cameras.
+        align: as of ``absolute_errors``.
+
+    >>> poses = np.tile(np.eye(4), (8, 1, 1))
+    >>> poses[:, :3, 3] = np.random.default_rng(0).standard_normal((8, 3))
+    >>> wrong_conventions(poses, poses @ np.diag([1, -1, -1, 1]))[0][:52]
+    "the estimate's cameras are turned by 180 degrees abo"
+    """
+    first, second = np.asarray(reference, np.float64), np.asarray(estimate, np.float64)
+
+    def errors(poses: Float64, how: str = align) -> PoseErrors:
+        return absolute_errors(first, poses, align=how, refuse_mirrored=False)
+
+    found = errors(second)
+    if found.translation is None or found.rotation_deg is None or len(first) < FEW:
+        return ()
+    notes, left = [], found.translation.rmse
+    if left > NOTABLE * found.extent:
+        inverted, scaled = errors(invert_rigid(second)).translation, errors(second, "sim3")
+        if inverted is not None and inverted.rmse < EXPLAINED * left:
+            notes.append(
+                "one of both seems to hold camera from world: with the estimate inverted, ATE "
+                f"would be {inverted.rmse:.4g} instead of {left:.4g}; expected world from camera"
+            )
+        elif align == "se3" and scaled.translation and scaled.translation.rmse < EXPLAINED * left:
+            notes.append(
+                f"another unit: with the estimate times {scaled.scale:.4g}, ATE would be "
+                f"{scaled.translation.rmse:.4g} instead of {left:.4g} (--align sim3)"
+            )
+    centers = first[:, :3, 3] - first[:, :3, 3].mean(axis=0)
+    across = np.linalg.svd(centers, compute_uv=False)[1] / np.sqrt(len(first))
+    if found.rotation_deg.rmse > TURNED and left * ACROSS < across:
+        notes += _other_turn(first, second, found, align=align)
+    _, which, counts = np.unique(
+        second.reshape(-1, 16), axis=0, return_inverse=True, return_counts=True
+    )
+    held = np.flatnonzero(which.reshape(-1) == counts.argmax())
+    if len(held) >= HELD and center_extent(first[held]) > NOTABLE * found.extent:
+        notes.append(
+            f"{len(held)} poses of the estimate are exactly one, though the reference moves: "
+            "leave poses out where tracking was lost"
+        )
+    return tuple(notes)
+
+
+def _other_turn(first: Float64, second: Float64, found: PoseErrors, *, align: str) -> list[str]:
+    """Lines for rotations that do not agree where the centres do."""
+    from scipy.spatial.transform import Rotation
+
+    assert found.rotation_deg is not None
+    turned = found.rotation_deg.rmse
+
+    def left(rotations: Rotation) -> float:
+        poses = second.copy()
+        poses[:, :3, :3] = rotations.as_matrix()
+        again = absolute_errors(first, poses, align=align, refuse_mirrored=False)
+        return np.inf if again.rotation_deg is None else again.rotation_deg.rmse
+
+    given = Rotation.from_matrix(second[:, :3, :3])
+    fit = fit_similarity(second[:, :3, 3], first[:, :3, 3], with_scale=align == "sim3")
+    frame = Rotation.identity() if align == "none" else Rotation.from_matrix(fit.rotation)
+    mount = (Rotation.from_matrix(first[:, :3, :3]).inv() * frame * given).mean()
+    if left(given * mount.inv()) < EXPLAINED * turned:
+        axis = (np.round(mount.as_rotvec() / mount.magnitude(), 2) + 0.0).tolist()
+        return [
+            f"the estimate's cameras are turned by {np.degrees(mount.magnitude()):.4g} degrees "
+            f"about their axis {axis} all along: other axes of the camera (OpenGL's), or another "
+            "sensor's poses; figures of rotation, RPE and AUC hold this turn"
+        ]
+    for order in ([1, 2, 3, 0], [3, 0, 1, 2]):
+        least = left(Rotation.from_quat(given.as_quat()[:, order]))
+        if least < EXPLAINED * turned:
+            return [
+                f"quaternions of the other order: with the real part at the other end, rotations "
+                f"are off by {least:.4g} degrees instead of {turned:.4g}; name the columns in a "
+                "first line, or give --layout"
+            ]
+    return []
