@@ -14,7 +14,7 @@ from enum import Enum
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -248,6 +248,17 @@ def camera_rays(cameras: Cameras, shape: tuple[int, ...]) -> Float32:
     return rays
 
 
+class CompleterFacts(NamedTuple):
+    """What is known of a completer, or of it with other weights (``gvtools completers``)."""
+
+    what: str  # it fills holes with
+    needs: str  # beside what is installed with gvtools
+    cost: str  # seconds a view, and where
+    gives: str  # what was measured of its generated pixels
+    source: str = ""  # the page of ``benchmarks/`` that has the figures
+    of: str = ""  # which weights
+
+
 class Completer(ABC):
     """Fills what memory does not know of the target views. A run makes one and keeps it."""
 
@@ -261,6 +272,8 @@ class Completer(ABC):
     batches_targets: bool = False
     # True leaves views with small holes to ``inpaint``, see ``EffortPolicy``.
     costly: bool = False
+    # What a user should know before choosing it, by the weights that it may have.
+    facts: ClassVar[tuple[CompleterFacts, ...]] = ()
     # Compiled kernels of its own, which a run compiles before its first round.
     kernels: ClassVar[tuple[KernelSet, ...]] = ()
 
@@ -301,6 +314,11 @@ class NoneCompleter(Completer):
     """Returns the guidance as it is; invalid pixels are 0 in colour, depth and confidence."""
 
     name = "none"
+    facts = (
+        CompleterFacts(
+            "nothing: holes stay black", "nothing", "none", "what the memory shows, alone"
+        ),
+    )
 
     def complete(
         self, context: Sequence[ContextView], guidance: Guidance, *, seed: int = 0

@@ -13,7 +13,13 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from gvtools.cameras import Cameras
-from gvtools.completers.base import Completer, Completion, ContextView, check_views
+from gvtools.completers.base import (
+    Completer,
+    CompleterFacts,
+    Completion,
+    ContextView,
+    check_views,
+)
 from gvtools.completers.hole_color import depth_error, fill_color, look_up, relax
 from gvtools.completers.hole_depth import HoleDepth, fill_depth
 from gvtools.completers.settings import CompleterSettings
@@ -60,6 +66,16 @@ class InpaintCompleter(Completer):
     """Fills depth from the far side of each hole's rim, and colour along the filled surface."""
 
     name = "inpaint"
+    facts = (
+        CompleterFacts(
+            "continued planes, and the photographs that see the filled point; sharp",
+            "nothing",
+            "0.012 s in drawn rooms, 1.243 s in a real kitchen",
+            "PSNR 20.09 dB in rooms, 17.87 in levels, 14.17 in the kitchen, 22.29 on the fern; "
+            "median depth error 0.1133, 0.1761, 0.0658",
+            "benchmarks/generative.md, Four domains (means over views)",
+        ),
+    )
     settings_type = InpaintSettings
     settings: InpaintSettings
     kernels = (KernelSet("inpaint", compile_kernels, relax),)
