@@ -213,7 +213,9 @@ def named_file(folder: Path, name: str | Path, *, where: str, follow_links: bool
     those of a download that is kept elsewhere; the name itself still may not.
     """
     try:
-        path = folder / name
+        # What begins with the folder already is not joined to it again.
+        inside = isinstance(name, Path) and name.is_relative_to(folder)
+        path = Path(name) if inside else folder / name
         resolved = os.path.abspath if follow_links else os.path.realpath
         home, real = resolved(folder), resolved(path)
         if "\0" in real:

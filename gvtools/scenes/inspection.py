@@ -17,6 +17,7 @@ from gvtools.cameras import Cameras
 from gvtools.errors import GvError
 from gvtools.scenes.depth_contradictions import unit_findings
 from gvtools.scenes.pixel_contradictions import PixelCheck
+from gvtools.scenes.pose_forms import pose_findings
 from gvtools.scenes.scene import Finding, Frame, Scene, SparsePoints
 
 Float32 = NDArray[np.float32]
@@ -100,6 +101,7 @@ def inspect(scene: Scene, *, probes: int | None = None) -> SceneReport:
     findings += _views_without_depth(scene)
     findings += _doubtful_cameras(scene, errors)
     findings += pixels.findings()
+    findings += pose_findings(scene)
     findings += unit_findings(scene)
     findings += contradiction_findings(
         scene,

@@ -20,6 +20,7 @@ from gvtools.scenes.depth_contradictions import unit_findings
 from gvtools.scenes.layout import is_address
 from gvtools.scenes.matching import natural
 from gvtools.scenes.pixel_contradictions import probed
+from gvtools.scenes.pose_forms import pose_findings
 from gvtools.scenes.resized import reduced
 from gvtools.scenes.scene import Scene, View
 from gvtools.scenes.selection import check_disjoint, select
@@ -334,8 +335,9 @@ def describe(plan: Plan, console: Console) -> None:
             f"{', '.join(plan.ignored)} changes nothing: no plane sweep computes depth here, but "
             f"{plan.source.name}"
         )
-    met = *plan.scene.findings, *probed(plan.scene, plan.context), *unit_findings(plan.scene)
-    for finding in met:
+    scene, context = plan.scene, plan.context
+    met = *probed(scene, context), *pose_findings(scene, context), *unit_findings(scene)
+    for finding in (*scene.findings, *met):
         if finding.level == "warning":
             console.warn(finding.message)
 

@@ -1,0 +1,161 @@
+"""Poses that contradict the photographs of scenes without tracks: other axes, inverted, shuffled.
+
+Matches of two pictures that fit one epipolar geometry, whichever it is, show the same places. So
+most of them lie on the epipolar lines of the given poses, too, unless these are of another form.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.errors import GvError
+from gvtools.features import Features, SiftMatcher
+from gvtools.scenes.calibration import OPENCV_FROM_OPENGL
+from gvtools.scenes.scene import Finding, Scene
+
+Float64 = NDArray[np.float64]
+
+# Pairs that are compared, by how many views they are apart, the pictures' longer side [pixels].
+PAIRS, STEPS, SIDE = 4, (1, 2, 4), 480
+# Matches lie on their lines below this distance [pixels], and fit a geometry of their own below
+# the second; a pair has so many at least, and moves by more than this share of the longer side.
+NEAR, OWN, MATCHES, MOTION = 2.5, 1.2, 40, 0.02
+# Poses are wrong below this share of matches on their lines, other forms are right above it; on
+# real scenes it is 0.9 and more in the middle of the pairs. So many matches are needed in all.
+WRONG, RIGHT = 0.35, 0.7
+JUDGED = 120
+# Views farther apart are not looked at where a pair moves by this share.
+ENOUGH = 0.08
+FLIP = OPENCV_FROM_OPENGL
+
+
+def _reordered(pose: Float64) -> Float64:
+    from scipy.spatial.transform import Rotation
+
+    # As read: w, x, y, z hold what is x, y, z, w.
+    x, y, z, w = np.roll(Rotation.from_matrix(pose[:3, :3]).as_quat(), 1)
+    changed = pose.copy()
+    changed[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix()
+    return changed
+
+
+# What may have been written for cam_from_world, by what sets it right.
+FORMS: Mapping[str, Callable[[Float64], Float64]] = {
+    "cameras' axes as OpenCV and OpenGL have them were taken for each other (turn y and z over)": (
+        lambda pose: FLIP @ pose
+    ),
+    "the matrices map the other way (invert them)": np.linalg.inv,
+    "the matrices map the other way (invert them), with axes of OpenCV": (
+        lambda pose: np.linalg.inv(pose) @ FLIP
+    ),
+    "the matrices map the other way (invert them), with axes of OpenGL": (
+        lambda pose: FLIP @ np.linalg.inv(pose) @ FLIP
+    ),
+    "quaternions have the scalar last, where it is expected first": _reordered,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class _Pair:
+    """Two views, and the places of what both show, pixels of the views."""
+
+    views: tuple[int, int]
+    xy: tuple[Float64, Float64]  # (M, 2) each
+
+    def share(self, K: Float64, poses: Float64, *, scale: Float64) -> float:
+        """How many of the matches lie on epipolar lines."""
+        a, b = self.views
+        change = poses[1] @ np.linalg.inv(poses[0])
+        x, y, z = change[:3, 3]
+        cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        F = np.linalg.inv(K[b]).T @ cross @ change[:3, :3] @ np.linalg.inv(K[a])
+        first, second = (np.column_stack([xy, np.ones(len(xy))]) for xy in self.xy)
+        lines, back = first @ F.T, second @ F
+        off = np.abs((second * lines).sum(1))
+        far = off / np.maximum(np.minimum(*(np.hypot(*r.T[:2]) for r in (lines, back))), 1e-12)
+        return float((far * scale[b] < NEAR).mean())
+
+
+def pose_findings(scene: Scene, names: Sequence[str] | None = None) -> list[Finding]:
+    """A warning where the photographs of a scene without tracks contradict its poses."""
+    chosen = [
+        number for number, view in enumerate(scene.views) if names is None or view.name in names
+    ]
+    if len(chosen) < 2 or (scene.points is not None and len(scene.points.point_index)):
+        return []
+    cameras = scene.cameras
+    scale = np.minimum(SIDE / np.maximum(cameras.width, cameras.height), 1)
+    pairs = _pairs(scene, chosen, scale)
+    poses = cameras.cam_from_world
+
+    def shares(form: Callable[[Float64], Float64] = np.asarray) -> list[float]:
+        changed = [np.array([form(poses[view]) for view in pair.views]) for pair in pairs]
+        return [
+            pair.share(cameras.K, both, scale=scale)
+            for pair, both in zip(pairs, changed, strict=True)
+        ]
+
+    found = shares()
+    if sum(len(pair.xy[0]) for pair in pairs) < JUDGED or np.median(found) >= WRONG:
+        return []
+    tried = {reason: float(np.median(shares(form))) for reason, form in FORMS.items()}
+    best = max(tried, key=lambda reason: tried[reason])
+    reason = f"; {best}: then it is {tried[best]:.0%}" if tried[best] > RIGHT else ""
+    first, second = (scene.views[view].name for view in pairs[0].views)
+    line = (
+        f"poses or intrinsics do not fit the photographs: {np.median(found):.0%} of the matches of "
+        f"{len(pairs)} pairs (first {first} and {second}) lie where the cameras allow, expected "
+        f"more than {WRONG:.0%}{reason}"
+    )
+    return [Finding("warning", line)]
+
+
+def _pairs(scene: Scene, chosen: Sequence[int], scale: Float64) -> list[_Pair]:
+    """A few pairs of views, evenly spread, that show the same from places apart."""
+    matcher, features = SiftMatcher(max_features=1500), dict[int, Features | None]()
+    pairs = []
+    for row in sorted({*np.linspace(0, len(chosen) - 2, PAIRS).round().astype(int).tolist()}):
+        found = None
+        for step in STEPS:
+            if row + step >= len(chosen):
+                break
+            views = chosen[row], chosen[row + step]
+            for view in views:
+                if view not in features:
+                    features[view] = _features(scene, view, scale[view], matcher=matcher)
+            a, b = (features[view] for view in views)
+            if a is None or b is None:
+                break
+            rows = matcher.match(a, b)
+            xy = a.xy[rows[:, 0]], b.xy[rows[:, 1]]
+            if len(rows) < MATCHES:
+                break
+            cv2.setRNGSeed(0)
+            _, own = cv2.findFundamentalMat(*xy, cv2.FM_RANSAC, OWN, 0.999, 2000)
+            kept = np.zeros(len(rows), np.bool_) if own is None else own[:, 0] > 0
+            if kept.sum() < MATCHES:
+                break
+            moved = np.median(np.linalg.norm(xy[1] - xy[0], axis=1))
+            if moved > MOTION * SIDE:
+                scales = scale[views[0]], scale[views[1]]
+                found = _Pair(views, (xy[0][kept] / scales[0], xy[1][kept] / scales[1]))
+                if moved > ENOUGH * SIDE:
+                    break
+        if found is not None:
+            pairs.append(found)
+    return pairs
+
+
+def _features(scene: Scene, view: int, scale: float, *, matcher: SiftMatcher) -> Features | None:
+    """Features of a view's picture at the longer side SIDE; None where it cannot be read."""
+    try:
+        rgb = scene.views[view].load().rgb
+    except GvError:
+        return None
+    size = tuple(max(1, round(side * scale)) for side in rgb.shape[1::-1])
+    return matcher.extract(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA))

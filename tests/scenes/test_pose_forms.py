@@ -1,0 +1,53 @@
+"""Poses of another form than the file's are told from the photographs of scenes without tracks."""
+
+from __future__ import annotations
+
+import json
+import os
+
+import numpy as np
+import pytest
+
+from gvtools.procedural.room_sample import write_room
+from gvtools.scenes.inspection import inspect
+from gvtools.scenes.pose_forms import pose_findings
+from gvtools.scenes.project import open_project
+from gvtools.scenes.transforms import write_transforms
+
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    """Six views of a room without tracks: ``transforms.json``."""
+    folder = tmp_path_factory.mktemp("room") / "room"
+    write_room(folder, views=6)
+    cameras = open_project(folder).cameras
+    names = [folder / "images" / name for name in cameras.names]
+    write_transforms(folder / "transforms.json", cameras, image_paths=names)
+    return folder / "transforms.json"
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda pose: pose, None),
+        (lambda pose: pose @ FLIP, "taken for each other"),
+        (np.linalg.inv, "invert them"),
+        (lambda pose: np.linalg.inv(pose @ FLIP), "invert them"),
+    ],
+)
+def test_the_form_of_poses_is_told_by_the_photographs(room, change, reason):
+    data = json.loads(room.read_text())
+    for frame in data["frames"]:
+        frame["transform_matrix"] = change(np.array(frame["transform_matrix"])).tolist()
+    file = room.with_name("changed.json")
+    file.write_text(json.dumps(data))
+    found = [item.message for item in pose_findings(open_project(file))]
+    assert len(found) == (reason is not None)
+    assert all("do not fit the photographs" in line and reason in line for line in found)
+
+
+def test_a_project_beside_the_working_folder_is_read(room, monkeypatch):
+    monkeypatch.chdir(room.parent / "images")
+    assert inspect(open_project(type(room)(os.path.relpath(room))), probes=1).ok
