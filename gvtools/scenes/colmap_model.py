@@ -241,8 +241,22 @@ def text_names(folder: Path) -> dict[int, str]:
             row = line.split(maxsplit=9)
             if len(row) == 10 and row[0].isdecimal():
                 names[number_key(row[0])] = row[9].strip()
-            next(rest, None)
+            second = next(rest, "").split()
+            if len(second) == 10 and not _is_number(second[-1]):
+                raise ProjectError(
+                    f"{path}: the line after image {row[-1].strip()} is another image, "
+                    f"{second[-1]}; expected two lines an image, the second with its features or "
+                    "empty; add an empty line after each"
+                )
     return names
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gvtools.cameras import invert_rigid
 from gvtools.errors import GvError
 from gvtools.features import Features, SiftMatcher
 from gvtools.scenes.calibration import OPENCV_FROM_OPENGL
@@ -49,12 +50,12 @@ FORMS: Mapping[str, Callable[[Float64], Float64]] = {
     "cameras' axes as OpenCV and OpenGL have them were taken for each other (turn y and z over)": (
         lambda pose: FLIP @ pose
     ),
-    "the matrices map the other way (invert them)": np.linalg.inv,
+    "the matrices map the other way (invert them)": invert_rigid,
     "the matrices map the other way (invert them), with axes of OpenCV": (
-        lambda pose: np.linalg.inv(pose) @ FLIP
+        lambda pose: invert_rigid(pose) @ FLIP
     ),
     "the matrices map the other way (invert them), with axes of OpenGL": (
-        lambda pose: FLIP @ np.linalg.inv(pose) @ FLIP
+        lambda pose: FLIP @ invert_rigid(pose) @ FLIP
     ),
     "quaternions have the scalar last, where it is expected first": _reordered,
 }
@@ -158,4 +159,6 @@ def _features(scene: Scene, view: int, scale: float, *, matcher: SiftMatcher) ->
     except GvError:
         return None
     size = tuple(max(1, round(side * scale)) for side in rgb.shape[1::-1])
-    return matcher.extract(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA))
+    return matcher.extract(
+        np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
+    )

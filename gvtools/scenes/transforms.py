@@ -51,6 +51,8 @@ FISHEYE = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE
 OF_A_FRAME = ("transform_matrix", "mask_path", "depth_file_path", "depth_path")
 # What tells the focal length along an axis: pixels, or a field of view in radians or degrees.
 FOCAL = {axis: (f"fl_{axis}", f"camera_angle_{axis}", f"{axis}_fov") for axis in "xy"}
+DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+FURTHER = ("k5", "k6", "p3", "p4", "b1", "b2")
 # What tells one axis may differ so much from what else tells it.
 SAME_FOCAL = 0.02
 # Twice a principal point may differ so much from the picture that it is of.
@@ -367,11 +369,24 @@ class FrameKeys(BaseModel):
     k4: Number = 0.0
     p1: Number = 0.0
     p2: Number = 0.0
+    # nerfstudio's k1, k2, k3, k4, p1, p2 in one; they count before the single ones.
+    distortion_params: Annotated[list[Number], Field(min_length=6, max_length=6)] | None = None
+    # Of models that are not read.
+    k5: Number = 0.0
+    k6: Number = 0.0
+    p3: Number = 0.0
+    p4: Number = 0.0
+    b1: Number = 0.0
+    b2: Number = 0.0
     # The file's, where the frame tells a focal length of its own.
     _of_file: FrameKeys | None = PrivateAttr(None)
 
     def lens(self, picture: Path, *, what: str) -> LensParameters:
         """The recorded camera; the ``picture`` tells the size where no key does."""
+        if self.distortion_params is not None:
+            told = dict(zip(DISTORTION, self.distortion_params, strict=True))
+            other = self.model_copy(update={**told, "distortion_params": None})
+            return other.lens(picture, what=what)
         size = self._size(picture)
         if (times := self._times(size)) != 1:
             whole = {"w": round(size[0] * times), "h": round(size[1] * times)}
@@ -393,6 +408,13 @@ class FrameKeys(BaseModel):
                 f"{what}: the camera model {named} is not read; expected one of "
                 f"{', '.join(name for name in (*PERSPECTIVE, *FISHEYE, PANORAMA) if name)}; "
                 "render perspective views first"
+            )
+        further = {key: value for key in FURTHER if (value := getattr(self, key))}
+        if further:
+            key, value = next(iter(further.items()))
+            raise ProjectError(
+                f"{what}: {key} = {value} is of a camera model that is not read; expected k1, k2, "
+                "k3, p1, p2 at most; undistort the pictures first, or calibrate without it"
             )
         if self.k4:
             raise ProjectError(

@@ -80,11 +80,13 @@ def test_malformed_text_model_names_the_file(tmp_path, name, pattern, replacemen
     one_line(error)
 
 
-def test_text_model_without_point_lines_does_not_lose_every_second_image(tmp_path):
+@pytest.mark.parametrize("count", [4, 5])
+def test_text_model_without_point_lines_does_not_lose_every_second_image(tmp_path, count):
     workspace(tmp_path, text=True, classic=True)
     path = tmp_path / "sparse/0/images.txt"
     lines = [line for line in path.read_text().splitlines() if line.endswith(".png")]
-    path.write_text("\n".join(lines) + "\n")
+    path.write_text("\n".join((lines * 2)[:count]) + "\n")
+    (path.parent / "points3D.txt").write_text("")
     with pytest.raises(ProjectError, match="two lines"):
         read_colmap(tmp_path)
 

@@ -93,6 +93,7 @@ def test_frames_have_intrinsics_of_their_own(tmp_path):
         ({"k1": 0.05, "k3": 0.01, "camera_model": "OPENCV"}, "FULL_OPENCV"),
         ({"k1": 0.02, "k4": 0.001, "camera_model": "OPENCV_FISHEYE"}, "OPENCV_FISHEYE"),
         ({"k1": 0.02, "is_fisheye": True}, "OPENCV_FISHEYE"),
+        ({"distortion_params": [0.05, -0.07, 0, 0, 0.002, -0.002]}, "OPENCV"),
     ],
 )
 def test_distortion_mask_and_depth_share_the_mapping(tmp_path, keys, model):
@@ -182,6 +183,8 @@ def test_masks_are_given_and_missed_as_those_of_colmap(tmp_path):
     [
         ({"camera_model": "EQUIRECTANGULAR"}, "expected twice as wide as high"),
         ({"k4": 0.1}, "k4 = 0.1 of a perspective camera"),
+        ({"b1": 0.1}, "b1 = 0.1 is of a camera model that is not read"),
+        ({"distortion_params": [0.1]}, "at least 6 items"),
         ({"transform_matrix": [[1, 2], [3]]}, "transform_matrix is no matrix"),
         ({"transform_matrix": (2 * np.eye(4)).tolist()}, "frame 0"),
         ({"transform_matrix": (np.eye(4) * np.nan).tolist()}, "NaN"),
