@@ -34,6 +34,9 @@ JPEG_QUALITY = 97
 # Pictures that cameras write and Pillow does not read.
 HEIF = (".heic", ".heif", ".avif")
 RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
+VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".insv")
+# Photographs have more colours; masks, blank frames and covers have these.
+FEW_COLORS = 4
 # Pictures are judged at this height, and one whose sharpness is below this share of the median's is
 # called blurred. [pixels]
 JUDGED_HEIGHT, BLURRED = 480, 0.15
@@ -57,6 +60,8 @@ class CapturedPhotograph:
     thumbnail: NDArray[np.uint8]  # (w h,) grey levels of the picture at THUMBNAIL
     # Latitude and longitude in degrees, height in metres; None without GPS.
     location: tuple[float, float, float] | None = None
+    few_colors: bool = False  # as masks and blank frames
+    deep: bool = False  # grey of more than 8 bits, as depth maps and some cameras' pictures
 
 
 def find_photographs(folder: Path) -> tuple[list[CapturedPhotograph], list[Finding]]:
@@ -84,6 +89,13 @@ def find_photographs(folder: Path) -> tuple[list[CapturedPhotograph], list[Findi
         except UNREADABLE:
             damaged.append(name)
     total = len(names)
+    # All pictures of a camera may be so; beside others they are masks, and depth maps.
+    shown = [item for item in found if not item.few_colors]
+    shown = shown if len(shown) > 1 else found
+    masks = [item.name for item in found if item not in shown]
+    found = [item for item in shown if not item.deep]
+    found = found if len(found) > 1 else shown
+    depth = [item.name for item in shown if item not in found]
     reduced = _reduced_copies(found)
     found = [item for item in found if item.name not in reduced]
     warnings = [
@@ -91,6 +103,8 @@ def find_photographs(folder: Path) -> tuple[list[CapturedPhotograph], list[Findi
         for some, reason in (
             (damaged, "cannot be read"),
             (copies, "are copies of others"),
+            (masks, f"have at most {FEW_COLORS} colours, as masks (give these with --masks)"),
+            (depth, "are grey of 16 bits beside others of 8, as depth maps"),
             (reduced, "are others again, in another size or format"),
         )
         if some
@@ -104,6 +118,15 @@ def find_photographs(folder: Path) -> tuple[list[CapturedPhotograph], list[Findi
         warnings.append(
             f"{len(foreign)} pictures are HEIC, AVIF or raw: left out ({named(foreign)}); convert "
             "them to JPEG"
+        )
+    stems = {path.with_suffix("") for path in map(files.__getitem__, [*names, *foreign])}
+    videos = [
+        name for name, path in files.items()
+        if path.suffix.lower() in VIDEOS and path.with_suffix("") not in stems
+    ]  # fmt: skip
+    if videos:
+        warnings.append(
+            f"{len(videos)} videos are left out ({named(videos)}); give one instead of the folder"
         )
     if len(found) < 2:
         met = f" ({'; '.join(warnings)})" if warnings else ""
@@ -142,6 +165,8 @@ def _reduced_copies(found: Sequence[CapturedPhotograph]) -> list[str]:
 
 def _look_at(path: Path, name: str) -> CapturedPhotograph:
     with open_picture(path) as image:
+        deep = image.mode.startswith(("I", "F"))
+        few = not deep and image.convert("RGB").getcolors(FEW_COLORS) is not None
         exif = image.getexif()
         more, gps = exif.get_ifd(EXIF_FOLDER), exif.get_ifd(GPS_FOLDER)
         turned = int(exif.get(ORIENTATION, 1) or 1) > 1
@@ -154,7 +179,7 @@ def _look_at(path: Path, name: str) -> CapturedPhotograph:
     sharp = sharpness(np.asarray(grey.resize((width, height), Image.Resampling.BOX)))
     thumbnail = np.asarray(grey.resize(THUMBNAIL, Image.Resampling.BOX)).ravel()
     return CapturedPhotograph(
-        path, name, upright.size, camera, turned, sharp, thumbnail, _location(gps)
+        path, name, upright.size, camera, turned, sharp, thumbnail, _location(gps), few, deep
     )
 
 

@@ -239,15 +239,15 @@ def text_names(folder: Path) -> dict[int, str]:
     for line in rest:
         if line.strip() and not line.startswith("#"):
             row = line.split(maxsplit=9)
+            second = next(rest, "").split()
             if len(row) == 10 and row[0].isdecimal():
                 names[number_key(row[0])] = row[9].strip()
-            second = next(rest, "").split()
-            if len(second) == 10 and not _is_number(second[-1]):
-                raise ProjectError(
-                    f"{path}: the line after image {row[-1].strip()} is another image, "
-                    f"{second[-1]}; expected two lines an image, the second with its features or "
-                    "empty; add an empty line after each"
-                )
+                if len(second) == 10 and not _is_number(second[-1]):
+                    raise ProjectError(
+                        f"{path}: image {row[9].strip()} is followed by another, {second[-1]}; "
+                        "expected two lines an image, the second with its features or empty; add "
+                        "an empty line after each"
+                    )
     return names
 
 

@@ -46,6 +46,7 @@ IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".p
 # Pillow's layouts of pixels with an alpha channel.
 WITH_ALPHA = ("RGBA", "LA", "PA", "RGBa", "La")
 SAMPLED = 8  # pictures that tell the range of a project's
+LOSSY = ("JPEG", "MPO", "JPEG2000")
 OPAQUE_FROM = 128  # an alpha at or above this counts as part of the picture
 
 _EXIF_ORIENTATION = 0x0112
@@ -173,7 +174,9 @@ def read_mask(path: Path) -> NDArray[np.bool_]:
     Of one colour, the picture tells nothing where its alpha does.
     """
     with _picture(path) as image:
-        used = np.asarray(image if image.mode.startswith("I") else image.convert("L")) > 0
+        # Where black is stored with loss, it is not quite black.
+        least = OPAQUE_FROM if image.format in LOSSY else 1
+        used = np.asarray(image if image.mode.startswith("I") else image.convert("L")) >= least
         if image.mode not in WITH_ALPHA and "transparency" not in image.info:
             return used
         opaque = np.asarray(image.convert("RGBA"))[..., 3] >= OPAQUE_FROM

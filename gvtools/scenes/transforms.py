@@ -123,7 +123,13 @@ def read_transforms(path: Path, *, images: Path | None = None, masks: Path | Non
                 where=what,
             )
         )
-        for line in keys.doubts(file):
+        lines = keys.doubts(file)
+        if mask is None and is_file(file.with_name(f"dynamic_mask_{file.stem}.png")):
+            lines.append(
+                "dynamic_mask_NAME.png lies beside them, whose white instant-ngp ignores, and is "
+                "not read; turn black and white over and give the folder of NAME.png with --masks"
+            )
+        for line in lines:
             said.setdefault(line, []).append(name)
     findings += [
         Finding("warning", f"{len(names)} frames ({named(names)}): {line}")

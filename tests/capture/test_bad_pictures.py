@@ -68,6 +68,27 @@ def test_copies_and_pictures_of_systems_are_left_out_by_content(
     assert "small/renamed.jpg" in said[0] and "3 pictures lie in hidden folders" in said[1]
 
 
+def test_what_is_no_photograph_is_left_out_by_content(texture: Image.Image, tmp_path: Path) -> None:
+    for index in range(3):
+        texture.crop((40 * index, 0, 40 * index + 480, 360)).save(tmp_path / f"{index}.png")
+        mask = np.zeros((360, 480), np.uint8)
+        mask[: 50 + index] = 255
+        Image.fromarray(mask).save(tmp_path / f"{index}.png.png")
+        depth = np.arange(480, dtype=np.uint16)[None] * np.full((360, 1), 9 + index, np.uint16)
+        Image.fromarray(depth).save(tmp_path / f"{index}_depth.png")
+    (tmp_path / "0.mov").write_bytes(b"of a live photograph")
+    (tmp_path / "walk.MOV").write_bytes(b"film")
+    found, said = find_photographs(tmp_path)
+    assert [item.name for item in found] == ["0.png", "1.png", "2.png"]
+    assert [item.message for item in said] == [
+        "3 of 9 pictures have at most 4 colours, as masks (give these with --masks): left out "
+        "(0.png.png, 1.png.png, 2.png.png)",
+        "3 of 9 pictures are grey of 16 bits beside others of 8, as depth maps: left out "
+        "(0_depth.png, 1_depth.png, 2_depth.png)",
+        "1 videos are left out (walk.MOV); give one instead of the folder",
+    ]
+
+
 def test_masks_fit_their_pictures(tmp_path: Path) -> None:
     photos, masks, out = tmp_path / "photos", tmp_path / "masks", tmp_path / "out"
     for folder in (photos, masks):

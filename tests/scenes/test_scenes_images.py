@@ -84,6 +84,14 @@ def test_mask_is_black_or_not(tmp_path):
     np.testing.assert_array_equal(read_mask(save(tmp_path / "w.png", wide)), mask > 0)
 
 
+def test_black_of_a_mask_stored_with_loss_is_black(tmp_path):
+    x, y = np.meshgrid(np.arange(64), np.arange(64))
+    mask = np.hypot(x - 32, y - 32) < 20
+    Image.fromarray(mask.astype(np.uint8) * 255).save(tmp_path / "m.jpg", quality=60)
+    assert (np.asarray(Image.open(tmp_path / "m.jpg"))[~mask] > 0).mean() > 0.1
+    assert (read_mask(tmp_path / "m.jpg") != mask).mean() < 0.01
+
+
 @pytest.mark.parametrize("color", [0, 255, None])
 def test_a_mask_may_tell_it_by_its_alpha(tmp_path, color):
     pixels = np.full((2, 2, 4), color or 0, np.uint8)

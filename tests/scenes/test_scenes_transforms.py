@@ -112,6 +112,14 @@ def test_distortion_mask_and_depth_share_the_mapping(tmp_path, keys, model):
     np.testing.assert_array_equal(loaded.mask[sure], loaded.rgb[..., 1][sure] > 127)
 
 
+def test_masks_of_instant_ngp_are_not_passed_over(tmp_path):
+    save(tmp_path / "images/a.png", ramp())
+    save(tmp_path / "images/dynamic_mask_a.png", ramp())
+    assert "dynamic_mask_NAME.png" in messages(
+        read_transforms(transforms(tmp_path, [frame()], **PINHOLE))
+    )
+
+
 def test_depth_is_millimetres_unless_said(tmp_path):
     save(tmp_path / "images/a.png", ramp())
     save(tmp_path / "a.depth.png", depth_picture(2.0))
