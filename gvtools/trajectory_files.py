@@ -31,6 +31,7 @@ _COLUMNS = {"tum": (0, 1, 2, 3, 4, 5, 6, 7), "euroc": (0, 1, 2, 3, 5, 6, 7, 4)}
 _NAMES = {"tum": "timestamp tx ty tz qx qy qz qw", "euroc": "nanoseconds, x, y, z, qw, qx, qy, qz"}
 _DECIMAL = re.compile(r"[+-]?\d+(,\d+)?(e[+-]?\d+)?", re.IGNORECASE)
 _ZERO = re.compile(r"[+-]?0*\.?0*(e[+-]?\d+)?", re.IGNORECASE)
+_LOST = {f"{sign}{word}" for sign in ("", "+", "-") for word in ("nan", "inf", "infinity")}
 _UNIT = re.compile(r"\s*[\[(]\s*([^\])]*?)\s*[\])]")
 _TIME = re.compile(r"(?:\w+_)?(?:time|(?:time_?)?stamps?|n?secs?|seconds|t)(?:_(ns|us|ms|s))?")
 _TURN = re.compile(r"(?:q|quat\w*?|rot\w*?|ori\w*?)(?:[._]\w+)??[._]?([xyzw])(?:_world\w*)?")
@@ -54,7 +55,7 @@ class Trajectory:
         return len(self.poses)
 
 
-def read_poses(path: str | Path, *, layout: str = "auto") -> Trajectory:
+def read_poses(path: str | Path, *, layout: str = "auto", lost: bool = False) -> Trajectory:
     r"""The poses of a trajectory file.
 
     Args:
@@ -63,6 +64,7 @@ def read_poses(path: str | Path, *, layout: str = "auto") -> Trajectory:
             with or without a number or time in front, or a line for each row), "euroc" (CSV:
             nanoseconds, x, y, z, qw, qx, qy, qz, and more that is not read) or "auto": the columns
             that the head names, else what the numbers tell.
+        lost: whether lines with NaN or infinity, for which a tracker was lost, are left out.
 
     Returns:
         N poses in the order of the file, with stamps for TUM and EuRoC. Rotations that are off by
@@ -83,6 +85,13 @@ def read_poses(path: str | Path, *, layout: str = "auto") -> Trajectory:
     """
     path = Path(path)
     form, rows = _form(path, layout)
+    kept = [row for row in rows if not (lost and _LOST.intersection(map(str.lower, row[1])))]
+    left_out = len(rows) - len(kept)
+    if not kept:
+        raise ProjectError(
+            f"{path}: all {len(rows)} poses hold NaN or infinity; expected finite ones"
+        )
+    rows = kept
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     stamps = np.empty(len(rows))
     for i, (number, words) in enumerate(rows):
@@ -111,6 +120,8 @@ def read_poses(path: str | Path, *, layout: str = "auto") -> Trajectory:
             "be; mend the head"
         )
     notes = form.notes
+    if left_out:
+        notes = (*notes, f"{left_out} poses hold NaN or infinity: dropped")
     if unit and not form.unit and not form.more:
         notes = (*notes, f"time stamps read as {unit}")
     return Trajectory(poses, (), seconds, notes)

@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from PIL import Image, ImageOps
 
 from gvtools.errors import ProjectError
-from gvtools.scenes.images import UNREADABLE, read_mask
-from gvtools.scenes.matching import named
+from gvtools.scenes.images import UNREADABLE, read_mask, resize_nearest, same_aspect
+from gvtools.scenes.matching import find_renamed, is_hidden, named
 from gvtools.scenes.project import PICTURES
 from gvtools.scenes.scene import Finding, natural_key
-from gvtools.untrusted import open_picture, read_bytes
+from gvtools.untrusted import is_file, open_picture, read_bytes
 
 # EXIF tags (Exif 2.32) and the sub-folders that hold them.
 EXIF_FOLDER, GPS_FOLDER = 0x8769, 0x8825
@@ -67,7 +67,7 @@ class CapturedPhotograph:
 def find_photographs(folder: Path) -> tuple[list[CapturedPhotograph], list[Finding]]:
     """The readable, different pictures below a folder in natural order, and what was met."""
     every = {path.relative_to(folder).as_posix(): path for path in sorted(folder.rglob("*"))}
-    files = {name: path for name, path in every.items() if not _is_hidden(name)}
+    files = {name: path for name, path in every.items() if not is_hidden(name)}
     hidden = [
         name for name, path in every.items()
         if name not in files and path.suffix.lower() in PICTURES and path.is_file()
@@ -135,11 +135,6 @@ def find_photographs(folder: Path) -> tuple[list[CapturedPhotograph], list[Findi
             "one place, taken from different points"
         )
     return found, [*(Finding("warning", text) for text in warnings), *_oddities(found)]
-
-
-def _is_hidden(name: str) -> bool:
-    """Whether a file or a folder above it is hidden, or one that systems make (``@eaDir``)."""
-    return any(part[0] in ".@#$" or part == "__MACOSX" for part in name.split("/"))
 
 
 def _reduced_copies(found: Sequence[CapturedPhotograph]) -> list[str]:
@@ -252,17 +247,21 @@ def complete_masks(
     ``masks`` holds ``a.jpg.png`` for ``a.jpg``, black where nothing is to be matched; pictures
     without a mask are used whole.
     """
-    absent = [item.name for item in photographs if not (masks / f"{item.name}.png").is_file()]
+    listed = [masks / f"{item.name}.png" for item in photographs]
+    where = [f"--masks {masks}"] * len(listed)
+    files, findings = find_renamed(masks, listed, where=where, noun="masks")
+    absent = [item.name for item, file in zip(photographs, files, strict=True) if not is_file(file)]
     if len(absent) == len(photographs):
         raise ProjectError(
             f"--masks {masks}: holds no mask of the {len(photographs)} pictures; expected "
             f"{absent[0]}.png for {absent[0]}"
         )
-    for item in photographs:
+    for item, file in zip(photographs, files, strict=True):
         mask = Image.new("L", item.size, 255)
-        file = masks / f"{item.name}.png"
-        if file.is_file():
+        if is_file(file):
             mask = Image.fromarray(read_mask(file))
+            if mask.size != item.size and same_aspect(mask.size, item.size):
+                mask = Image.fromarray(resize_nearest(np.asarray(mask), *item.size))
             if mask.size != item.size:
                 raise ProjectError(
                     f"{file}: {mask.width}x{mask.height} pixels; expected those of the upright "
@@ -274,4 +273,4 @@ def complete_masks(
     text = (
         f"{len(absent)} of {len(photographs)} pictures have no mask ({named(absent)}): used whole"
     )
-    return [Finding("warning", text)] if absent else []
+    return [*findings, Finding("warning", text)] if absent else findings

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from gvtools.scenes.colmap_model import (
     sparse_points,
 )
 from gvtools.scenes.images import IMAGE_SUFFIXES
-from gvtools.scenes.matching import given_folder, renamed
+from gvtools.scenes.matching import find_renamed, given_folder
 from gvtools.scenes.photographs import PosedFrame, posed_scene
 from gvtools.scenes.scene import Finding, Scene
 from gvtools.scenes.undistort import LensParameters
@@ -68,32 +68,26 @@ def read_colmap(
         _first([around, *homes], "masks") if masks is None else given_folder(masks, "masks")
     )
     depth_folder = _first([*homes, around], "stereo/depth_maps")
-    frames = []
-    other = renamed(image_folder, [image.name for image in loaded.images])
-    for frame in colmap_frames(
-        loaded,
-        lambda image: named_file(
-            image_folder, other.get(image.name, image.name), where=f"{folder}, an image"
-        ),
-    ):
-        if mask_folder is not None:
-            mask = named_file(mask_folder, f"{frame.name}.png", where=f"{mask_folder}, a mask")
-            frame = replace(frame, mask=mask)
-        if depth_folder is not None:
-            frame = replace(frame, depth=depth_map_path(depth_folder, frame.name))
-        frames.append(frame)
+    frames = colmap_frames(loaded, lambda image: image_folder / image.name)
+    where = [f"{folder}, an image"] * len(frames)
+    files, met = find_renamed(image_folder, [frame.image for frame in frames], where=where)
+    frames = [replace(frame, image=file) for frame, file in zip(frames, files, strict=True)]
+    if mask_folder is not None:
+        listed = [mask_folder / f"{frame.name}.png" for frame in frames]
+        where = [f"{mask_folder}, a mask"] * len(frames)
+        found, others = find_renamed(mask_folder, listed, where=where, noun="masks")
+        frames = [replace(frame, mask=mask) for frame, mask in zip(frames, found, strict=True)]
+        met += others
+    if depth_folder is not None:
+        frames = [
+            replace(frame, depth=depth_map_path(depth_folder, frame.name)) for frame in frames
+        ]
     scene = colmap_scene(root, loaded, frames, strict=True)
     kinds = Counter(frame.depth.name.split(".")[-2] for frame in frames if frame.depth is not None)
-    listed = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items()))
-    findings = [Finding("info", f"depth maps: {listed}")] if listed else []
-    findings.append(_registered_finding(image_folder, loaded, other))
-    if other:
-        first = next(iter(other.items()))
-        line = (
-            f"{len(other)} pictures are named otherwise than in the model ({first[0]}: {first[1]})"
-        )
-        findings.append(Finding("info", f"{line}: taken, as each fits one name alone"))
-    return replace(scene, findings=(*scene.findings, *findings))
+    kinds_found = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items()))
+    findings = [Finding("info", f"depth maps: {kinds_found}")] if kinds_found else []
+    findings.append(_registered_finding(image_folder, loaded, files))
+    return replace(scene, findings=(*scene.findings, *met, *findings))
 
 
 def model_in(root: Path, *, number: int | None = None, faces: bool = False) -> ColmapModel:
@@ -174,16 +168,13 @@ def _first(homes: list[Path], name: str) -> Path | None:
     return next((home / name for home in homes if (home / name).is_dir()), None)
 
 
-def _registered_finding(
-    image_folder: Path, model: ColmapModel, other: Mapping[str, str]
-) -> Finding:
+def _registered_finding(image_folder: Path, model: ColmapModel, files: list[Path]) -> Finding:
     """How many of the pictures on disk the model knows, and through which cameras."""
-    names = (other.get(image.name, image.name) for image in model.images)
-    known = {Path(name).as_posix() for name in names}
+    known = {os.path.relpath(file, image_folder) for file in files}
     others = 0
-    for folder, _, files in os.walk(image_folder):
+    for folder, _, inner in os.walk(image_folder):
         relative = Path(folder).relative_to(image_folder)
-        for name in files:
+        for name in inner:
             if name.lower().endswith(IMAGE_SUFFIXES):
                 others += (relative / name).as_posix() not in known
     models = Counter(views[0].model for views in model.views.values())
@@ -197,5 +188,7 @@ def depth_map_path(folder: Path, name: str) -> Path | None:
     for suffix in DEPTH_SUFFIXES:
         path = folder / f"{name}{suffix}"
         if is_file(path):
-            return named_file(folder, path, where=f"{folder}, a depth map")
+            home, file = Path(os.path.abspath(folder)), os.path.abspath(path)
+            named_file(home, file, where=f"{folder}, a depth map", follow_links=True)
+            return path
     return None

@@ -6,6 +6,7 @@ import os
 import re
 import unicodedata
 from collections.abc import Iterable, Sequence
+from itertools import islice
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from gvtools.errors import DegenerateError, ProjectError
 from gvtools.scenes.images import IMAGE_SUFFIXES
-from gvtools.scenes.scene import natural_key
+from gvtools.scenes.scene import Finding, natural_key
 from gvtools.trajectory_files import in_seconds
 from gvtools.untrusted import is_file, named_file
 
@@ -22,6 +23,8 @@ Float64 = NDArray[np.float64]
 PICTURES = (".jpg", ".jpeg", ".png")
 # Stamps of the other list within the limit of one, on average, at most.
 MOST_CANDIDATES = 100
+# Files of a folder that absent ones are looked for among.
+MOST_FILES = 200_000
 NAMED_AT_MOST = 3  # a message names this many files and counts the rest
 
 
@@ -161,34 +164,88 @@ def paired(first: Sequence[str], second: Sequence[str]) -> list[tuple[int, int]]
     return sorted(pairs.items())
 
 
-def renamed(folder: Path, names: Sequence[str]) -> dict[str, str]:
-    """For names that a folder does not hold, its one picture whose name is another form of it.
+def is_hidden(name: str) -> bool:
+    """Whether a file or a folder above it is hidden, or one that systems make (``@eaDir``)."""
+    return any(part[0] in ".@#$" or part == "__MACOSX" for part in name.split("/"))
 
-    Separators, suffixes, case, Unicode's forms and leading folders may differ.
+
+def find_renamed(
+    folder: Path,
+    files: Sequence[Path],
+    *,
+    where: Sequence[str] | None = None,
+    noun: str = "pictures",
+    also: Path | None = None,
+) -> tuple[list[Path], list[Finding]]:
+    r"""Files that lists name in a folder; for one that is absent, the only one of nearly that name.
+
+    It differs by the separator "\", case, Unicode form or suffix, and, where none is as listed, by
+    folders in front of one of the two names. Absolute names may be those of another computer.
+    A name that leads out of the folder and to no such file is refused where ``where`` says for each
+    what names it; links are followed. Files may lie in a second folder, ``also``, as listed.
     """
-    missing = [name for name in names if not is_file(folder / name)]
-    if not missing:
-        return {}
-    files = (path for path in sorted(folder.rglob("*")) if path.suffix.lower() in IMAGE_SUFFIXES)
-    others = {path.relative_to(folder).as_posix() for path in files} - {*names}
-    held = sorted(others)
-    try:
-        pairs = paired([stem(name).casefold() for name in missing],
-                       [stem(name).casefold() for name in held])  # fmt: skip
-    except DegenerateError:
-        return {}
-    return {missing[i]: held[row] for i, row in pairs}
+    home, found = Path(os.path.abspath(folder)), list(files)
+    names = [os.path.relpath(file, home) for file in files]
+    places = [Path(os.path.abspath(item)) for item in (folder, also or folder)]
+    whole = [Path(os.path.abspath(file)) for file in files]
+    inside = [any(map(file.is_relative_to, places)) for file in whole]
+    absent = [row for row, file in enumerate(files) if not (inside[row] and is_file(file))]
+    if not absent:
+        return found, []
+    known = set(names) - {names[row] for row in absent}
+    listed = set(names)
+    walk = ((Path(top).relative_to(home), inner) for top, _, inner in os.walk(home))
+    every = ((top / name).as_posix() for top, inner in walk for name in inner)
+    there = [name for name in islice(every, MOST_FILES) if name not in listed]
+    there = [name for name in there if not is_hidden(name)]
+    taken: dict[str, list[int]] = {}
+    levels = [_Tails(there, twice=twice) for twice in (None, False, True)]
+    for row in absent:
+        others = (level.only(names[row], whole=bool(known)) for level in levels)
+        if (other := next(filter(None, others), None)) is not None:
+            taken.setdefault(other, []).append(row)
+    renamed = {rows[0]: name for name, rows in taken.items() if len(rows) == 1}
+    for row in absent:
+        if row in renamed:
+            found[row] = folder / renamed[row]
+        elif where is not None and (not inside[row] or "\0" in str(files[row])):
+            named_file(home, whole[row], where=where[row], follow_links=True)
+    if not renamed:
+        return found, []
+    row, name = next(iter(renamed.items()))
+    line = (
+        f"{len(renamed)} {noun} are named otherwise than listed ({names[row]!r}: {name!r}): taken, "
+        "as each fits one name alone"
+    )
+    return found, [Finding("info", line)]
 
 
-def listed_file(folder: Path, name: str, *, where: str) -> Path:
-    r"""The path of a file that a list names, which has to lie in a folder, on disk or not.
+class _Tails:
+    """Names by what they end in, freed of case and Unicode form, and of suffixes unless None."""
 
-    Lists of Windows programs separate folders by "\", which may also be part of a name here.
-    """
-    path = named_file(folder, name, where=where)
-    if "\\" in name and not is_file(path):
-        return named_file(folder, name.replace("\\", "/"), where=where)
-    return path
+    def __init__(self, names: Sequence[str], *, twice: bool | None) -> None:
+        self.twice = twice
+        self.wholes = {name: self._parts(name) for name in names}
+        self.tails: dict[tuple[str, ...], list[str]] = {}
+        for name, parts in self.wholes.items():
+            for start in range(len(parts)):
+                self.tails.setdefault(parts[start:], []).append(name)
+
+    def _parts(self, name: str) -> tuple[str, ...]:
+        name = unicodedata.normalize("NFC", name.replace("\\", "/")).casefold()
+        for _ in range(0 if self.twice is None else 1 + self.twice):
+            name = stem(name).removesuffix("_mask")
+        return PurePosixPath(unicodedata.normalize("NFC", name)).parts
+
+    def only(self, name: str, *, whole: bool) -> str | None:
+        """The one name that shares most of its end, all of its parts with ``whole``."""
+        parts = self._parts(name)
+        for start in range(1 if whole else len(parts)):
+            ending = self.tails.get(parts[start:], [])
+            found = [other for other in ending if self.wholes[other] == parts[start:]]
+            if found := found or (ending if start == 0 and not whole else []):
+                return found[0] if len(found) == 1 else None
+        return None
 
 
 def associate(first: Float64, second: Float64, limit: float) -> dict[int, int]:

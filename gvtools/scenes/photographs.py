@@ -187,6 +187,7 @@ def posed_scene(
     photographs.sort(key=lambda item: natural_key(item.name))
     report += lens_findings([item.lens for item in photographs])
     report += mask_findings([item.frame.mask for item in photographs if item.frame.mask])
+    report += _mask_sizes(photographs)
     deep = [i.frame.image for i in photographs if i.frame.read is None]
     white = white_of_pictures([path for path in deep if path.suffix.lower() in DEEP])
     if white != WHOLE[-1]:
@@ -220,6 +221,20 @@ def mask_findings(files: Sequence[Path]) -> list[Finding]:
         "black or transparent pixels where a picture is to be ignored, and others elsewhere"
     )
     return [Finding("warning", line)]
+
+
+def _mask_sizes(photographs: Sequence[Photograph]) -> list[Finding]:
+    """A line for each size of masks that is not the pictures' but of their aspect."""
+    sizes = Counter[str]()
+    for item in photographs:
+        try:
+            header = None if item.frame.mask is None else read_header(item.frame.mask)
+        except GvError:  # said where its view is read
+            continue
+        (w, h), size = item.lens.source_size, header and (header.width, header.height)
+        if size and size != (w, h) and same_aspect(size, (w, h)):
+            sizes[f"masks of {size[0]}x{size[1]} for pictures of {w}x{h}: nearest pixel taken"] += 1
+    return [Finding("info", f"{count} {line}") for line, count in sizes.items()]
 
 
 def _rigid(frame: PosedFrame, sieve: _Sieve, *, unposed: str) -> Float64:

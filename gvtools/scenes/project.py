@@ -58,7 +58,7 @@ def open_project(
         ProjectError: nothing there that can be read, or what is there is damaged.
         UnposedError: pictures, a video or a recording without cameras.
         OptionError: an option of another kind of project.
-        ShapeError: a pose with NaN, a scale or a mirror.
+        ShapeError: a pose with a scale or a mirror.
     """
     if is_address(path):
         if any(option is not None for option in (images, masks, rgbd, model)):

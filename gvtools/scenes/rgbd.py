@@ -44,11 +44,12 @@ from gvtools.scenes.images import read_depth
 from gvtools.scenes.layout import Layout
 from gvtools.scenes.matching import (
     associate,
-    listed_file,
+    find_renamed,
     named,
     pair_by_name,
     pictures_in,
     pose_at,
+    times_in,
 )
 from gvtools.scenes.photographs import NO_POSE, PosedFrame, Registration, first_size, posed_scene
 from gvtools.scenes.scene import Finding, Scene
@@ -217,39 +218,51 @@ class _Tum(RgbdFolder):
     unit = 1 / 5000
 
     def matches(self, root: Path, *, posed: bool = True) -> bool:
-        names = self.holds[not posed].split(", ")
-        if self._associated(root) is not None:
-            names = names[2:]
-        return all((root / name).is_file() for name in names)
-
-    def _associated(self, root: Path) -> Path | None:
-        """A list of pictures and their depth maps, where there is none of each."""
-        if (root / "rgb.txt").is_file():
-            return None
-        names = ("associations.txt", "associate.txt", "association.txt")
-        return next((root / name for name in names if (root / name).is_file()), None)
+        listed = all((root / f"{kind}.txt").is_file() for kind in ("rgb", "depth"))
+        if not posed:
+            return listed or self._associated(root) is not None
+        named_by_time = all(_stamped_pictures(root / kind) for kind in ("rgb", "depth"))
+        pictures = listed or self._associated(root) is not None or named_by_time
+        return pictures and (root / "groundtruth.txt").is_file()
 
     def frames(self, root: Path, options: RgbdOptions) -> list[PosedFrame]:
-        return [frame for _, frame in self._stamped(root, options)]
+        return [frame for _, frame in self._stamped(root, options)[0]]
 
-    def _stamped(self, root: Path, options: RgbdOptions) -> list[tuple[float, PosedFrame]]:
-        lists = root / "rgb.txt", root / "depth.txt"
-        if (both := self._associated(root)) is not None:
-            lists = both, both
-            colors, depths = _associated_files(both)
+    def _associated(self, root: Path) -> Path | None:
+        """A list of pictures with their depth maps, as tools write it beside the two lists."""
+        return next(iter(sorted(root.glob("assoc*.txt"))), None)
+
+    def _stamped(
+        self, root: Path, options: RgbdOptions
+    ) -> tuple[list[tuple[float, PosedFrame]], list[Finding]]:
+        lists, pairs = [root / f"{kind}.txt" for kind in ("rgb", "depth")], self._associated(root)
+        if pairs is not None and not all(path.is_file() for path in lists):
+            colors, depths = _associated_files(pairs)
+            depth_of = {i: i for i in range(len(colors))}
+            lists = [pairs, pairs]
         else:
-            colors, depths = (_stamped_files(path) for path in lists)
-        times, depth_times = (np.array([time for time, _ in found]) for found in (colors, depths))
-        depth_of = associate(times, depth_times, options.max_time_difference)
+            colors, depths = (
+                _stamped_files(path) if path.is_file() else _stamped_pictures(root / path.stem)
+                for path in lists
+            )
+            times, depth_times = (np.array([time for time, _ in x]) for x in (colors, depths))
+            depth_of = associate(times, depth_times, options.max_time_difference)
+        images, met = find_renamed(
+            root, [root / name for _, name in colors], where=[str(lists[0])] * len(colors)
+        )
+        maps, others = find_renamed(
+            root, [root / name for _, name in depths], where=[str(lists[1])] * len(depths),
+            noun="depth maps",
+        )  # fmt: skip
         frames = []
-        for i, (time, name) in enumerate(colors):
-            color = listed_file(root, name, where=str(lists[0]))
-            depth = None
-            if i in depth_of:
-                depth = listed_file(root, depths[depth_of[i]][1], where=str(lists[1]))
+        for i, ((time, _), color) in enumerate(zip(colors, images, strict=True)):
+            depth = maps[depth_of[i]] if i in depth_of else None
             where = f"{root / 'groundtruth.txt'}, time {time:.6f}"
             frames.append((time, PosedFrame(color.name, color, None, None, depth, where=where)))
-        return sorted(frames, key=lambda item: (item[0], item[1].image))
+        if not all((root / f"{kind}.txt").is_file() for kind in ("rgb", "depth")):
+            source = pairs.name if pairs is not None else "the names of the files in rgb and depth"
+            met.append(Finding("info", f"rgb.txt or depth.txt is absent: times are of {source}"))
+        return sorted(frames, key=lambda item: (item[0], item[1].image)), [*met, *others]
 
     def uncalibrated(self, root: Path, options: RgbdOptions) -> Recording:
         for name, (values, distortion) in PUBLISHED.items():
@@ -262,11 +275,11 @@ class _Tum(RgbdFolder):
 
     def posed(self, recording: Recording, *, strict: bool) -> Recording:
         limit = recording.options.max_time_difference
-        truth = read_poses(recording.root / "groundtruth.txt", layout="tum")
+        truth = read_poses(recording.root / "groundtruth.txt", layout="tum", lost=True)
         assert truth.stamps is not None
         order = np.argsort(truth.stamps, kind="stable")
         at = partial(pose_at, times=truth.stamps[order], poses=truth.poses[order], same=limit)
-        stamped = self._stamped(recording.root, recording.options)
+        stamped, met = self._stamped(recording.root, recording.options)
         frames = [replace(frame, pose=at(time)) for time, frame in stamped]
         # How far off those are that have none tells clocks that differ from poses that lack.
         off = [
@@ -277,7 +290,16 @@ class _Tum(RgbdFolder):
         unposed = f"{NO_POSE} within {limit:g} s"
         if off:
             unposed += f" (the nearest is {min(off):.3g} to {max(off):.3g} s off)"
-        return replace(recording, frames=frames, unposed=unposed)
+        notes = [Finding("warning", f"groundtruth.txt: {note}") for note in truth.notes]
+        findings = [*recording.findings, *met, *notes]
+        return replace(recording, frames=frames, unposed=unposed, findings=findings)
+
+
+def _stamped_pictures(folder: Path) -> list[tuple[float, str]]:
+    """Time stamps and names, below the folder above, of pictures that are all named by time."""
+    names = [f"{folder.name}/{path.name}" for path in pictures_in(folder)]
+    times = times_in(names) if names else None
+    return [] if times is None else list(zip(times.tolist(), names, strict=True))
 
 
 def _associated_files(path: Path) -> tuple[list[tuple[float, str]], list[tuple[float, str]]]:

@@ -11,6 +11,7 @@ import math
 import os
 import reprlib
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -31,11 +32,11 @@ from gvtools.scenes.calibration import (
 )
 from gvtools.scenes.faces import PANORAMA, perspective_views
 from gvtools.scenes.images import read_depth, read_header
-from gvtools.scenes.matching import given_folder, named
+from gvtools.scenes.matching import find_renamed, given_folder, named
 from gvtools.scenes.photographs import PosedFrame, posed_scene
 from gvtools.scenes.scene import Finding, Scene, natural_key
 from gvtools.scenes.undistort import LensParameters, Undistortion
-from gvtools.untrusted import is_file, named_file, read_json, reading
+from gvtools.untrusted import is_file, read_json, reading
 
 FILE = "transforms.json"
 # The files of Blender's synthetic scenes, one a split; a picture of several belongs to the first.
@@ -99,9 +100,9 @@ def read_transforms(path: Path, *, images: Path | None = None, masks: Path | Non
     home = root if images is None else given_folder(images, "images")
     cameras: dict[LensParameters, tuple[Undistortion, ...]] = {}
     frames, said = [], dict[str, list[str]]()
-    for shared, entry, own, name, where in listed:
-        file = own if images is None else home / name
-        named_file(home, file, where=where)
+    named_files = [item.file if images is None else home / item.name for item in listed]
+    files, renamed = find_renamed(home, named_files, where=[item.what for item in listed])
+    for file, (shared, entry, _, name, where) in zip(files, listed, strict=True):
         if not is_file(file):
             frames.append(PosedFrame(name, file, None, None))
             continue
@@ -109,7 +110,7 @@ def read_transforms(path: Path, *, images: Path | None = None, masks: Path | Non
         keys = frame_keys(entry, shared, what=what)
         mask = None if masks is None else masks / f"{name}.png"
         if keys.mask_path:
-            mask = named_file(root, keys.mask_path, where=what)
+            mask = root / keys.mask_path
         depth, unit = keys.depth()
         frames.append(
             PosedFrame(
@@ -117,7 +118,7 @@ def read_transforms(path: Path, *, images: Path | None = None, masks: Path | Non
                 file,
                 _views(keys, file, cameras, what=what),
                 _pose(keys, what),
-                named_file(root, depth, where=what) if depth else None,
+                root / depth if depth else None,
                 partial(read_depth, unit=unit),
                 mask,
                 where=what,
@@ -131,6 +132,17 @@ def read_transforms(path: Path, *, images: Path | None = None, masks: Path | Non
             )
         for line in lines:
             said.setdefault(line, []).append(name)
+    findings += renamed
+    for noun, key, folder in (("masks", "mask", masks or root), ("depth maps", "depth", root)):
+        rows = [i for i, frame in enumerate(frames) if getattr(frame, key) is not None]
+        places = [frames[i].where for i in rows]
+        others, met = find_renamed(
+            folder, [getattr(frames[i], key) for i in rows], where=places, noun=noun, also=root
+        )
+        for i, other in zip(rows, others, strict=True):
+            changed: dict[str, Any] = {key: other}
+            frames[i] = replace(frames[i], **changed)
+        findings += met
     findings += [
         Finding("warning", f"{len(names)} frames ({named(names)}): {line}")
         for line, names in said.items()
@@ -157,7 +169,7 @@ def _listed(path: Path) -> tuple[list[_Listed], list[Finding]]:
     if path.is_file() or (path / FILE).is_file() or not is_transforms(path):
         path = path / FILE if path.is_dir() else path
         data = load_frames(path)
-        files = _pictures(path, data["frames"])
+        files, findings = _pictures(path, data["frames"])
         places = zip(data["frames"], files, _names(files), strict=True)
         listed = [
             _Listed(data, entry, file, name, f"{path}, frame {i}")
@@ -165,16 +177,16 @@ def _listed(path: Path) -> tuple[list[_Listed], list[Finding]]:
         ]
         unused = data.get("ply_file_path")
         line = f"ply_file_path ({reprlib.repr(unused)}) is not read: depth comes from pictures"
-        return listed, [Finding("info", line)] if unused else []
+        return listed, [*findings, *([Finding("info", line)] if unused else [])]
     splits, found = dict[Path, str](), list[_Listed]()
-    sizes = dict.fromkeys(SPLITS, 0)
+    sizes, findings = dict.fromkeys(SPLITS, 0), list[Finding]()
     for split, name in SPLITS.items():
         if not (path / name).is_file():
             continue
         data = load_frames(path / name)
-        for i, (entry, file) in enumerate(
-            zip(data["frames"], _pictures(path / name, data["frames"]), strict=True)
-        ):
+        files, met = _pictures(path / name, data["frames"])
+        findings += met
+        for i, (entry, file) in enumerate(zip(data["frames"], files, strict=True)):
             if splits.setdefault(file, split) == split:
                 found.append(_Listed(data, entry, file, split, f"{path / name}, frame {i}"))
                 sizes[split] += 1
@@ -187,7 +199,7 @@ def _listed(path: Path) -> tuple[list[_Listed], list[Finding]]:
     line = f"splits: {', '.join(f'{split} ({sizes[split]} frames)' for split in held)}"
     if len(held) > 1:
         line += f"; select them by name: --context {held[0]} --targets {held[1]}"
-    return listed, [Finding("info", line)]
+    return listed, [*findings, Finding("info", line)]
 
 
 def transforms_frames(
@@ -300,8 +312,8 @@ def _file_path(frame: Mapping[str, Any], what: str) -> str:
     return name.replace("\\", "/")
 
 
-def _pictures(path: Path, frames: Sequence[Mapping[str, Any]]) -> list[Path]:
-    """The pictures that frames name, on disk or not."""
+def _pictures(path: Path, frames: Sequence[Mapping[str, Any]]) -> tuple[list[Path], list[Finding]]:
+    """The pictures that frames name, on disk or not, or those of nearly the same name."""
     files = []
     for i, frame in enumerate(frames):
         file = Path(os.path.normpath(path.parent / _file_path(frame, f"{path}, frame {i}")))
@@ -309,7 +321,7 @@ def _pictures(path: Path, frames: Sequence[Mapping[str, Any]]) -> list[Path]:
             guesses = [file.with_name(file.name + suffix) for suffix in GUESSED_SUFFIXES]
             file = next((guess for guess in guesses if is_file(guess)), guesses[0])
         files.append(file)
-    return files
+    return find_renamed(path.parent, files)
 
 
 def _names(files: Sequence[Path]) -> list[str]:

@@ -77,13 +77,15 @@ def test_images_of_colmap(tmp_path, secret):
 
 
 @pytest.mark.parametrize("make", [samples.transforms, samples.tum, samples.colmap])
-def test_a_picture_that_is_a_link_out_is_refused(tmp_path, secret, make):
+def test_a_picture_that_is_a_link_into_a_store_is_followed(tmp_path, make):
     make(tmp_path / "scan")
-    picture = next(p for p in sorted((tmp_path / "scan").rglob("*.png")) if "depth" not in str(p))
-    picture.unlink()
-    picture.symlink_to(secret)
-    with pytest.raises(ProjectError, match=OUT):
-        open_project(tmp_path / "scan")
+    expected = [view.load().rgb.sum() for view in open_project(tmp_path / "scan")]
+    for number, file in enumerate(sorted((tmp_path / "scan").rglob("*.png"))):
+        blob = tmp_path / "blobs" / str(number)
+        blob.parent.mkdir(exist_ok=True)
+        file.rename(blob)
+        file.symlink_to(blob)
+    assert [view.load().rgb.sum() for view in open_project(tmp_path / "scan")] == expected
 
 
 def test_links_inside_and_a_linked_image_folder_are_followed(tmp_path):

@@ -78,29 +78,38 @@ def test_impossible_poses_name_their_file(tmp_path, change, told):
     assert "\n" not in str(error.value)
 
 
-def test_a_pose_with_nan_leaves_its_frame_out(tmp_path):
-    root = sevenscenes(tmp_path)
-    np.savetxt(root / "frame-000001.pose.txt", pose_matrix() * np.nan)
-    scene = SEVENSCENES.read(root)
-    assert len(scene) == 2
-    assert "1 of 3 frames have NaN in their pose: dropped (frame-000001" in messages(scene)
+@pytest.mark.parametrize("value", [np.nan, -np.inf])
+@pytest.mark.parametrize("make", [sevenscenes, redwood, scannet, tum])
+def test_a_pose_that_is_no_number_is_one_lost_frame(tmp_path, make, value):
+    make(tmp_path / "scan")
+    before = len(open_project(tmp_path / "scan"))
+    for file in (tmp_path / "scan").rglob("*0.pose.txt"):
+        np.savetxt(file, np.full((4, 4), value))
+    for file in (*tmp_path.rglob("pose/2.txt"), *tmp_path.rglob("trajectory.log")):
+        lines = file.read_text().splitlines()
+        file.write_text("\n".join([lines[0], f"{value} {value} {value} {value}", *lines[2:]]))
+    for file in tmp_path.rglob("groundtruth.txt"):
+        lines = file.read_text().splitlines()
+        file.write_text("\n".join([*lines[:-1], lines[-1].split()[0] + f" {value}" * 7]))
+    scene = open_project(tmp_path / "scan")
+    assert len(scene) == before - 1
+    told = "have NaN in their pose" if np.isnan(value) else "were lost by the tracker"
+    assert ("1 poses hold NaN or infinity: dropped" if make is tum else told) in messages(scene)
 
 
-@pytest.mark.parametrize("order", ["rgb depth", "depth rgb"])
-def test_tum_of_associations_alone(tmp_path, order):
-    whole = TUM.read(tum(tmp_path / "whole"))
-    root = tum(tmp_path / "recording")
-    lists = {}
-    for name in ("rgb", "depth"):
-        lines = (root / f"{name}.txt").read_text().splitlines()
-        lists[name] = [line for line in lines if not line.startswith("#")]
-        (root / f"{name}.txt").unlink()
-    first, second = (lists[name] for name in order.split())
-    lines = [f"{a} {b}" for a, b in zip(first, second, strict=False)]
-    (root / "associations.txt").write_text("\n".join(lines))
-    scene = open_project(root)
-    assert scene.names == whole.names and all(view.has_depth for view in scene)
-    np.testing.assert_array_equal(scene.cameras.K, whole.cameras.K)
+@pytest.mark.parametrize("order", [1, -1, 0])
+def test_tum_without_its_lists(tmp_path, order):
+    expected = TUM.read(tum(tmp_path))
+    lines = [(tmp_path / f"{kind}.txt").read_text().splitlines() for kind in ("rgb", "depth")]
+    if order:
+        pairs = [" ".join(pair[::order]) for pair in zip(*lines, strict=True)]
+        (tmp_path / "associations.txt").write_text("\n".join(pairs))
+    (tmp_path / "rgb.txt").unlink()
+    (tmp_path / "depth.txt").unlink()
+    scene = open_project(tmp_path)
+    assert scene.names == expected.names and all(view.has_depth for view in scene)
+    source = "associations.txt" if order else "the names of the files"
+    assert f"times are of {source}" in messages(scene)
 
 
 @pytest.mark.parametrize("codes", [[[90, 5, 0], [0, 90, 0], [0, 0, 1]], [[0, 0, 0]] * 3])
