@@ -14,12 +14,16 @@ from math import prod
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+import skimage
 import torch
+from PIL import Image
 
 from gvtools.completers.geoverse import config as configs
 from gvtools.completers.geoverse.config import GeoVerseConfig
 from gvtools.completers.geoverse.model import GeoVerse, empty_model
 from gvtools.completers.geoverse.video_prior import VideoPriorConfig
+from gvtools.completers.geoverse.views import model_size
 from gvtools.completers.geoverse.weights import (
     CONFIG_FILE,
     VIDEO_FOLDER,
@@ -37,12 +41,14 @@ from gvtools.completers.geoverse.weights import (
     save_pretrained,
 )
 from gvtools.errors import ProjectError
+from gvtools.evaluation.images import psnr
 from gvtools.files import write_text
 from gvtools.networks.depth_anything.network import RELEASED, DepthAnything3, tied_norms
 from gvtools.networks.tensors import Shapes
 from gvtools.training.records import STAGES, read_log
 from gvtools.training.run import SETTINGS, WEIGHTS
-from gvtools.untrusted import read_json
+from gvtools.untrusted import open_picture, read_json, reading
+from pipelines.published import MODELS
 
 if TYPE_CHECKING:
     from pipelines.console import Console
@@ -162,18 +168,70 @@ def _print_file(
 
 
 def print_parts(
-    folder: Path, config: GeoVerseConfig, parts: Sequence[PartReport], *, console: Console
+    folder: Path,
+    config: GeoVerseConfig,
+    parts: Sequence[PartReport],
+    *,
+    checked: str = "",
+    console: Console,
 ) -> None:
-    """A line a part, and whether the folder can be loaded."""
+    """A line a part, that of the self-check, and whether the folder can be loaded."""
     console.line(f"{folder}, configuration {config.name}")
     width = max(len(part.name) for part in parts)
     for part in parts:
         mark = "does not fit" if not part.ok else "ok" if part.path else "absent"
+        mark = "left out" if part.left_out else mark
         size = f", {size_text(part.bytes)}" if part.bytes else ""
         where = f" ({part.path.relative_to(folder)}{size})" if part.path else ""
         summary = part.summary.removeprefix("absent: ").removeprefix("absent, and not needed: ")
         console.line(f"  {part.name.ljust(width)}  {mark}{where}: {summary}")
+    if checked:
+        console.line(checked)
     console.line(f"ok: {'true' if all(part.ok for part in parts) else 'false'}")
+
+
+# What GLD states of a photograph that is encoded and decoded, dB, and what is too little.
+STATED, LEAST = 35, 30
+
+
+def of_published_size(config: GeoVerseConfig) -> bool:
+    """Whether encoder and decoders are those that are published."""
+    gld = configs.named("gld")
+    return (config.geometry, config.rgb) == (gld.geometry, gld.rgb)
+
+
+def other_revisions(config: GeoVerseConfig, parts: Sequence[PartReport]) -> list[str]:
+    """A line for every file that is not the published one; whole files are read."""
+    if not of_published_size(config):
+        return []
+    lines = []
+    for part in parts:
+        for file in MODELS["gld"]:
+            if part.path is not None and part.path.as_posix().endswith(f"/{file.place}"):
+                found = file.difference(part.path)
+                lines += [f"{part.path}: is {found}; gvtools weights fetch"] if found else []
+    return lines
+
+
+def self_check(folder: Path, config: GeoVerseConfig, photo: Path | None) -> tuple[str, bool]:
+    """A line about a photograph, by default scikit-image's, en- and decoded, and if it is right."""
+    path = photo or Path(skimage.__file__).parent / "data" / "astronaut.png"
+    with reading(path, "expected a photograph"):
+        picture = open_picture(path).convert("RGB")
+    height, width = model_size(
+        picture.height, picture.width, longest=config.image_size, patch=config.patch
+    )
+    pixels = np.asarray(picture.resize((width, height), Image.Resampling.LANCZOS))
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    model = from_pretrained(folder, config=config, video=False, device=device)
+    tensor = torch.from_numpy(pixels.copy()).permute(2, 0, 1)[None].to(device) / 255
+    made = model.reconstruct(tensor)[0].permute(1, 2, 0).clamp(0, 1).cpu().numpy()
+    value = psnr(made, pixels / 255.0) or 0.0
+    line = f"self-check: {path.name} encoded and decoded, PSNR {value:.1f} dB"
+    if not (config.trained and of_published_size(config)):
+        return line, True
+    line += f"; GLD states {STATED} dB of its files"
+    return line, value >= LEAST
 
 
 def size_text(count: int) -> str:

@@ -85,7 +85,7 @@ class FetchWeights(Arguments):
 
 
 class CheckWeights(Arguments):
-    """Say precisely what does not fit."""
+    """Say precisely what does not fit; encode and decode a photograph."""
 
     examples = ("weights/base", "DIR --config tiny")
     positional = ("folder",)
@@ -94,13 +94,15 @@ class CheckWeights(Arguments):
     """A weights folder. [DIR]"""
     config: str | None = None
     """Instead of the folder's own config.json. [NAME|FILE]"""
+    photo: Path | None = None
+    """To encode and decode; by default one that ships with scikit-image. [FILE]"""
     json_: Path | None = None
     """Write the report there. [FILE]"""
 
     def run(self, console: Console) -> None:
         from gvtools.completers.geoverse.weights import check_folder, check_is_folder, config_of
         from gvtools.files import write_json
-        from pipelines.weights import print_parts
+        from pipelines.weights import other_revisions, print_parts, self_check
 
         folder = self.folder
         report: dict[str, Any] = {"folder": str(folder), "config": None, "ok": False, "parts": []}
@@ -121,12 +123,20 @@ class CheckWeights(Arguments):
                 f"{folder}: {len(bad)} of {len(parts)} parts cannot be loaded, first {first}: "
                 f"{bad[0].summary}"
             )
+        notes = other_revisions(config, parts)
+        report["self_check"], right = ("", True) if bad else self_check(folder, config, self.photo)
+        if not right:
+            notes.append(f"{report['self_check']}: the files are damaged, or not of one kind")
         if self.json_ is not None:
             found = [part.to_dict() for part in parts]
-            write_json(self.json_, {**report, "ok": not bad, "parts": found, "problem": problem})
+            report |= {"ok": not bad, "parts": found, "problem": problem, "notes": notes}
+            write_json(self.json_, report)
             console.line(f"report written to {self.json_}")
         else:
-            print_parts(folder, config, parts, console=console)
+            checked = str(report["self_check"])
+            print_parts(folder, config, parts, checked=checked, console=console)
+        for note in notes:
+            console.warn(note)
         if problem:
             raise CheckpointError(problem)
 

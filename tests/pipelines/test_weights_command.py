@@ -10,12 +10,14 @@ import published_folder as published
 import pytest
 import torch
 from command_line import refused
+from PIL import Image
 from safetensors.torch import load_file, save_file
 
 from gvtools.completers.geoverse import from_pretrained
 from gvtools.completers.geoverse.weights import WHOLE_FILE, save_pretrained
 from gvtools.networks.config_json import to_json
 from pipelines.cli import build_parser, main
+from pipelines.published import MODELS, Published, sha256_of
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -152,6 +154,38 @@ def test_the_configuration_may_be_another_than_the_folders(capsys, own, micro_fi
     line = refused(capsys, "weights", "check", own, "--config", "tiny", "--quiet")
     assert "missing: " in line
     assert "of another shape: " in line
+
+
+def test_a_photograph_is_encoded_and_decoded(capsys, own, tmp_path, monkeypatch):
+    assert weights("check", own) == 0
+    text = capsys.readouterr().out
+    (line,) = [line for line in text.splitlines() if line.startswith("self-check")]
+    assert "astronaut.png encoded and decoded, PSNR " in line and "GLD" not in line
+    Image.new("RGB", (60, 40), (128, 128, 128)).save(tmp_path / "grey.png")
+    assert weights("check", own, "--photo", tmp_path / "grey.png") == 0
+    assert "grey.png encoded" in capsys.readouterr().out
+    assert "no such file" in refused(capsys, "weights", "check", own, "--photo", tmp_path / "none")
+    monkeypatch.setattr("pipelines.weights.of_published_size", lambda config: True)
+    assert weights("check", own) == 0
+    assert "GLD states 35 dB of its files: the files are damaged" in capsys.readouterr().err
+    monkeypatch.setattr(micro.GeoVerse, "reconstruct", lambda model, picture: picture)
+    assert weights("check", own) == 0
+    assert capsys.readouterr().err == ""
+
+
+def test_an_older_revision_is_named(capsys, tmp_path, monkeypatch):
+    bare = replace(PLAIN, level1=replace(PLAIN.level1, depth_condition=False))
+    folder = published.write_published(micro.model(bare), tmp_path / "published")
+    path = folder / published.LEVEL1
+    monkeypatch.setattr("pipelines.weights.of_published_size", lambda config: True)
+    monkeypatch.setattr(micro.GeoVerse, "reconstruct", lambda model, picture: picture)
+    for older in ({sha256_of(path): "of another camera convention"}, {}):
+        file = Published(published.LEVEL1.as_posix(), "", "", path.stat().st_size, "0" * 64,
+                         older=older)  # fmt: skip
+        monkeypatch.setitem(MODELS, "gld", (file,))
+        assert weights("check", folder) == 0
+        said = "is an older revision (of another camera" if older else "is of sha256 "
+        assert f"{path}: {said}" in capsys.readouterr().err
 
 
 def test_a_folder_that_is_none(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

@@ -40,6 +40,7 @@ from gvtools.completers.geoverse.views import choose_views, context_depth, model
 from gvtools.completers.geoverse.weights import (
     check_headers,
     from_pretrained,
+    left_out,
     untrained_branches,
 )
 from gvtools.completers.push_pull import Filled
@@ -189,10 +190,12 @@ class GeoVerseCompleter(Completer):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Warnings of weights, or branches of them, that are untrained."""
+        """Warnings of weights, or branches of them, that are untrained or do not fit."""
         if not self.config.trained:
             return (f"the weights in {self.folder} are untrained: what they complete is noise",)
-        return untrained_branches(self.folder, self.config)
+        unfit = left_out(self.folder, self.config)
+        branches = untrained_branches(self.folder, self.config)
+        return branches if unfit is None else (*branches, unfit)
 
     @property
     def files(self) -> tuple[Path, ...]:

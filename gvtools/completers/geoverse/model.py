@@ -465,6 +465,22 @@ class GeoVerse(nn.Module):
         level0, level1 = self.level_statistics
         return encode_latents(self.geometry, level0, level1, batch=batch, config=self.config.hints)
 
+    @torch.no_grad()
+    def reconstruct(self, picture: Tensor) -> Tensor:
+        """(1, 3, H, W) in [0, 1], encoded and decoded without a denoiser; H and W whole patches."""
+        images = picture[:, None].expand(-1, 2, -1, -1, -1)
+        size = max(picture.shape[-2:])
+        K = picture.new_tensor([[size, 0, size / 2], [0, size, size / 2], [0, 0, 1]])
+        nothing = torch.zeros_like(images[:, :, :1])
+        pose = torch.eye(4, device=picture.device).expand(1, 2, 4, 4)
+        batch = ViewBatch(images, nothing, nothing == 0, pose, K.expand(1, 2, 3, 3), 1)
+        with_video, self.without_video = self.without_video, True
+        try:
+            prepared = self.prepare(batch)
+        finally:
+            self.without_video = with_video
+        return self.decode(prepared, *self.clean_latents(batch), targets_alone=True).rgb[:, 0]
+
     def velocity_wanted(self, velocity: Tensor, t: Tensor) -> Tensor:
         """The target of ``velocity1`` at ``t`` where ``velocity`` (B, V, C, h, w) is right.
 

@@ -75,8 +75,9 @@ class Part:
     # Names that are one tensor in the publisher's network; a file may hold any of them.
     tied: tuple[tuple[str, ...], ...] = ()
     optional: bool = False  # the model can do without it
-    # Loaded as its publisher's code does: unknown names are ignored, and missing tensors keep the
-    # values of the part that was loaded before; a message lists them.
+    # Loaded as its publisher's code does: unknown names are ignored, of a name that is there twice
+    # the later counts, and missing tensors keep the values of the part that was loaded before; a
+    # message lists them. What does not fit is left out as a whole.
     lenient: bool = False
     # The file's size as published, where it holds other networks, too.
     stated_bytes: int | None = None
@@ -151,8 +152,9 @@ PARTS = (
     ),
 )
 
-# Read where it is there, as GLD does: what has a name of the geometry head counts, the rest is left
-# aside, and tensors that it lacks stay Depth Anything 3's. Another shape is refused, as GLD does.
+# Read where it is there, as GLD does: what has a name of the geometry head counts, of a name under
+# both prefixes the later; the rest is left aside, tensors that it lacks stay Depth Anything 3's,
+# and a file that does not fit is left out.
 GEOMETRY_HEAD = Part(
     "geometry_head",
     "geometry.head.",
@@ -217,7 +219,7 @@ def read_part(
         name = part.own_name(key)
         if name is None:
             ignored.append(key)
-        elif name in found:
+        elif name in found and not part.lenient:
             raise CheckpointError(f"{path}: holds {name} twice, also as {key}; expected it once")
         else:
             found[name] = tensor
@@ -254,6 +256,7 @@ class PartReport:
     parameters: int = 0  # numbers in the tensors that fit
     types: tuple[str, ...] = ()  # what they are stored as
     ignored: tuple[str, ...] = ()  # names in the file that are not looked at
+    left_out: bool = False  # it does not fit, and the model does without it
 
     def to_dict(self) -> dict[str, Any]:
         """For a JSON file."""
@@ -315,7 +318,9 @@ def examine(
         tensors, ignored = read_part(path, part, numbers=numbers)
     except CheckpointError as error:
         summary = str(error).removeprefix(f"{path}: ")
-        return PartReport(part.name, path, False, summary, bytes=size), {}
+        left_out = part.lenient
+        report = PartReport(part.name, path, left_out, summary, bytes=size, left_out=left_out)
+        return report, {}
     expected = expected_of(model, part)
     found = compare_tensors(tensors, expected)
     left = {}
@@ -339,8 +344,9 @@ def examine(
     report = PartReport(
         part.name,
         path,
-        ok,
+        ok or part.lenient,
         summary,
+        left_out=part.lenient and not ok,
         fit=found,
         bytes=size,
         parameters=sum(t.numel() for n, t in tensors.items() if n in expected),
@@ -392,6 +398,16 @@ def check_headers(folder: Path | str) -> GeoVerseConfig:
     if needs_video(folder, config):
         check_video_folder(folder / VIDEO_FOLDER)
     return config
+
+
+def left_out(folder: Path, config: GeoVerseConfig) -> str | None:
+    """What a user should know of a file that is there and is not loaded, as far as headers show."""
+    if WHOLE.find(folder) or GEOMETRY_HEAD.find(folder) is None:
+        return None
+    model = empty_model(config, where=folder)
+    report = examine(folder, GEOMETRY_HEAD, model, numbers=False)[0]
+    why = f"{report.path} is left out, Depth Anything 3's own head is used: {report.summary}"
+    return why if report.left_out else None
 
 
 def needs_video(folder: Path, config: GeoVerseConfig) -> bool:

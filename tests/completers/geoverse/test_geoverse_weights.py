@@ -28,6 +28,7 @@ from gvtools.completers.geoverse.weights import (
     check_folder,
     expected_of,
     from_pretrained,
+    left_out,
     save_pretrained,
 )
 from gvtools.errors import CheckpointError, GvError, ProjectError
@@ -111,8 +112,16 @@ def test_the_publishers_other_geometry_head_takes_the_place_of_the_first(folder,
     state = load(folder).state_dict()
     name = "geometry.head.norm.weight"
     assert torch.equal(state[name], before[name]) and not torch.equal(state[name], kept)
-    torch.save({"model": {**content, "decoder.norm.weight": kept[1:]}}, folder / published.DPT_HEAD)
-    refused(folder, r"dpt_decoder\.pt: .*of another shape: norm\.weight")
+    assert left_out(folder, BARE) is None
+    twice = {"decoder.norm.weight": kept, "pred.norm.weight": kept + 1}
+    torch.save({"model": {**content, **twice}}, folder / published.DPT_HEAD)
+    assert torch.equal(load(folder).state_dict()[name], kept + 1)
+    for damaged in ({"model": {**content, "decoder.norm.weight": kept[1:]}}, {"model": print}):
+        torch.save(damaged, folder / published.DPT_HEAD)
+        said = report(folder, "geometry_head")
+        assert said.ok and said.left_out
+        assert "dpt_decoder.pt is left out, Depth Anything 3's own" in str(left_out(folder, BARE))
+        assert equal(load(folder), load(source))
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
