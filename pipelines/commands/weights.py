@@ -219,7 +219,7 @@ class TruncateWan(Arguments):
     folder: Path
     """The folder to make. [DIR]"""
     vae: Path | None = None
-    """Of diffusers; by default beside the transformer. [DIR]"""
+    """Of diffusers or Wan's own; by default beside the transformer. [DIR|FILE]"""
     blocks: int = 16
     """Backbone blocks to keep. [N]"""
 
@@ -239,13 +239,13 @@ class WriteEmptyPrompt(Arguments):
     """Add the empty prompt's embedding to the video prior's folder."""
 
     examples = (
+        "Wan2.2-VACE-Fun-A14B weights/base/video",
         "Wan2.2-VACE-Fun-14B-diffusers/text_encoder weights/base/video",
-        "text_encoder weights/base/video",
     )
     positional = ("source", "folder")
 
     source: Path
-    """Wan's text encoder (transformers). [SOURCE]"""
+    """Wan's text encoder: its file, or a folder with it. [SOURCE]"""
     folder: Path
     """The video prior's folder. [DIR]"""
 

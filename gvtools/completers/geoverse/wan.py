@@ -230,8 +230,8 @@ def read_empty_prompt(folder: Path) -> Tensor:
     path = Path(folder) / EMPTY_PROMPT
     if not path.is_file():
         raise CheckpointError(
-            f"{path} is absent; make it once, where Wan's text encoder is (11 GB, needs pip "
-            f"install transformers): gvtools weights empty-prompt WAN/text_encoder {folder}"
+            f"{path} is absent; make it once, where Wan's text encoder is (11 GB): gvtools weights "
+            f"empty-prompt WAN {folder}"
         )
     files = TensorFiles.find(path)
     embedding = files.read("embedding") if "embedding" in files.places else torch.zeros(())

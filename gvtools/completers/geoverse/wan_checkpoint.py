@@ -16,6 +16,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
+import torch.nn.functional as F
+from torch import Tensor
 
 from gvtools.completers.geoverse.wan import (
     COMPONENTS,
@@ -28,10 +30,12 @@ from gvtools.completers.geoverse.wan import (
 )
 from gvtools.errors import CheckpointError, OptionError, ProjectError
 from gvtools.files import check_space, replaced_when_written
-from gvtools.networks.tensors import INDEX, TensorFiles, check_fit
+from gvtools.networks.tensors import INDEX, TensorFiles, check_fit, plain_tensors, read_pickled
 from gvtools.untrusted import read_json
 
 _WEIGHTS = "diffusion_pytorch_model"
+# Of Wan's own release.
+VAE_FILE, TEXT_FILE = "Wan2.1_VAE.pth", "models_t5_umt5-xxl-enc-bf16.pth"
 # Bytes of tensors held in memory at a time, and of one file.
 _PART = 2 * 1024**3
 _MARGIN = 64 * 1024**2
@@ -40,30 +44,67 @@ _HEAD_WIDTH = 128
 
 
 def write_empty_prompt(text_encoder: Path | str, out: Path | str) -> None:
-    """Run Wan's text encoder on the empty prompt, which is the end-of-text token alone, once.
+    """Wan's text encoder on the empty prompt, which is the end-of-text token alone, once.
 
-    ``text_encoder`` is the folder of the UMT5 encoder in transformers' form (11.4 GB in bfloat16 as
-    published), ``out`` the truncated folder that the prompt belongs into.
+    ``text_encoder`` is Wan's own file (11.4 GB), its folder, or the encoder in the form of
+    transformers; ``out`` the truncated folder that the prompt belongs into.
     """
     from safetensors.torch import save_file
 
-    folder = Path(text_encoder)
-    try:
-        from transformers import UMT5EncoderModel
-
-        if not folder.is_dir():
-            raise FileNotFoundError(f"{folder} is no folder")
-        encoder = UMT5EncoderModel.from_pretrained(folder, local_files_only=True).eval()
-    except (ImportError, OSError, ValueError) as error:
-        raise CheckpointError(
-            f"the empty prompt: {str(error).strip().splitlines()[0]}; expected transformers (pip "
-            "install transformers) and the folder of Wan's text encoder"
-        ) from error
-    tokens = torch.tensor([[encoder.config.eos_token_id]])
-    with torch.no_grad():
-        embedding = encoder(tokens, attention_mask=torch.ones_like(tokens)).last_hidden_state[0]
+    embedding = _end_token(Path(text_encoder))
     with replaced_when_written(Path(out) / EMPTY_PROMPT) as path:
-        save_file({"embedding": embedding.float().contiguous()}, path)
+        save_file({"embedding": embedding[None].contiguous()}, path)
+
+
+# Tensors of UMT5 by Wan's own names and by those of transformers.
+_TEXT = {
+    "embedding": ("token_embedding", "shared"),
+    "norm1": ("blocks.{}.norm1", "encoder.block.{}.layer.0.layer_norm"),
+    "v": ("blocks.{}.attn.v", "encoder.block.{}.layer.0.SelfAttention.v"),
+    "o": ("blocks.{}.attn.o", "encoder.block.{}.layer.0.SelfAttention.o"),
+    "norm2": ("blocks.{}.norm2", "encoder.block.{}.layer.1.layer_norm"),
+    "gate": ("blocks.{}.ffn.gate.0", "encoder.block.{}.layer.1.DenseReluDense.wi_0"),
+    "in": ("blocks.{}.ffn.fc1", "encoder.block.{}.layer.1.DenseReluDense.wi_1"),
+    "out": ("blocks.{}.ffn.fc2", "encoder.block.{}.layer.1.DenseReluDense.wo"),
+    "norm": ("norm", "encoder.final_layer_norm"),
+}
+_END = 1  # the number of the end-of-text token
+
+
+def _end_token(place: Path) -> Tensor:
+    """The encoding of the one token: attention to oneself is one's own value, at any position."""
+    file = place / TEXT_FILE if place.is_dir() else place
+    if file.is_file():
+        stored = plain_tensors(read_pickled(file, legacy=True), file)
+        names, take, form = set(stored), stored.__getitem__, 0
+    elif place.is_dir() and any(place.glob("*.safetensors")):
+        files = TensorFiles.find(place)
+        names, take, form = set(files.places), files.read, 1
+    else:
+        raise CheckpointError(
+            f"{place}: no text encoder; expected {TEXT_FILE} of Wan, or the encoder's folder in "
+            "transformers' form"
+        )
+
+    def weight(part: str, block: int = 0) -> Tensor:
+        name = f"{_TEXT[part][form].format(block)}.weight"
+        if name not in names:
+            raise CheckpointError(f"{place}: no {name}; expected Wan's whole text encoder, UMT5")
+        return take(name)
+
+    def normed(x: Tensor, scale: Tensor) -> Tensor:
+        return F.rms_norm(x, x.shape, scale.float(), 1e-6)
+
+    start = _TEXT["norm1"][form].partition("{}")[0]
+    x = weight("embedding")[_END].float()
+    for block in range(len({name.removeprefix(start).partition(".")[0] for name in names
+                            if name.startswith(start)})):  # fmt: skip
+        y = normed(x, weight("norm1", block))
+        x = x + weight("o", block).float() @ (weight("v", block).float() @ y)
+        y = normed(x, weight("norm2", block))
+        gate = F.gelu(weight("gate", block).float() @ y, approximate="tanh")
+        x = x + weight("out", block).float() @ (gate * (weight("in", block).float() @ y))
+    return normed(x, weight("norm"))
 
 
 def truncate(
@@ -76,7 +117,7 @@ def truncate(
     blocks: int = 16,  # backbone blocks to keep, and with them the VACE blocks that act on them
     # Of the result, except for what diffusers keeps in float32.
     dtype: torch.dtype = torch.bfloat16,
-    # Folder of the VAE in diffusers' form; None looks beside the transformer.
+    # Folder of the VAE in diffusers' form, or Wan's own file; None looks beside the transformer.
     vae: Path | str | None = None,
     # Called with bytes done and in all.
     progress: Callable[[int, int], None] = lambda done, total: None,
@@ -87,6 +128,7 @@ def truncate(
     ``write_empty_prompt``. At most about 2 GB of tensors are in memory.
     """
     from safetensors import SafetensorError
+    from safetensors.torch import save_file
 
     place, out = _transformer(Path(source)), Path(out)
     if out.exists():
@@ -95,8 +137,10 @@ def truncate(
     expected = expected_tensors(config)
     check_fit(files.empty(expected), expected, where=place)
     sizes = {n: prod(shape) * dtype_of(n, dtype).itemsize for n, shape in expected.items()}
-    copied = _vae_files(_vae(place, vae))
-    needed = sum(sizes.values()) + sum(path.stat().st_size for path in copied)
+    found = _vae(place, vae)
+    own = _own_vae(found) if found.is_file() else None
+    copied = _vae_files(found) if own is None else []
+    needed = sum(sizes.values()) + sum(path.stat().st_size for path in copied or [found])
     check_space(out.parent, needed + _MARGIN)
 
     temporary = out.with_name(f".{out.name}.part")
@@ -107,6 +151,10 @@ def truncate(
         _write_json(temporary / "transformer" / "config.json", config)
         for done in _write(temporary / "transformer", files, sizes, dtype=dtype):
             progress(done, needed)
+        if own is not None:
+            _write_json(temporary / "vae" / "config.json", own[0])
+            about = {"format": "pt"}
+            save_file(own[1], temporary / "vae" / f"{_WEIGHTS}.safetensors", metadata=about)
         for path in copied:
             shutil.copyfile(path, temporary / "vae" / path.name)
         temporary.replace(out)
@@ -124,6 +172,21 @@ def _vae_files(folder: Path) -> list[Path]:
     files = TensorFiles.find(folder)
     check_fit(files.empty(), expected_tensors(read_config(folder), component="vae"), where=folder)
     return sorted({folder / "config.json", *files.paths, *folder.glob(f"*{INDEX}")})
+
+
+def _own_vae(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Diffusers' config and tensors of Wan's own VAE file, after a check of names and shapes."""
+    network_class("vae")  # diffusers, or an error that says what is absent
+    from diffusers.loaders.single_file_utils import convert_wan_vae_to_diffusers
+
+    stored = plain_tensors(read_pickled(path, legacy=True), path)
+    tensors = {n: t.contiguous() for n, t in convert_wan_vae_to_diffusers(stored).items()}
+    config: dict[str, Any] = {"_class_name": COMPONENTS["vae"]}
+    for key, name in (("base_dim", "encoder.conv_in.weight"), ("z_dim", "post_quant_conv.weight")):
+        if name in tensors:
+            config[key] = len(tensors[name])
+    check_fit(tensors, expected_tensors(config, component="vae"), where=path)
+    return config, tensors
 
 
 def _write(
@@ -274,13 +337,15 @@ def _has_two_experts(place: Path) -> bool:
 
 
 def _vae(transformer: Path, named: Path | str | None) -> Path:
-    places = [transformer / "vae", transformer.parent / "vae", transformer.parent.parent / "vae"]
-    places = [Path(named)] if named is not None else places
+    beside = [transformer, transformer.parent, transformer.parent.parent]
+    places = [Path(named)] if named is not None else [folder / "vae" for folder in beside]
     for place in places:
-        if (place / "config.json").is_file():
+        if (place / "config.json").is_file() or place.is_file():
             return place
+    for folder in beside if named is None else places:
+        if (folder / VAE_FILE).is_file():
+            return folder / VAE_FILE
     raise CheckpointError(
-        f"{places[-1]}: no VAE (config.json and safetensors in diffusers' form); name the folder "
-        "vae of any Wan2.1 or Wan2.2-A14B model in that form; Wan2.1_VAE.pth is the same network "
-        "in a form that is not read"
+        f"{places[-1]}: no VAE; expected {VAE_FILE} of Wan, or the folder vae of any Wan2.1 or "
+        "Wan2.2-A14B model in diffusers' form"
     )

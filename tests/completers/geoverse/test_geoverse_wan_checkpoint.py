@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import sys
 from collections.abc import Mapping
@@ -30,6 +31,9 @@ from gvtools.completers.geoverse.wan import (
     read_empty_prompt,
 )
 from gvtools.completers.geoverse.wan_checkpoint import (
+    _TEXT,
+    TEXT_FILE,
+    VAE_FILE,
     by_diffusers_name,
     truncate,
     write_empty_prompt,
@@ -346,7 +350,7 @@ def test_loading_is_strict(truncated: Path, tmp_path: Path) -> None:
 def test_without_the_empty_prompt_it_says_how_to_make_it(truncated: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(truncated, tmp_path / "prior"))
     (folder / EMPTY_PROMPT).unlink()
-    with pytest.raises(CheckpointError, match="gvtools weights empty-prompt WAN/text_encoder"):
+    with pytest.raises(CheckpointError, match="gvtools weights empty-prompt WAN"):
         VideoPrior.from_pretrained(folder, config=tiny.CONFIG)
     with pytest.raises(CheckpointError, match=EMPTY_PROMPT):
         check_folder(folder)
@@ -376,8 +380,122 @@ def test_the_empty_prompt_is_the_encoding_of_the_end_token(tmp_path: Path) -> No
     with torch.no_grad():
         padded = encoder(tokens, attention_mask=mask).last_hidden_state[0, :1]
     torch.testing.assert_close(read_empty_prompt(tmp_path), padded, rtol=0, atol=1e-5)
-    with pytest.raises(CheckpointError, match="is no folder"):
+    with pytest.raises(CheckpointError, match="no text encoder; expected models_t5"):
         write_empty_prompt(tmp_path / "absent", tmp_path)
+
+
+def encoder_tensors(form: int, blocks: int = 2) -> dict[str, Tensor]:
+    torch.manual_seed(0)
+    width, inner, hidden = 12, 8, 10
+    sizes = {
+        "embedding": (5, width), "v": (inner, width), "o": (width, inner), "gate": (hidden, width),
+        "in": (hidden, width), "out": (width, hidden),
+    }  # fmt: skip
+    tensors = {}
+    for part, names in _TEXT.items():
+        for block in range(blocks if "{}" in names[0] else 1):
+            tensors[f"{names[form].format(block)}.weight"] = torch.randn(sizes.get(part, (width,)))
+    return tensors
+
+
+def encoded(stored: Mapping[str, Tensor], tokens: Tensor, blocks: int = 2) -> Tensor:
+    """UMT5 over several tokens, by Wan's names, of which the first alone is seen; two heads."""
+
+    def linear(x: Tensor, name: str) -> Tensor:
+        return x @ stored[f"{name}.weight"].T
+
+    def norm(x: Tensor, name: str) -> Tensor:
+        scale = x.pow(2).mean(-1, keepdim=True).add(1e-6).rsqrt()
+        return x * scale * stored[f"{name}.weight"]
+
+    x = stored["token_embedding.weight"][tokens]
+    seen = torch.full((len(tokens), len(tokens)), -torch.inf)
+    seen[:, 0] = 0
+    for block in range(blocks):
+        start = f"blocks.{block}."
+        y = norm(x, f"{start}norm1")
+        q, k = torch.randn(2, 2, len(tokens), 4)
+        share = (q @ k.mT + torch.randn(2, len(tokens), len(tokens)) + seen).softmax(-1)
+        values = linear(y, f"{start}attn.v").unflatten(-1, (2, 4)).transpose(0, 1)
+        x = x + linear((share @ values).transpose(0, 1).flatten(1), f"{start}attn.o")
+        y = norm(x, f"{start}ffn".replace("ffn", "norm2"))
+        z = linear(y, f"{start}ffn.gate.0")
+        z = z / 2 * (1 + torch.tanh((2 / torch.pi) ** 0.5 * (z + 0.044715 * z**3)))
+        x = x + linear(z * linear(y, f"{start}ffn.fc1"), f"{start}ffn.fc2")
+    return norm(x, "norm")
+
+
+@pytest.mark.parametrize("kind", ["file", "folder", "transformers"])
+def test_the_empty_prompt_comes_of_wans_own_file(tmp_path: Path, kind: str) -> None:
+    stored = encoder_tensors(int(kind == "transformers"))
+    path = tmp_path / TEXT_FILE
+    if kind == "transformers":
+        save_file(stored, tmp_path / "model.safetensors")
+    else:
+        torch.save(stored, path)
+    write_empty_prompt(path if kind == "file" else tmp_path, tmp_path)
+    wanted = encoded(encoder_tensors(0), torch.tensor([1, 0, 0]))[:1]
+    torch.testing.assert_close(read_empty_prompt(tmp_path), wanted, rtol=1e-5, atol=1e-5)
+    if kind == "file":
+        stored.pop("blocks.1.ffn.fc1.weight")
+        torch.save(stored, path)
+        with pytest.raises(CheckpointError, match=r"no blocks\.1\.ffn\.fc1\.weight"):
+            write_empty_prompt(path, tmp_path)
+
+
+def own_vae_names(names: list[str]) -> dict[str, str]:
+    """Wan's own names of its VAE's tensors by diffusers', for two blocks a stage."""
+    changes = {
+        "mid_block.resnets.0": "middle.0", "mid_block.resnets.1": "middle.2",
+        "mid_block.attentions.0": "middle.1", "norm_out": "head.0", "conv_out": "head.2",
+        "quant_conv": "conv1", "down_blocks": "downsamples", "conv_in": "conv1",
+    }  # fmt: skip
+    parts = {
+        "norm1": "residual.0", "conv1": "residual.2", "norm2": "residual.3", "conv2": "residual.6",
+        "conv_shortcut": "shortcut",
+    }  # fmt: skip
+    found = {}
+    for name in names:
+        own = name
+        if name.startswith("post_quant_conv"):
+            own = name.replace("post_quant_conv", "conv2")
+        elif "resnets" in name or "down_blocks" in name:
+            for new, old in parts.items():
+                own = own.replace(f".{new}.", f".{old}.")
+        own = re.sub(
+            r"up_blocks\.(\d)\.resnets\.(\d)",
+            lambda m: f"upsamples.{4 * int(m[1]) + int(m[2])}", own,
+        )  # fmt: skip
+        own = re.sub(
+            r"up_blocks\.(\d)\.upsamplers\.0", lambda m: f"upsamples.{4 * int(m[1]) + 3}", own
+        )
+        for new, old in changes.items():
+            own = own.replace(new, old)
+        found[name] = own
+    return found
+
+
+def test_wans_own_vae_file_is_the_vae_of_diffusers(network, tmp_path):
+    torch.manual_seed(5)
+    vae = network_class("vae")(base_dim=4, num_res_blocks=2).eval()
+    state = vae.state_dict()
+    names = own_vae_names(list(state))
+    assert len(set(names.values())) == len(state)
+    folder = save_original(network, tmp_path / "wan" / "low_noise_model")
+    stored = {names[name]: tensor for name, tensor in state.items()}
+    torch.save(stored, folder.parent / VAE_FILE)
+    for number, given in enumerate((None, folder.parent / VAE_FILE)):
+        truncate(folder.parent, tmp_path / f"out{number}", vae=given, **KEPT)
+        loaded = load_network(tmp_path / f"out{number}", "vae").state_dict()
+        assert loaded.keys() == state.keys()
+        assert all(torch.equal(loaded[name], tensor) for name, tensor in state.items())
+    stored.pop("conv2.bias")
+    torch.save(stored, folder.parent / VAE_FILE)
+    with pytest.raises(
+        CheckpointError, match=r"Wan2\.1_VAE\.pth: .*missing: post_quant_conv\.bias"
+    ):
+        truncate(folder.parent, tmp_path / "none", **KEPT)
+    assert not (tmp_path / "none").exists()
 
 
 @pytest.mark.gpu
