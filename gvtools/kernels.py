@@ -19,10 +19,35 @@ from typing import Any, NamedTuple
 import numba
 from numba import get_num_threads, njit, threading_layer
 
+
 # error_model="numpy": division by zero gives infinity instead of raising; the check that raising
 # needs keeps loops from being vectorised (measured: projection ten times slower with it).
 # nogil=True: other Python threads (file I/O, kernels on other memories) run during a kernel.
-compiled = partial(njit, cache=True, error_model="numpy", nogil=True)
+def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Numba's ``njit`` with what all kernels share."""
+    shared: dict[str, Any] = {"cache": True, "error_model": "numpy", "nogil": True}
+    compile_function = njit(**(shared | options))
+
+    def kernel(function: Callable[..., Any]) -> Any:
+        dispatcher = compile_function(function)
+        index = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
+        if index is not None:
+            index._load_index = partial(_fresh, index._load_index)
+        return dispatcher
+
+    return kernel
+
+
+def _fresh(load: Callable[[], dict[Any, Any]]) -> dict[Any, Any]:
+    """A kernel's cache; empty where an earlier version took types that are gone or elsewhere.
+
+    numba unpickles such types before it compares the times of the sources.
+    """
+    try:
+        return load()
+    except (AttributeError, ImportError):
+        return {}
+
 
 # What is compiled stays for this process and its children alone.
 cached_here_alone = False

@@ -71,3 +71,27 @@ def test_where_nothing_can_be_written_the_cache_is_a_folder_that_goes(tmp_path):
     alone = {"NUMBA_CACHE_LOCATOR_CLASSES": "UserProvidedCacheLocator", "TMPDIR": str(tmp_path)}
     subprocess.run([sys.executable, "-c", code], env={**os.environ, **alone}, check=True)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_cache_of_types_that_moved_is_compiled_again(tmp_path, monkeypatch):
+    source = """
+from typing import NamedTuple
+from gvtools.kernels import compiled
+
+class {name}(NamedTuple):
+    x: float
+
+Pair = {name}
+
+@compiled()
+def double(pair):
+    return 2 * pair.x
+"""
+    call = "import moved; print(moved.double(moved.Pair(1.5)))"
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), *sys.path]))
+    for name in ("Before", "Beyond"):
+        (tmp_path / "moved.py").write_text(source.format(name=name))
+        run = subprocess.run(
+            [sys.executable, "-c", call], capture_output=True, text=True, check=False
+        )
+        assert run.stdout == "3.0\n", run.stderr
