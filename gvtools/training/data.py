@@ -240,7 +240,7 @@ def recorded_sources(
 ) -> tuple[SampleSource, ...]:
     """The sources of recorded scenes."""
     whole = [SceneSource(project=entry) if isinstance(entry, str) else entry for entry in entries]
-    opened = [_open(entry) for entry in whole]
+    opened = [open_source(entry) for entry in whole]
     total = sum(weight for _, weight, _ in opened)
     if not total:
         raise OptionError("data.scenes: every weight is 0; give one of them a weight above 0")
@@ -258,7 +258,7 @@ def recorded_sources(
     return tuple(sources)
 
 
-def _open(entry: SceneSource) -> tuple[SceneCollection, float, float]:
+def open_source(entry: SceneSource) -> tuple[SceneCollection, float, float]:
     """A source's scenes, their weight, and the share of samples with the data set's geometry."""
     root = None if entry.root is None else Path(entry.root)
     collection = open_collection(entry.project, root)

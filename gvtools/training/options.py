@@ -317,7 +317,7 @@ def shipped_or_read(name: str) -> tuple[TrainingSettings, Path]:
     if name.endswith(".json"):
         path = Path(name)
         return with_file(TrainingSettings(), path), path.parent
-    known = sorted(path.stem for path in SHIPPED.glob("*.json") if "_model" not in path.stem)
+    known = sorted(path.stem for path in SHIPPED.glob("*.json") if "_" not in path.stem)
     if name not in known:
         raise OptionError(f"no training {name!r}; known: {', '.join(known)}, or a .json file")
     return with_file(TrainingSettings(), SHIPPED / f"{name}.json"), SHIPPED

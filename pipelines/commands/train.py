@@ -22,13 +22,14 @@ from pipelines.options import HelpSettings
 if TYPE_CHECKING:
     from gvtools.scenes.scene import Scene
     from gvtools.settings import Settings
+    from gvtools.training.options import TrainingSettings
     from pipelines.console import Console
     from pipelines.reconstruction.settings import RunSettings
 
 
 NAME = "tune"
 # Of the stages; tuning does not look at them.
-STAGE_OPTIONS = ("stage", "resume", "until", "set", "sheets")
+STAGE_OPTIONS = ("stage", "resume", "until", "set", "sheets", "data", "rooms")
 
 
 class TuneArguments(RootArguments):
@@ -138,7 +139,7 @@ class TrainCommand(TuneArguments):
     examples = (
         "gvtools train tiny --stage all --out training/tiny",
         "gvtools train my_training.json --stage denoiser --out training/mine --resume",
-        "gvtools train base --init weights/base --out training/base",
+        "gvtools train base --init weights/base --data data --out training/base",
         "gvtools train tune --scene scan/ --context every:2 --minutes 10 --out tuned/scan",
     )
     positional = ("config",)
@@ -160,6 +161,11 @@ class TrainCommand(TuneArguments):
     """Continue the stage where its last state was saved."""
     until: int | None = Field(None, ge=1)
     """Stop after this step. [STEP]"""
+    data: Path | None = None
+    """Train on those of the paper's fifteen data sets that lie there, each in a folder of its name
+    (docs/training_data.md). [ROOT]"""
+    rooms: bool = False
+    """Train base on drawn rooms alone."""
     set: tuple[str, ...] = ()
     """A setting, such as denoiser.optimizer.steps=500. [KEY=VALUE]"""
     device: Literal["auto", "cpu", "cuda"] = "auto"
@@ -192,7 +198,7 @@ class TrainCommand(TuneArguments):
             if name in self.model_fields_set:
                 raise OptionError(f"{self.key(name)} belongs to 'gvtools train tune'; leave it out")
         config, folder = shipped_or_read(self.config)
-        config = with_texts(config, self.set)
+        config = self._with_scenes(with_texts(config, self.set), console)
         stages: tuple[str, ...] = (self.stage,)
         if self.stage == "all":
             stages = tuple(stage for stage in STAGES if getattr(config, stage) is not None)
@@ -227,6 +233,27 @@ class TrainCommand(TuneArguments):
                     break
             if self.json_ is not None and processes.first:
                 write_text(self.json_, json.dumps(figures, indent=2) + "\n")
+
+    def _with_scenes(self, config: TrainingSettings, console: Console) -> TrainingSettings:
+        """The training on the scenes that were asked for; base does not begin without any."""
+        if self.data is not None:
+            from gvtools.training.mixture import with_data
+
+            if self.rooms or config.data.scenes:
+                given = "--rooms" if self.rooms else "data.scenes"
+                raise OptionError(f"--data and {given}: expected one of them; leave the other out")
+            config, found = with_data(config, self.data)
+            console.table(
+                ["data set", "share", "what is there"],
+                [[one.name, f"{one.share:.1%}", one.note] for one in found],
+            )
+        elif self.config == "base" and not config.data.scenes and not self.rooms:
+            raise OptionError(
+                "train base: no scenes to learn from; give --data ROOT with data sets of the "
+                "paper's mixture, data.scenes in a file of your own, or --rooms for drawn rooms "
+                "alone, which the paper does not train on"
+            )
+        return config
 
 
 def _settings(args: argparse.Namespace) -> list[Settings]:

@@ -148,7 +148,9 @@ def test_heads_lower_the_error_of_what_inference_composes(trained, tmp_path):
 
 
 def test_a_training_without_that_stage_says_so(tmp_path, capsys):
-    assert main(["train", "base", "--stage", "heads", "--out", str(tmp_path / "base")]) == 2
+    assert (
+        main(["train", "base", "--rooms", "--stage", "heads", "--out", str(tmp_path / "base")]) == 2
+    )
     assert "this training has no stage heads" in capsys.readouterr().err
 
 
