@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageOps
 
 from gvtools.errors import ProjectError
-from gvtools.scenes.images import UNREADABLE, read_mask, resize_nearest, same_aspect
+from gvtools.scenes.images import UNREADABLE, orientation_of, read_mask, resize_nearest, same_aspect
 from gvtools.scenes.matching import find_renamed, is_hidden, named
 from gvtools.scenes.project import PICTURES
 from gvtools.scenes.scene import Finding, natural_key
@@ -164,8 +164,8 @@ def _look_at(path: Path, name: str) -> CapturedPhotograph:
         few = not deep and image.convert("RGB").getcolors(FEW_COLORS) is not None
         exif = image.getexif()
         more, gps = exif.get_ifd(EXIF_FOLDER), exif.get_ifd(GPS_FOLDER)
-        turned = int(exif.get(ORIENTATION, 1) or 1) > 1
-        upright = ImageOps.exif_transpose(image)
+        turned = orientation_of(exif) > 1
+        upright = _upright(image)
         grey = upright.convert("L")
     lens = (exif.get(MAKE, ""), exif.get(MODEL, ""), more.get(FOCAL, ""), more.get(FOCAL_35MM, ""))
     camera = "/".join(str(part).strip("\0 ") for part in (*lens, *upright.size))
@@ -176,6 +176,17 @@ def _look_at(path: Path, name: str) -> CapturedPhotograph:
     return CapturedPhotograph(
         path, name, upright.size, camera, turned, sharp, thumbnail, _location(gps), few, deep
     )
+
+
+def _upright(image: Image.Image) -> Image.Image:
+    """The picture turned as its orientation says, of whatever type the tag is."""
+    exif = image.getexif()
+    told = orientation_of(exif)
+    if told == 1:
+        exif.pop(ORIENTATION, None)
+        return image
+    exif[ORIENTATION] = told
+    return ImageOps.exif_transpose(image)
 
 
 def sharpness(grey: np.ndarray) -> float:
@@ -231,7 +242,7 @@ def copy_upright(photographs: Iterable[CapturedPhotograph], folder: Path) -> Non
             continue
         with Image.open(item.path) as image:
             form = image.format
-            upright = ImageOps.exif_transpose(image)
+            upright = _upright(image)
             options = {"quality": JPEG_QUALITY} if form in ("JPEG", "MPO", "WEBP") else {}
             # exif_transpose has taken the orientation out; focal length and camera stay.
             upright.save(

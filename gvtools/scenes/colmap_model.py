@@ -10,8 +10,9 @@ import os
 import shutil
 import struct
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -297,7 +298,8 @@ def load_model(folder: Path, *, faces: bool = False) -> ColmapModel:
         listed = ", ".join(f"{name} ({count} images)" for name, count in files.others)
         line = f"model {folder.name} is read; further models are not: {listed}"
         findings.append(Finding("warning", line))
-    reconstruction = _read(files)
+    reconstruction, mended = _read(files)
+    findings += mended
     findings += _contradicting_text(files, reconstruction)
     if reconstruction.num_reg_images() == 0:
         raise ProjectError(
@@ -351,7 +353,86 @@ def _contradicting_text(
     return []
 
 
-def _read(files: ModelFiles) -> pycolmap.Reconstruction:
+def _read(files: ModelFiles) -> tuple[pycolmap.Reconstruction, list[Finding]]:
+    """The model; where it is refused, without what names images that are not there."""
+    try:
+        return _parsed(files), []
+    except ProjectError:
+        with TemporaryDirectory() as work:
+            try:
+                changed = _mend(files.folder, Path(work), files.suffix)
+            except (struct.error, ValueError, IndexError, OSError):
+                changed = None
+            if changed is None:
+                raise
+            reconstruction = _parsed(replace(files, folder=Path(work)))
+    line = f"{changed} track elements name images that the model does not hold: left out"
+    return reconstruction, [Finding("warning", line)] if changed else []
+
+
+def _mend(folder: Path, out: Path, suffix: str) -> int | None:
+    """Write a model again without what names absent images; how many elements, None: no change."""
+    stems = [stem for stem in (*REQUIRED, *RIGGED) if (folder / f"{stem}{suffix}").is_file()]
+    count, changed = 0, False
+    known = set(text_names(folder)) if suffix == ".txt" else _image_ids(folder / "images.bin")
+    for stem in stems:
+        data = read_bytes(folder / f"{stem}{suffix}")
+        if suffix == ".txt":
+            text = read_text(folder / f"{stem}.txt")
+            first = {"points3D": 8, "frames": 10}.get(stem)
+            lines = []
+            for line in text.splitlines():
+                words = line.split()
+                if first is None or not words or words[0].startswith("#"):
+                    lines.append(line)
+                    continue
+                step, at = (2, 0) if stem == "points3D" else (3, 2)
+                parts = [words[i : i + step] for i in range(first, len(words), step)]
+                kept = [part for part in parts if int(part[at]) in known]
+                count += (len(parts) - len(kept)) * (stem == "points3D")
+                if stem == "frames" and parts and not kept:
+                    continue
+                head = words[:first] if stem == "points3D" else [*words[:9], str(len(kept))]
+                lines.append(" ".join([*head, *(word for part in kept for word in part)]))
+            new = ("\n".join(lines) + "\n").encode()
+            changed |= lines != text.splitlines() or not data.startswith(text[:1].encode())
+        elif stem in ("points3D", "frames"):
+            new, left_out = _without(data, stem, known)
+            count += left_out * (stem == "points3D")
+            changed |= left_out > 0
+        else:
+            new = data
+        (out / f"{stem}{suffix}").write_bytes(new)
+    return count if changed else None
+
+
+def _image_ids(path: Path) -> set[int]:
+    data, at, found = read_bytes(path), 8, set()
+    for _ in range(_count(path)):
+        found.add(int(struct.unpack_from("<I", data, at)[0]))
+        at = _image_end(data, at)
+    return found
+
+
+def _without(data: bytes, stem: str, known: set[int]) -> tuple[bytes, int]:
+    """Records of points3D or frames less elements of images that are not known, and how many."""
+    form, place, kind = ("<Q", 43, "<II") if stem == "points3D" else ("<I", 64, "<iIQ")
+    size, begin = struct.calcsize(kind), place + struct.calcsize(form)
+    records, at, left_out = list[bytes](), 8, 0
+    for _ in range(int(struct.unpack_from("<Q", data)[0])):
+        count = int(struct.unpack_from(form, data, at + place)[0])
+        places = range(at + begin, at + begin + count * size, size)
+        column = 0 if stem == "points3D" else 2
+        kept = [i for i in places if struct.unpack_from(kind, data, i)[column] in known]
+        left_out += count - len(kept)
+        if kept or not count or stem == "points3D":
+            head = data[at : at + place] + struct.pack(form, len(kept))
+            records.append(head + b"".join(data[i : i + size] for i in kept))
+        at += begin + count * size
+    return struct.pack("<Q", len(records)) + b"".join(records), left_out
+
+
+def _parsed(files: ModelFiles) -> pycolmap.Reconstruction:
     from gvtools.colmap import pycolmap
 
     reconstruction = pycolmap.Reconstruction()

@@ -82,7 +82,8 @@ def orientation_of(exif: Mapping[int, Any]) -> int:
     """From 1 to 8, whatever type a program gave the tag; 1 where it says nothing."""
     told = exif.get(_EXIF_ORIENTATION)
     told = told[0] if isinstance(told, tuple | bytes) and told else told
-    return int(told) if str(told) in list("12345678") else 1  # type: ignore[arg-type]
+    told = str(told).strip("\0 ").removesuffix(".0")  # rationals and floats, too
+    return int(told) if told in list("12345678") else 1
 
 
 def read_image(path: Path, *, white: float = 65535) -> Frame:

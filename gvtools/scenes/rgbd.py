@@ -164,6 +164,11 @@ class RgbdFolder(ABC):
         return Layout.of_folder(self.name, self.holds[0], matches=self.matches, read=self.read)
 
 
+def _text(path: Path) -> str:
+    with reading(path):
+        return read_text(path)
+
+
 def _with_pose(frame: PosedFrame, *, strict: bool) -> PosedFrame:
     """The frame with the pose in its own file."""
     path = Path(frame.where)
@@ -335,38 +340,85 @@ class _ScanNet(RgbdFolder):
     holds = "color, depth, pose, intrinsic", "color, depth, intrinsic"
 
     def matches(self, root: Path, *, posed: bool = True) -> bool:
-        return all((root / name).is_dir() for name in self.holds[not posed].split(", "))
+        # Exporters put the cameras in several places; Redwood's have a trajectory instead of poses.
+        folders = [self._folder(root, "color"), root / "depth"]
+        if posed and not any(root.glob("*.log")):
+            posed_by_files = any(self._folder(root, "pose").glob("*.txt"))
+            return posed_by_files and all(folder.is_dir() for folder in folders)
+        folders += [root / "intrinsic", *([self._folder(root, "pose")] if posed else [])]
+        return all(folder.is_dir() for folder in folders)
+
+    def _folder(self, root: Path, kind: str) -> Path:
+        names = {"color": ("color", "rgb", "image", "images"), "pose": ("pose", "poses")}[kind]
+        return next((root / name for name in names if (root / name).is_dir()), root / kind)
 
     def frames(self, root: Path, options: RgbdOptions) -> list[PosedFrame]:
-        return [self._frame(root, path) for path in pictures_in(root / "color")]
+        colors = pictures_in(self._folder(root, "color"))
+        depths = pictures_in(root / "depth")
+        poses = sorted(self._folder(root, "pose").glob("*.txt"))
+        depth_of, pose_of = pair_by_name(colors, depths), pair_by_name(colors, poses)
+        return [
+            self._frame(root, color, depth=depth_of.get(color), pose=pose_of.get(color))
+            for color in colors
+        ]
 
     def frames_of_poses(self, root: Path) -> list[PosedFrame]:
-        stems = (path.stem for path in (root / "pose").glob("*.txt"))
-        return [self._frame(root, root / "color" / f"{stem}.jpg") for stem in stems]
+        colors = self._folder(root, "color")
+        poses = self._folder(root, "pose").glob("*.txt")
+        return [self._frame(root, colors / f"{path.stem}.jpg", pose=path) for path in poses]
 
-    def _frame(self, root: Path, color: Path) -> PosedFrame:
-        depth, pose = root / "depth" / f"{color.stem}.png", root / "pose" / f"{color.stem}.txt"
+    def _frame(
+        self, root: Path, color: Path, *, depth: Path | None = None, pose: Path | None = None
+    ) -> PosedFrame:
+        depth = depth or root / "depth" / f"{color.stem}.png"
+        pose = pose or self._folder(root, "pose") / f"{color.stem}.txt"
         return PosedFrame(color.name, color, None, None, depth, where=str(pose))
+
+    def _place(self, root: Path, name: str) -> Path:
+        folders = (root / "intrinsic", root / "intrinsics", root)
+        return next((f / name for f in folders if (f / name).is_file()), root / name)
+
+    def _intrinsics(self, root: Path, camera: str) -> tuple[Float64, str] | None:
+        """(3, 3) and the file that has it, at one of the places where exporters put it."""
+        names = [f"intrinsic_{camera}", f"intrinsics_{camera}", f"{camera}_intrinsic",
+                 f"{camera}_intrinsics"]  # fmt: skip
+        if camera == "color":
+            names += ["intrinsic", "intrinsics", "camera_intrinsics", "K"]
+        for name in names:
+            if (path := self._place(root, f"{name}.txt")).is_file():
+                matrix = load_matrix(path, (4, 4), (3, 4), (3, 3), (1, 4))
+                return pinhole(matrix[0]) if len(matrix) == 1 else matrix[:3, :3], path.name
+        for path in (root / "_info.txt", root / f"{root.resolve().name}.txt"):
+            if path.is_file():
+                lines = (line.partition("=") for line in _text(path).splitlines())
+                told = {key.strip(): value.split() for key, _, value in lines}
+                K = finite_array(told.get(f"m_calibration{camera.title()}Intrinsic"), 4, 4)
+                keys = [f"{name}_{camera}" for name in ("fx", "fy", "mx", "my")]
+                values = finite_array([told.get(key, ["x"])[0] for key in keys], 4)
+                if K is not None or values is not None:
+                    return (pinhole(values) if K is None else K[:3, :3]), path.name  # type: ignore[arg-type]
+        return intrinsics_beside(root) if camera == "color" else None
 
     def calibration(self, root: Path, options: RgbdOptions) -> Recording:
         folder, cameras = root / "intrinsic", ("color", "depth")
-        color_K, depth_K = (
-            load_matrix(path, (4, 4), (3, 3))[:3, :3] if path.is_file() else None
-            for path in (folder / f"intrinsic_{camera}.txt" for camera in cameras)
-        )
+        found = [self._intrinsics(root, camera) for camera in cameras]
+        color_K, depth_K = (None if item is None else item[0] for item in found)
         merged = _under(options, depth_unit=self.unit, color_K=color_K, depth_K=depth_K)
         if merged.color_K is None:
             raise ProjectError(
-                f"{folder}: no intrinsic_color.txt; export it, or give color_K (--color-intrinsics)"
+                f"{folder}: no intrinsic_color.txt there or in {root}; export it, or give color_K "
+                "(--color-intrinsics)"
             )
         if depth_K is None:
-            return Recording(root, merged)
+            name = "" if found[0] is None else found[0][1]
+            line = [Finding("info", f"intrinsics: {name}")] if name else []
+            return Recording(root, merged, findings=line)
         # Camera from rig each; an export without such files has one place for both.
         color, depth = (
             rigid_transform(load_matrix(path, (4, 4)), what=str(path))[0]
             if path.is_file()
             else np.eye(4)
-            for path in (folder / f"extrinsic_{camera}.txt" for camera in cameras)
+            for path in (self._place(root, f"extrinsic_{camera}.txt") for camera in cameras)
         )
         moved, findings = color @ np.linalg.inv(depth), []
         if options.color_from_depth is None and not np.allclose(moved, np.eye(4)):

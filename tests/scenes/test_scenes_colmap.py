@@ -7,6 +7,7 @@ from scenes_workspace import HEIGHT, LENSES, WIDTH, ramp, save, workspace
 
 from gvtools.errors import ProjectError
 from gvtools.scenes.colmap import read_colmap
+from gvtools.scenes.colmap_model import _image_end
 from gvtools.scenes.images import write_depth_map
 from gvtools.scenes.inspection import reprojection_errors
 from gvtools.scenes.project import open_as, open_project
@@ -276,4 +277,39 @@ def test_names_of_another_form_find_the_one_picture_that_fits(tmp_path, form):
     assert len(scene) == 4 and scene.views[0].load().rgb.shape == (HEIGHT, WIDTH, 3)
     said = [found for found in scene.findings if "named otherwise" in found.message]
     assert len(said) == 1 and said[0].message.startswith("4 pictures")
+    assert not [found for found in scene.findings if found.level == "warning"]
+
+
+@pytest.mark.parametrize("classic", [False, True])
+@pytest.mark.parametrize("text", [False, True])
+def test_tracks_that_name_pictures_taken_out(tmp_path, text, classic):
+    import pycolmap
+
+    reconstruction = workspace(tmp_path, text=text, classic=classic)
+    folder = tmp_path / "sparse" / "0"
+    if text:
+        lines = (folder / "images.txt").read_text().splitlines()
+        head = [line for line in lines if line.startswith("#")]
+        (folder / "images.txt").write_text("\n".join([*head, *lines[len(head) + 2 :], ""]))
+    else:
+        data = (folder / "images.bin").read_bytes()
+        count = (int.from_bytes(data[:8], "little") - 1).to_bytes(8, "little")
+        (folder / "images.bin").write_bytes(count + data[_image_end(data, 8) :])
+    with pytest.raises(Exception, match="does not exist"):
+        pycolmap.Reconstruction(folder)
+    scene = read_colmap(tmp_path)
+    assert len(scene) == reconstruction.num_images() - 1
+    said = [found.message for found in scene.findings if found.level == "warning"]
+    assert any("40 track elements name images that the model does not hold" in s for s in said)
+    assert len(scene.points.positions) == 40 and reprojection_errors(scene).max() < 1e-3
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_text_models_with_a_byte_order_mark(tmp_path, encoding):
+    workspace(tmp_path, text=True)
+    expected = read_colmap(tmp_path)
+    for file in (tmp_path / "sparse" / "0").iterdir():
+        file.write_text(file.read_text(), encoding=encoding)
+    scene = read_colmap(tmp_path)
+    assert scene.names == expected.names
     assert not [found for found in scene.findings if found.level == "warning"]

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -110,6 +111,32 @@ def test_tum_without_its_lists(tmp_path, order):
     assert scene.names == expected.names and all(view.has_depth for view in scene)
     source = "associations.txt" if order else "the names of the files"
     assert f"times are of {source}" in messages(scene)
+
+
+@pytest.mark.parametrize("place", ["", "intrinsics", "single", "_info.txt", "scan.txt"])
+def test_scannets_cameras_at_the_usual_other_places(tmp_path, place):
+    expected = SCANNET.read(scannet(tmp_path / "as it is"))
+    root = scannet(tmp_path / "scan")
+    if place in ("", "intrinsics"):
+        (root / place).mkdir(exist_ok=True)
+        for file in (root / "intrinsic").iterdir():
+            file.rename(root / place / file.name)
+        (root / "intrinsic").rmdir()
+    else:
+        shutil.rmtree(root / "intrinsic")
+        color, depth = "180 0 95.5 0 180 71.5 0 0 1", "90 0 47.5 0 0 90 35.5 0 0 0 1 0 0 0 0 1"
+        wide = "180 0 95.5 0 0 180 71.5 0 0 0 1 0 0 0 0 1"
+        keys = "fx_color = 180\nfy_color = 180\nmx_color = 95.5\nmy_color = 71.5\n"
+        info = f"m_calibrationColorIntrinsic = {wide}\nm_calibrationDepthIntrinsic = {depth}\n"
+        name = "intrinsic.txt" if place == "single" else place
+        np.savetxt(root / name, np.array(color.split(), float).reshape(3, 3))
+        if place != "single":
+            (root / name).write_text(info if place == "_info.txt" else keys)
+        (root / "color").rename(root / "rgb")
+        (root / "pose").rename(root / "poses")
+    scene = open_project(root)
+    assert scene.names == expected.names and all(view.has_depth for view in scene)
+    np.testing.assert_array_equal(scene.cameras.K, expected.cameras.K)
 
 
 @pytest.mark.parametrize("codes", [[[90, 5, 0], [0, 90, 0], [0, 0, 1]], [[0, 0, 0]] * 3])
