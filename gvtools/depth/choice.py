@@ -44,7 +44,8 @@ def choose_source(
     its weights are given, by COLMAP's PatchMatch where pycolmap has CUDA, otherwise by plane-sweep
     stereo. Of CHOICES, ``sensor`` wants RGB-D, ``colmap`` COLMAP's stereo maps, on disk or computed
     now, ``plane-sweep`` photographs alone, ``da3`` a foundation model's weights, ``sensor-or-da3``
-    these for what has no recorded depth. Nothing but ``views`` is looked at.
+    these for what has no recorded depth, and without weights what "auto" takes. Nothing but
+    ``views`` is looked at.
     """
     chosen = _chosen(
         scene, views, choice, stereo=stereo, foundation=foundation or FoundationOptions()
@@ -102,9 +103,9 @@ def _chosen(
         return ChosenSource(_stereo(scene, views, stereo), "asked for")
     if recorded == len(views):
         return ChosenSource(RecordedDepth(views), "every context view has recorded depth")
-    if recorded and len(views) < 2 and foundation.weights is None and choice == "auto":
+    if recorded and len(views) < 2 and foundation.weights is None:
         return ChosenSource(RecordedDepth(), "a single view leaves nothing to compute from")
-    if choice == "sensor-or-da3" or foundation.weights is not None:
+    if foundation.weights is not None:
         source = _foundation(scene, views, foundation)
         how = f"Depth Anything 3, as weights are given: {foundation.weights}"
     elif has_patch_match() and scene.points is not None and len(views) > 1:
@@ -112,6 +113,8 @@ def _chosen(
     else:
         source = _stereo(scene, views, stereo)
         how = "plane-sweep stereo of the photographs"
+    if choice == "sensor-or-da3" and foundation.weights is None:
+        how += ", as no weights of a foundation model are given (da3.weights)"
     if not recorded:
         return ChosenSource(source, f"no context view has recorded depth; {how}")
     return ChosenSource(

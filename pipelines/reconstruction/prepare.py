@@ -71,8 +71,9 @@ def make_plan(
         allow_overlap=config.allow_overlap, max_side=config.max_side,
     )  # fmt: skip
     scene = _allowed_points(scene, context, config.points, say=say)
-    if config.depth == "sensor-or-da3" and config.da3.weights is None and completer.weights:
-        config = config.replaced(da3=config.da3.replaced(weights=str(completer.weights)))
+    own = config.completer_options.get("weights")
+    if config.depth == "sensor-or-da3" and config.da3.weights is None and own is not None:
+        config = config.replaced(da3=config.da3.replaced(weights=str(own)))
     chosen = choose_source(
         scene, context, config.depth, stereo=config.stereo, foundation=config.da3
     )

@@ -257,6 +257,11 @@ def test_choice_takes_it_when_weights_are_given(tmp_path, weights):
     without = replace(scene, views=tuple(bare(view) for view in scene.views))
     chosen = choose_source(without, scene.names, "auto", foundation=given)
     assert isinstance(chosen.source, FoundationDepth) and "weights are given" in chosen.reason
+    paper = choose_source(without, scene.names, "sensor-or-da3", foundation=given)
+    assert isinstance(paper.source, FoundationDepth)
+    assert choose_source(scene, scene.names, "sensor-or-da3", foundation=given).source.name != "da3"
+    swept = choose_source(without, scene.names, "sensor-or-da3")
+    assert "as no weights of a foundation model are given" in swept.reason
     mixed = replace(scene, views=(scene.views[0], *without.views[1:]))
     chosen = choose_source(mixed, scene.names, "auto", foundation=given)
     assert isinstance(chosen.source, MixedDepth) and chosen.source.files
