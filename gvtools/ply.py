@@ -6,6 +6,7 @@ ones being whatever the heap held. Here counts have to fit the file's size.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from itertools import chain
@@ -69,13 +70,13 @@ def read_header(path: Path) -> Header:
             head = file.read(MAX_HEADER)
     except OSError as error:
         raise MemoryFileError(f"{path}: cannot be read ({error.strerror})") from None
-    newline = b"\r\n" if head.startswith(b"ply\r\n") else b"\n"
-    mark = newline + b"end_header" + newline
-    end = head.find(mark)
-    if not head.startswith(b"ply" + newline) or end < 0:
+    # Programs leave blanks at the ends of lines, and a mark of Unicode in front.
+    begin = re.match(rb"(?:\xef\xbb\xbf)?ply[ \t]*(\r?\n)", head)
+    mark = begin and re.search(rb"\r?\nend_header[ \t]*" + begin[1], head)
+    if not begin or not mark:
         raise MemoryFileError(f"{path}: no PLY header; expected a PLY file")
     order, elements, size = None, list[Element](), path.stat().st_size
-    for line in head[:end].decode("ascii", "replace").splitlines()[1:]:
+    for line in head[: mark.start()].decode("ascii", "replace").splitlines()[1:]:
         match line.split():
             case [] | ["comment" | "obj_info", *_]:
                 continue
@@ -102,7 +103,14 @@ def read_header(path: Path) -> Header:
         )
     if order is None:
         raise MemoryFileError(f"{path}: PLY header without a format")
-    return Header(order, tuple(elements), end + len(mark))
+    for item in elements:
+        names = [name.lower() for name, _ in item.columns]
+        # PDAL and MDAL write X, Y, Z.
+        if not {"x", "y", "z"} <= {name for name, _ in item.columns} and len({*names}) == len(
+            names
+        ):
+            item.columns[:] = [(name.lower(), kind) for name, kind in item.columns]
+    return Header(order, tuple(elements), mark.end())
 
 
 def point_vertices(path: Path, header: Header) -> Element:
@@ -110,6 +118,11 @@ def point_vertices(path: Path, header: Header) -> Element:
     vertices = header.vertices
     names = [] if vertices is None else [name for name, _ in vertices.columns]
     if vertices is None or not {"x", "y", "z"} <= set(names) or len(set(names)) != len(names):
+        if any("packed_position" in dict(item.columns) for item in header.elements):
+            raise MemoryFileError(
+                f"{path}: Gaussians compressed as SuperSplat does; expected points; save it again "
+                "as uncompressed PLY, or as SPZ"
+            )
         raise MemoryFileError(
             f"{path}: PLY header whose first element has no distinct vertex properties x, y, z; "
             "expected a point cloud"

@@ -100,6 +100,13 @@ def read_las(path: Path, *, generated: bool) -> Iterator[Item]:
         bits = LEAST_BITS if header.are_points_compressed else 8 * size
         room = path.stat().st_size - int(header.offset_to_point_data)
         _check_count(path, count, bits=bits, room=room)
+        # Since 1.3 more may come behind the points.
+        bare = header.version.minor < 3 and not header.are_points_compressed
+        if bare and room >= (count + 1) * size:
+            raise MemoryFileError(
+                f"{path}: its header says {count} points, but there is room for {room // size}: "
+                "the file was not closed when it was written; repair its header"
+            )
         stations = [{"name": path.stem, "center": None}]
         yield {"count": count, "stations": stations, "crs": _crs(header)}, {}
         for points in reader.chunk_iterator(min(CHUNK, max(1, CHUNK_BYTES // max(size, 1)))):

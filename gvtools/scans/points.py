@@ -60,6 +60,7 @@ class ScanFile:
     stations: tuple[Station, ...]  # at least one
     chunks: Iterator[Chunk]  # all points, in the order of the file, read as they are asked for
     crs: str = ""  # the coordinate system that it names, WKT or "EPSG:N"
+    notes: tuple[str, ...] = ()  # what its header says and is not followed
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +79,7 @@ class Scan:
     dropped: dict[str, int]  # number of points of the file that are left out, by reason
     color_range: str = ""  # what was decided of the colours' range, where their type does not tell
     crs: str = ""  # as of ScanFile
+    notes: tuple[str, ...] = ()  # as of ScanFile, and what may be wrong with the points
 
     def __len__(self) -> int:
         return len(self.positions)

@@ -24,6 +24,9 @@ MOST_POINTS = 8_000_000
 CELLS = 1 << 14
 # Shares of the points whose intensities become black and white, and the grey of what has none.
 DARK, BRIGHT, GREY = 0.01, 0.99, 128
+# Points that are looked at for their precision, and rows of a chunk for rays without a return;
+# fewer than so many tell nothing.
+SAMPLE, NO_RETURN_ROWS, FEW = 20_000, 5_000, 10
 # Beyond it no unit is meant.
 FARTHEST = 1e15
 
@@ -60,12 +63,53 @@ def read_scan(path: Path, *, most: int = MOST_POINTS, generated: bool = False) -
     held = reading.whole()
     if held is None:
         raise MemoryFileError(f"{path}: none of its {file.count} points is usable; expected some")
+    notes = (*file.notes, *_precision(path, held["positions"], reading.origin))
     colors, colored_by, color_range = _colors(held)
     return Scan(
         path.name, reading.origin, held["positions"], colors, held["station"], file.stations,
         colored_by, file.count, dict(reading.dropped), color_range,
-        file.crs,
+        file.crs, notes,
     )  # fmt: skip
+
+
+def _precision(
+    path: Path, positions: NDArray[np.float64], origin: NDArray[np.float64]
+) -> Iterator[str]:
+    """What was lost of coordinates when they were written; all of them are refused."""
+    from scipy.spatial import cKDTree
+
+    some = positions[len(positions) // 2 :][:SAMPLE] if len(positions) > 2 * SAMPLE else positions
+    if len(positions) > 1 and not np.ptp(positions, axis=0).any():
+        raise MemoryFileError(
+            f"{path}: all of its {len(positions)} points lie at {origin.tolist()}; expected a "
+            "scan; its coordinates were lost (a LAS with steps that are too coarse?)"
+        )
+    places = np.unique(some, axis=0)
+    world = some + origin
+    if len(some) > FEW and len(places) < len(some) / 2:
+        yield (
+            f"{len(some):,} points have only {len(places):,} places: coordinates were rounded too "
+            "coarsely, or points occur several times; save it with finer steps"
+        )
+    elif len(some) > FEW and (world == world.astype(np.float32)).all():
+        step = float(np.spacing(np.abs(world).max(axis=0).astype(np.float32)).max())
+        apart = float(np.median(cKDTree(places).query(places, 2)[0][:, 1]))
+        if step > apart / 2:
+            yield (
+                f"coordinates are single precision, in steps of {step:.3g} that far from 0, points "
+                f"{apart:.3g} apart; save it as double, or shifted towards 0"
+            )
+
+
+def _no_return(positions: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Points that all lie at one place, as scanners write rays without a return."""
+    some = positions[:: max(1, len(positions) // NO_RETURN_ROWS)]
+    places, counts = np.unique(some, axis=0, return_counts=True)
+    most = int(counts.argmax())
+    usual = float(np.median(counts))
+    if len(places) < FEW or counts[most] < max(FEW, len(some) / 100, 20 * usual):
+        return np.zeros(len(positions), np.bool_)
+    return np.asarray((positions == places[most]).all(axis=1))
 
 
 @contextmanager
@@ -102,9 +146,13 @@ class _Reading:
     def add(self, chunk: Chunk) -> None:
         """Take points in."""
         self.dropped.update(chunk.dropped)
-        usable = (np.abs(chunk.positions) < FARTHEST).all(axis=1)
+        usable = np.asarray((np.abs(chunk.positions) < FARTHEST).all(axis=1))
         if not usable.all():
             self.dropped["no finite coordinates"] += int((~usable).sum())
+        nowhere = _no_return(chunk.positions[usable]) if usable.any() else usable[usable]
+        if nowhere.any():
+            self.dropped["at one place (no return)"] += int(nowhere.sum())
+            usable[usable] = ~nowhere
         positions = chunk.positions[usable]
         if not len(positions):
             return

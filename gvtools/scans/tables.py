@@ -47,6 +47,7 @@ class ScanTable:
     count: int
     layout: str
     offset: int  # of the first row, bytes
+    last: bool = True  # whether nothing comes behind its rows
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -58,7 +59,7 @@ class ScanTable:
         return tuple(names)
 
     def check(self, path: Path) -> None:
-        """Refuse a file that is shorter than its header says."""
+        """Refuse a file that is shorter, or longer, than its header says."""
         text = self.layout == "text"
         least = LEAST_TEXT * len(self.names) if text else self.dtype.itemsize
         needed = self.offset + self.count * least - text
@@ -67,6 +68,11 @@ class ScanTable:
             raise MemoryFileError(
                 f"{path}: {found} bytes, but its header says {self.count} points, at least "
                 f"{needed}; the file is truncated or damaged; save it again"
+            )
+        if self.layout == "rows" and self.last and found >= needed + max(self.dtype.itemsize, 4):
+            raise MemoryFileError(
+                f"{path}: {found} bytes, but the {self.count} points that its header says end at "
+                f"{needed}: more points, or points as text; mend its header, or save it again"
             )
 
     def chunks(self, path: Path) -> Iterator[Columns]:
@@ -88,6 +94,11 @@ class ScanTable:
                 file.seek(self.offset)
                 for _, rows in parts:
                     yield dict(zip(self.names, _numbers(path, file, self.names, rows), strict=True))
+                if self.last and file.read(1 << 16).strip():
+                    raise MemoryFileError(
+                        f"{path}: more lines than the {self.count} points that its header says; "
+                        "mend its header, or save it again"
+                    )
 
 
 def _numbers(path: Path, file: IO[bytes], names: tuple[str, ...], rows: int) -> NDArray[np.float64]:
@@ -99,7 +110,8 @@ def _numbers(path: Path, file: IO[bytes], names: tuple[str, ...], rows: int) -> 
             table = np.loadtxt(lines, ndmin=2, comments=None)
     except ValueError as error:
         raise MemoryFileError(
-            f"{path}: a point is not {len(names)} numbers ({error}); save it again"
+            f"{path}: a point is not {len(names)} numbers with decimal points ({error}); save it "
+            "again"
         ) from None
     if table.shape != (rows, len(names)):
         raise MemoryFileError(
@@ -110,14 +122,13 @@ def _numbers(path: Path, file: IO[bytes], names: tuple[str, ...], rows: int) -> 
 
 
 def _lines(file: IO[bytes], count: int, most: int) -> Iterator[bytes]:
-    """Lines of a file, none of which is longer than ``most`` bytes."""
-    for _ in range(count):
-        line = file.readline(most)
+    """Lines of a file that are not blank, none of which is longer than ``most`` bytes."""
+    while count and (line := file.readline(most)):
         if len(line) == most:
             raise ValueError(f"a line of {most} bytes or more")
-        if not line:
-            return
-        yield line
+        if line.strip():
+            count -= 1
+            yield line
 
 
 def open_ply(path: Path) -> ScanFile:
@@ -125,7 +136,8 @@ def open_ply(path: Path) -> ScanFile:
     header = read_header(path)
     vertices = point_vertices(path, header)
     layout = "rows" if header.order else "text"
-    table = ScanTable(header.dtype(vertices), vertices.count, layout, header.offset)
+    last = not any(item.count for item in header.elements if item is not vertices)
+    table = ScanTable(header.dtype(vertices), vertices.count, layout, header.offset, last)
     table.check(path)
     kinds = {name: np.dtype(kind) for name, kind in vertices.columns}
     chunks = (_ply_chunk(columns, kinds) for columns in table.chunks(path))
@@ -170,13 +182,16 @@ def _positions(columns: Columns) -> NDArray[np.float64]:
 
 def open_pcd(path: Path) -> ScanFile:
     """A PCD, its header read: as text, binary or compressed."""
-    table = _pcd_header(path)
+    table, viewpoint = _pcd_header(path)
     if table.layout == "columns":
         _check_compressed(path, table)
     else:
         table.check(path)
     chunks = (_pcd_chunk(columns, table.dtype) for columns in table.chunks(path))
-    return ScanFile(path, table.count, (Station(path.stem),), chunks)
+    moved = f"VIEWPOINT {' '.join(viewpoint)} is not applied: points are taken as they stand"
+    return ScanFile(
+        path, table.count, (Station(path.stem),), chunks, notes=(moved,) if viewpoint else ()
+    )
 
 
 def _pcd_chunk(columns: Columns, dtype: np.dtype[np.void]) -> Chunk:
@@ -184,10 +199,13 @@ def _pcd_chunk(columns: Columns, dtype: np.dtype[np.void]) -> Chunk:
     name = next((name for name in ("rgb", "rgba") if name in columns), None)
     if name is not None:
         # One number each, 0xRRGGBB; as float, its bits are meant.
-        if dtype[name].kind == "f":
-            bits = columns[name].astype(np.float32).view(np.uint32)
+        packed = columns[name]
+        # In text some programs write the whole number, though they say F; bits are tiny or huge.
+        whole = packed.dtype == np.float64 and ((packed == 0) | (packed >= 1)).all()
+        if dtype[name].kind == "f" and not (whole and (packed < 1 << 32).all()):
+            bits = packed.astype(np.float32).view(np.uint32)
         else:
-            bits = columns[name].astype(np.int64).astype(np.uint32)
+            bits = packed.astype(np.int64).astype(np.uint32)
         rgb = np.stack([(bits >> shift) & 255 for shift in (16, 8, 0)], axis=1)
         colors = rgb.astype(np.uint8)
     else:
@@ -196,7 +214,8 @@ def _pcd_chunk(columns: Columns, dtype: np.dtype[np.void]) -> Chunk:
     return Chunk(_positions(columns), colors, intensity)
 
 
-def _pcd_header(path: Path) -> ScanTable:
+def _pcd_header(path: Path) -> tuple[ScanTable, list[str]]:
+    """The table of a file, and its viewpoint where that is not the origin's."""
     with path.open("rb") as file:
         head = file.read(MAX_HEADER)
     given: dict[str, list[str]] = {}
@@ -204,6 +223,8 @@ def _pcd_header(path: Path) -> ScanTable:
     while "DATA" not in given:
         end = head.find(b"\n", offset)
         words = head[offset:end].decode("ascii", "replace").split()
+        if words[:1] == ["COLUMNS"]:  # of PCD before 0.7
+            words[0] = "FIELDS"
         if end < 0 or (words and not words[0].startswith("#") and words[0] not in KEYS):
             raise MemoryFileError(f"{path}: no PCD header; expected a PCD point cloud")
         offset = end + 1
@@ -212,7 +233,9 @@ def _pcd_header(path: Path) -> ScanTable:
                 raise MemoryFileError(f"{path}: PCD header with two lines {words[0]}")
             given[words[0]] = words[1:]
     try:
-        return _pcd_table(given, offset)
+        viewpoint = given.get("VIEWPOINT", [])
+        plain = [float(number) for number in viewpoint] in ([], [0, 0, 0, 1, 0, 0, 0])
+        return _pcd_table(given, offset), [] if plain else viewpoint
     except (KeyError, ValueError, IndexError, TypeError) as error:
         raise MemoryFileError(
             f"{path}: PCD header that does not describe points x, y, z ({error!r}); expected "
@@ -232,7 +255,7 @@ def _pcd_table(given: Mapping[str, list[str]], offset: int) -> ScanTable:
             raise ValueError(f"COUNT {count}, SIZE {size[:9]}")
         # Gaps between fields have the name _, perhaps several times.
         label = f"gap {len(columns)}" if name == "_" else name
-        shape = (label, KINDS[kind] + size)
+        shape = (label, KINDS[kind.upper()] + size)
         columns.append(shape if count == 1 else (*shape, (count,)))
     dtype = np.dtype(columns)
     if not {"x", "y", "z"} <= set(names):
@@ -240,11 +263,12 @@ def _pcd_table(given: Mapping[str, list[str]], offset: int) -> ScanTable:
     several = [name for name in READ if name in names and dtype[name].shape]
     if several:
         raise ValueError(f"{several[0]} of several numbers")
-    count = int(given["POINTS"][0])
-    if count < 0 or count != int(given["WIDTH"][0]) * int(given["HEIGHT"][0]):
+    whole = int(given["WIDTH"][0]) * int(given["HEIGHT"][0])
+    count = int(given["POINTS"][0]) if "POINTS" in given else whole
+    if count < 0 or count != whole:
         raise ValueError(f"{count} points")
     layouts = {"ascii": "text", "binary": "rows", "binary_compressed": "columns"}
-    return ScanTable(dtype, count, layouts[given["DATA"][0]], offset)
+    return ScanTable(dtype, count, layouts[given["DATA"][0].lower()], offset)
 
 
 def _check_compressed(path: Path, table: ScanTable) -> None:

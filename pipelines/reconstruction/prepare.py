@@ -303,6 +303,8 @@ def placed_scan(plan: Plan, console: Console) -> PlacedScan | None:
         return None
     scan = read_scan(Path(options.file))
     console.line(_scan_summary(scan))
+    for note in scan.notes:
+        console.warn(f"{scan.name}: {note}")
     placement = given_placement(options.placement)
     if placement is None:
         centers = [station.center for station in scan.stations]

@@ -434,3 +434,102 @@ def test_gaussians_given_as_a_scan_are_their_opaque_centres(tmp_path):
     scan = read_scan(path)
     np.testing.assert_allclose(scan.colors.astype(int), colors[100:], atol=1)
     assert scan.dropped == {"transparent Gaussians": 100} and scan.colored_by == "colour"
+
+
+def written(path, change=lambda text: text, *, rows=None):
+    """A PLY or PCD as text, of 300 coloured points."""
+    positions, colors = surface(300)
+    lines = [f"{x:.6f} {y:.6f} {z:.6f}" for x, y, z in positions] if rows is None else rows
+    if path.suffix == ".ply":
+        head = "ply\nformat ascii 1.0\nelement vertex 300\n" + "".join(
+            f"property {kind} {name}\n"
+            for kind, names in (("double", "xyz"), ("uchar", ("red", "green", "blue")))
+            for name in names
+        )
+        head += "end_header\n"
+        lines = [f"{line} {r} {g} {b}" for line, (r, g, b) in zip(lines, colors, strict=True)]
+    else:
+        head = (
+            "VERSION 0.7\nFIELDS x y z rgb\nSIZE 8 8 8 4\nTYPE F F F F\nCOUNT 1 1 1 1\nWIDTH 300\n"
+            "HEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 300\nDATA ascii\n"
+        )
+        packed = colors.astype(np.int64) @ [1 << 16, 1 << 8, 1]
+        lines = [f"{line} {value}" for line, value in zip(lines, packed, strict=True)]
+    path.write_bytes(change(head + "\n".join(lines) + "\n").encode())
+    return path, positions, colors
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("a.ply", lambda text: "\ufeff" + text),
+        (
+            "a.ply",
+            lambda text: text.replace("end_header", "end_header  ").replace(
+                "ascii 1.0", "ascii 1.0 "
+            ),
+        ),
+        ("a.ply", lambda text: text.replace(" x", " X").replace(" y", " Y").replace(" z", " Z")),
+        ("a.ply", lambda text: text.replace("header\n", "header\n\n") + "\n \n"),
+        ("a.pcd", lambda text: text),
+        ("a.pcd", lambda text: text.replace("F F F F", "f f f f").replace("ascii", "ASCII")),
+        ("a.pcd", lambda text: text.replace("FIELDS", "COLUMNS").replace("POINTS 300\n", "")),
+    ],
+)
+def test_text_as_other_programs_write_it(tmp_path, name, change):
+    same(*written(tmp_path / name, change))
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "said"),
+    [
+        ("a.ply", lambda text: text.replace("x 300", "x 200"), "more lines than the 200 points"),
+        ("a.pcd", lambda text: text.replace(" 300", " 200"), "more lines than the 200 points"),
+        ("a.ply", lambda text: text.replace("ascii", "binary_little_endian"), "points as text"),
+        ("a.ply", lambda text: text.replace("0.", "0,"), "with decimal points"),
+        ("a.ply", lambda text: text.replace(" x", " packed_position"), "compressed as SuperSplat"),
+    ],
+)
+def test_headers_that_contradict_the_points(tmp_path, name, change, said):
+    with pytest.raises(MemoryFileError, match=said):
+        read_scan(written(tmp_path / name, change)[0])
+
+
+@pytest.mark.parametrize("nowhere", ["0 0 0", "-9999 -9999 -9999"])
+def test_rays_without_return_are_left_out(tmp_path, nowhere):
+    lines = [nowhere if i % 3 else f"{i + 1} {i % 7} {i % 5}" for i in range(300)]
+    scan = read_scan(written(tmp_path / "a.ply", rows=lines)[0])
+    assert len(scan) == 100
+    assert scan.dropped == {"at one place (no return)": 200}
+
+
+def test_coordinates_that_were_rounded_are_named(tmp_path):
+    points = np.random.default_rng(0).uniform(0, 1, (300, 3))
+    single = (points + np.array([5e5, 5.4e6, 100])).astype(np.float32).astype(np.float64)
+    for k, (rows, said) in enumerate(
+        [(single, "single precision, in steps of 0.5"), (points.round(), "only 8 places")]
+    ):
+        lines = [" ".join(map(repr, row)) for row in rows.tolist()]
+        path = written(tmp_path / f"{k}.ply", rows=lines)[0]
+        (note,) = read_scan(path).notes
+        assert said in note
+        assert not read_scan(written(tmp_path / "fine.ply")[0]).notes
+    with pytest.raises(MemoryFileError, match="all of its 300 points lie at"):
+        read_scan(written(tmp_path / "one.ply", rows=["1 2 3"] * 300)[0])
+
+
+def test_a_viewpoint_that_is_not_applied_is_named(tmp_path):
+    path, *_ = written(tmp_path / "a.pcd", lambda text: text.replace("NT 0 0 0 1", "NT 1 2 3 1"))
+    assert "VIEWPOINT 1 2 3 1 0 0 0 is not applied" in read_scan(path).notes[0]
+
+
+def test_a_las_whose_header_was_not_completed(tmp_path):
+    laspy = pytest.importorskip("laspy")
+    las = laspy.create(point_format=2, file_version="1.2")
+    las.x, las.y, las.z = surface(300)[0].T
+    las.write(str(tmp_path / "a.las"))
+    data = bytearray((tmp_path / "a.las").read_bytes())
+    data[107:111] = (100).to_bytes(4, "little")
+    (tmp_path / "a.las").write_bytes(data)
+    with pytest.raises(MemoryFileError, match="room for 300"):
+        read_scan(tmp_path / "a.las")
