@@ -24,6 +24,8 @@ from gvtools.completers.geoverse.config import GeoVerseConfig
 from gvtools.completers.geoverse.model import GeoVerse, empty_model
 from gvtools.completers.geoverse.video_prior import VideoPriorConfig
 from gvtools.completers.geoverse.views import model_size
+from gvtools.completers.geoverse.wan import EMPTY_PROMPT
+from gvtools.completers.geoverse.wan_checkpoint import write_empty_prompt
 from gvtools.completers.geoverse.weights import (
     CONFIG_FILE,
     VIDEO_FOLDER,
@@ -40,9 +42,9 @@ from gvtools.completers.geoverse.weights import (
     parts_of,
     save_pretrained,
 )
-from gvtools.errors import ProjectError
+from gvtools.errors import CheckpointError, ProjectError
 from gvtools.evaluation.images import psnr
-from gvtools.files import write_text
+from gvtools.files import folder_replaced_when_written, link_or_copy, make_folder, write_text
 from gvtools.networks.depth_anything.network import RELEASED, DepthAnything3, tied_norms
 from gvtools.networks.tensors import Shapes
 from gvtools.training.records import STAGES, read_log
@@ -244,17 +246,22 @@ def size_text(count: int) -> str:
 
 # Records of a stage's log that are kept.
 RECORDS = 150
-DTYPE = "float16"
 
 
-def pack(training: Path, out: Path) -> Path:
-    """Write the last stage's weights and every stage's record.
+def pack(
+    training: Path, out: Path, *, dtype: str = "float16", text_encoder: Path | None = None
+) -> Path:
+    """Write the last stage's weights and every stage's record, or a weights folder as one file.
 
-    ``training``: folder of a ``gvtools train --out``.
+    Args:
+        training: folder of a ``gvtools train --out``, or a weights folder.
+        text_encoder: Wan's, for a video prior without the empty prompt.
 
     Returns:
-        The stage's folder that the weights came from.
+        The folder that the weights came from.
     """
+    if any(part.find(training) for part in (WHOLE, *parts_of(configs.named("base")))):
+        return _pack_folder(training, out, dtype=dtype, text_encoder=text_encoder)
     folders = [training / name / WEIGHTS for name in STAGES]
     finished = [folder for folder in folders if folder.is_dir() and config_of(folder).trained]
     if not finished:
@@ -274,7 +281,7 @@ def pack(training: Path, out: Path) -> Path:
         )
     model = from_pretrained(source)
     out.mkdir(parents=True, exist_ok=True)
-    save_pretrained(model, out, dtype=DTYPE)
+    save_pretrained(model, out, dtype=dtype)
     for stage in STAGES:
         for name in (f"log_{stage}.jsonl", f"training_{stage}.json"):
             (out / name).unlink(missing_ok=True)
@@ -290,6 +297,30 @@ def pack(training: Path, out: Path) -> Path:
             # Where its samples were kept is of no use elsewhere.
             settings["data"]["cache"] = None
             write_text(out / f"training_{stage}.json", json.dumps(settings, indent=2) + "\n")
+    return source
+
+
+def _pack_folder(source: Path, out: Path, *, dtype: str, text_encoder: Path | None) -> Path:
+    """One file of a weights folder's many; the video prior is linked, or copied to another disk."""
+    video = source / VIDEO_FOLDER
+    if out.resolve().is_relative_to(source.resolve()):
+        raise ProjectError(f"{out} lies within {source}; choose another folder")
+    if video.is_dir() and text_encoder is None and not (video / EMPTY_PROMPT).is_file():
+        raise CheckpointError(
+            f"{video}: no {EMPTY_PROMPT}; name Wan's text encoder with --text-encoder, once"
+        )
+    model = from_pretrained(source, video=False)
+    make_folder(out)
+    if video.is_dir():
+        make_folder(out / VIDEO_FOLDER)
+        with folder_replaced_when_written(out / VIDEO_FOLDER) as new:
+            for path in sorted(path for path in video.rglob("*") if path.is_file()):
+                target = new / path.relative_to(video)
+                make_folder(target.parent)
+                link_or_copy(path, target)
+            if text_encoder is not None and not (new / EMPTY_PROMPT).is_file():
+                write_empty_prompt(text_encoder, new)
+    save_pretrained(model, out, dtype=dtype, about="packed")
     return source
 
 

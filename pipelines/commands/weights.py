@@ -188,20 +188,27 @@ class CreateWeights(Arguments):
 
 
 class PackWeights(Arguments):
-    """Write a trained model in half precision, with its training's record."""
+    """Write a model in half precision as one file, with the record of a training."""
 
-    examples = ("training/tiny weights/tiny",)
+    examples = (
+        "training/tiny weights/tiny",
+        "weights/gld weights/packed --dtype bfloat16",
+    )
     positional = ("source", "folder")
 
     source: Path
-    """Of gvtools train --out. [TRAINING]"""
+    """Of gvtools train --out, or a weights folder. [TRAINING|DIR]"""
     folder: Path
     """The folder to make or to renew. [DIR]"""
+    dtype: Literal["float16", "bfloat16"] = "float16"
+    """What numbers are stored as; bfloat16 has the range of float32."""
+    text_encoder: Path | None = None
+    """Wan's, for a video prior without the empty prompt; never needed again. [DIR|FILE]"""
 
     def run(self, console: Console) -> None:
         from pipelines.weights import pack, packed_bytes, size_text
 
-        source = pack(self.source, self.folder)
+        source = pack(self.source, self.folder, dtype=self.dtype, text_encoder=self.text_encoder)
         console.line(f"{self.folder}: {size_text(packed_bytes(self.folder))}, from {source}")
 
 

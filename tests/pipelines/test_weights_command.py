@@ -22,7 +22,7 @@ from pipelines.published import MODELS, Published, sha256_of
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 PLAIN = micro.config()
-ACTIONS = ("list", "fetch", "check", "create", "truncate-wan", "empty-prompt")
+ACTIONS = ("list", "fetch", "check", "create", "pack", "truncate-wan", "empty-prompt")
 
 
 def weights(*arguments: object) -> int:
@@ -171,6 +171,33 @@ def test_a_photograph_is_encoded_and_decoded(capsys, own, tmp_path, monkeypatch)
     monkeypatch.setattr(micro.GeoVerse, "reconstruct", lambda model, picture: picture)
     assert weights("check", own) == 0
     assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("dtype", ["float16", "bfloat16"])
+def test_published_files_are_packed_into_one(capsys, tmp_path, dtype):
+    bare = replace(PLAIN, level1=replace(PLAIN.level1, depth_condition=False))
+    folder = published.write_published(micro.model(bare), tmp_path / "published")
+    (folder / "video" / "vae").mkdir(parents=True)
+    (folder / "video" / "vae" / "numbers").write_bytes(b"1234")
+    words = ("weights", "pack", folder, tmp_path / "out", "--dtype", dtype)
+    assert "name Wan's text encoder with --text-encoder" in refused(capsys, *words)
+    assert not (tmp_path / "out").exists()
+    embedding = torch.randn(3, 5)
+    torch.save({"token_embedding.weight": embedding, "norm.weight": torch.ones(5)}, tmp_path / "t5")
+    assert main([str(word) for word in (*words, "--text-encoder", tmp_path / "t5")]) == 0
+    packed, whole = (from_pretrained(place).state_dict() for place in (tmp_path / "out", folder))
+    buffers = {name for name, _ in micro.model(bare).named_buffers()}
+    for name, tensor in whole.items():
+        exact = name in buffers or name.endswith(".t_embedder.W")
+        kept = tensor if exact else tensor.to(getattr(torch, dtype)).float()
+        assert torch.equal(packed[name], kept), name
+    prompt = load_file(tmp_path / "out" / "video" / "empty_prompt.safetensors")["embedding"]
+    wanted = embedding[1] / embedding[1].square().mean().add(1e-6).sqrt()
+    torch.testing.assert_close(prompt, wanted[None])
+    assert (tmp_path / "out" / "video" / "vae" / "numbers").read_bytes() == b"1234"
+    assert not (folder / "video" / "empty_prompt.safetensors").exists()
+    assert weights("check", tmp_path / "out") == 0
+    assert "lies within" in refused(capsys, "weights", "pack", folder, folder / "packed")
 
 
 def test_an_older_revision_is_named(capsys, tmp_path, monkeypatch):

@@ -437,10 +437,10 @@ def _is_zero(folder: Path, start: str) -> bool:
 def untrained_branches(folder: Path, config: GeoVerseConfig) -> tuple[str, ...]:
     """A note for every part of a folder whose branch no training has made useful yet."""
     notes, video = [], folder / VIDEO_FOLDER
-    published = WHOLE.find(folder) is None
-    if published and config.hints.encode == "context":
+    if config.hints.encode == "context":
+        files = "published files, " if WHOLE.find(folder) is None else ""
         notes.append(
-            f"{folder}: published files, trained without a memory: they complete from the "
+            f"{folder}: {files}trained without a memory: they complete from the "
             "photographs and the cameras alone, and the memory only keeps what was completed"
         )
     elif config.level1.depth_condition and _is_zero(folder, "level1.depth_embedder."):
