@@ -47,6 +47,9 @@ IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".p
 WITH_ALPHA = ("RGBA", "LA", "PA", "RGBa", "La")
 SAMPLED = 8  # pictures that tell the range of a project's
 LOSSY = ("JPEG", "MPO", "JPEG2000")
+# What becomes of it, and what findings say of that.
+ALPHA = {"mask": "read as a mask", "ignore": "ignored", "white": "laid on white",
+         "black": "laid on black"}  # fmt: skip
 OPAQUE_FROM = 128  # an alpha at or above this counts as part of the picture
 
 _EXIF_ORIENTATION = 0x0112
@@ -86,8 +89,8 @@ def orientation_of(exif: Mapping[int, Any]) -> int:
     return int(told) if told in list("12345678") else 1
 
 
-def read_image(path: Path, *, white: float = 65535) -> Frame:
-    """The picture at ``path`` as 8-bit RGB, with its alpha channel as a mask.
+def read_image(path: Path, *, white: float = 65535, alpha: str = "mask") -> Frame:
+    """The picture at ``path`` as 8-bit RGB, with its alpha channel as ``ALPHA`` says, a mask.
 
     Grey is repeated over the channels, palettes are resolved, 16 bits a channel become eight, of
     which full brightness is ``white``. EXIF orientation is not applied (see the module's text).
@@ -96,11 +99,20 @@ def read_image(path: Path, *, white: float = 65535) -> Frame:
         if white != 65535 and _is_deep(image):
             levels = to_bytes(_levels(path, image), white)
             if levels.ndim == 3 and levels.shape[2] == 4:
-                mask = levels[..., 3] >= OPAQUE_FROM
-                return Frame(np.ascontiguousarray(levels[..., :3]), mask=mask)
+                return _without_alpha(levels, alpha)
             rgb = levels if levels.ndim == 3 else np.repeat(levels[..., None], 3, axis=-1)
             return Frame(rgb)
-        return _decode(image, path)
+        return _decode(image, path, alpha=alpha)
+
+
+def _without_alpha(rgba: NDArray[np.uint8], alpha: str) -> Frame:
+    """(H, W, 4) as a picture: opaque pixels alone, all as stored, or laid on white or black."""
+    rgb = np.ascontiguousarray(rgba[..., :3])
+    if alpha in ("white", "black"):
+        share = rgba[..., 3:].astype(np.float32) / 255
+        rgb = np.rint(rgb * share + (255 if alpha == "white" else 0) * (1 - share)).astype(np.uint8)
+    mask = rgba[..., 3] >= OPAQUE_FROM
+    return Frame(rgb, mask=None if alpha != "mask" or mask.all() else mask)
 
 
 def _is_deep(image: Image.Image) -> bool:
@@ -152,7 +164,7 @@ def _picture(source: Path | bytes, where: str = "") -> Iterator[Image.Image]:
         yield image
 
 
-def _decode(image: Image.Image, path: Path | str) -> Frame:
+def _decode(image: Image.Image, path: Path | str, *, alpha: str = "mask") -> Frame:
     if image.mode in ("I", "F"):
         raise ProjectError(
             f"{path}: the picture holds 32-bit values ({image.mode}); "
@@ -162,10 +174,7 @@ def _decode(image: Image.Image, path: Path | str) -> Frame:
         grey = (np.asarray(image) >> 8).astype(np.uint8)
         return Frame(np.repeat(grey[..., None], 3, axis=-1))
     if image.mode in WITH_ALPHA or "transparency" in image.info:
-        rgba = np.array(image.convert("RGBA"))
-        mask = rgba[..., 3] >= OPAQUE_FROM
-        rgb = np.ascontiguousarray(rgba[..., :3])
-        return Frame(rgb, mask=None if mask.all() else mask)
+        return _without_alpha(np.array(image.convert("RGBA")), alpha)
     return Frame(np.array(image.convert("RGB")))
 
 

@@ -26,6 +26,7 @@ from gvtools.ranges import WHOLE
 from gvtools.scenes.calibration import Float64, scaled_lens
 from gvtools.scenes.faces import perspective_views
 from gvtools.scenes.images import (
+    ALPHA,
     ImageHeader,
     check_size,
     fit_depth,
@@ -352,10 +353,10 @@ class Photograph:
         files = tuple(dict.fromkeys(path for path in paths if path is not None))
         return View(self.name, camera, self.load, self.frame.depth is not None, files)
 
-    def load(self) -> Frame:
+    def load(self, alpha: str = "mask") -> Frame:
         """The pixels in the pinhole camera."""
         frame, lens = self.frame, self.lens
-        read = frame.read or partial(read_image, white=self.white)
+        read = frame.read or partial(read_image, white=self.white, alpha=alpha)
         picture = read(frame.image)
         check_size(picture.rgb.shape[1::-1], lens.source_size, path=frame.image)
         masks = [] if picture.mask is None else [lens.nearest(picture.mask)]
@@ -420,7 +421,7 @@ def conversion_findings(headers: Sequence[ImageHeader]) -> list[Finding]:
         elif header.mode in ("L", "1", "LA"):
             kinds["grey: repeated over red, green and blue"] += 1
         if header.has_alpha:
-            kinds["with an alpha channel: read as a mask"] += 1
+            kinds[f"with an alpha channel: {ALPHA['mask']}"] += 1
         if header.orientation != 1:
             kinds["with an EXIF orientation: not applied, cameras are of the stored pixels"] += 1
     return [Finding("info", f"{count} pictures {kind}") for kind, count in kinds.items()]

@@ -6,16 +6,20 @@ import difflib
 import shlex
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from types import MethodType
 from typing import Any
 
 from gvtools.errors import OptionError, ProjectError, UnposedError
 from gvtools.scenes.calibration import load_matrix
 from gvtools.scenes.collection import SceneCollection, of_scenes
 from gvtools.scenes.colmap_model import find_model
+from gvtools.scenes.images import ALPHA
 from gvtools.scenes.layout import FORM, SPEC, is_address
 from gvtools.scenes.matching import named
 from gvtools.scenes.phones import POLYCAM, RECORD3D, SCANNER_APP, STRAY_SCANNER
+from gvtools.scenes.photographs import Photograph
 from gvtools.scenes.rgbd import LAYOUTS, RgbdOptions, count_unposed
 from gvtools.scenes.scene import Finding, Scene
 from gvtools.scenes.transforms import FILE as TRANSFORMS
@@ -42,6 +46,7 @@ def open_project(
     rgbd: RgbdOptions | None = None,
     root: Path | None = None,
     model: int | None = None,
+    alpha: str = "mask",
 ) -> Scene:
     """The scene of a COLMAP workspace, a posed RGB-D folder, a phone's or a ``transforms.json``.
 
@@ -53,6 +58,8 @@ def open_project(
         rgbd: what a posed RGB-D folder does not tell by itself.
         root: the folder of the data set's download.
         model: number of the COLMAP model, where there are several; None takes the largest.
+        alpha: what a picture's alpha channel is: a "mask", to "ignore", or what it is laid on
+            "white" or "black" by.
 
     Raises:
         ProjectError: nothing there that can be read, or what is there is damaged.
@@ -60,6 +67,11 @@ def open_project(
         OptionError: an option of another kind of project.
         ShapeError: a pose with a scale or a mirror.
     """
+    if alpha not in ALPHA:
+        raise OptionError(f"alpha {alpha!r}; expected one of {', '.join(ALPHA)}")
+    if alpha != "mask":
+        scene = open_project(path, images=images, masks=masks, rgbd=rgbd, root=root, model=model)
+        return _with_alpha(scene, alpha)
     if is_address(path):
         if any(option is not None for option in (images, masks, rgbd, model)):
             raise OptionError(
@@ -122,6 +134,21 @@ def open_project(
     raise _unknown(path)
 
 
+def _with_alpha(scene: Scene, alpha: str) -> Scene:
+    """The scene with the alpha of its pictures taken otherwise than as a mask."""
+    views = tuple(
+        replace(view, load=partial(view.load.__self__.load, alpha))
+        if isinstance(view.load, MethodType) and isinstance(view.load.__self__, Photograph)
+        else view
+        for view in scene.views
+    )
+    findings = (
+        replace(found, message=found.message.replace(ALPHA["mask"], ALPHA[alpha]))
+        for found in scene.findings
+    )
+    return replace(scene, views=views, findings=tuple(findings))
+
+
 def _capture(path: Path) -> str:
     return f"find the cameras first: gvtools capture {shlex.quote(str(path))} --out PROJECT"
 
@@ -175,6 +202,7 @@ READING = {
     "images": None,
     "masks": None,
     "model": None,
+    "alpha": None,
     "depth_unit": "depth_unit",
     "depth_max": "depth_max",
     "color_intrinsics": "color_K",
@@ -194,7 +222,13 @@ def open_as(path: Path, reading: Mapping[str, Any]) -> Scene:
         name: None if reading.get(name) is None else Path(reading[name])
         for name in ("images", "masks", "root")
     }
-    scene = open_project(path, **folders, rgbd=rgbd_options(reading), model=reading.get("model"))
+    scene = open_project(
+        path,
+        **folders,
+        rgbd=rgbd_options(reading),
+        model=reading.get("model"),
+        alpha=reading.get("alpha") or "mask",
+    )
     if reading.get("resolution") is None:
         return scene
     from gvtools.scenes.resized import resized

@@ -96,6 +96,8 @@ class SceneArguments(RecordingArguments, RootArguments):
     """Masks NAME.png (black = ignore) of the pictures. [DIR]"""
     model: int | None = None
     """COLMAP's sparse/N, where it holds several (largest). [N]"""
+    alpha: Literal["mask", "ignore", "white", "black"] | None = None
+    """Of pictures: leave transparent pixels out (mask), or use them, as stored or on a colour."""
 
     def open_scene(self, path: Path) -> Scene:
         """The project at ``path``."""

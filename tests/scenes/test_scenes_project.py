@@ -10,6 +10,7 @@ from rgbd_folders import redwood, scannet, tum
 from scenes_workspace import PINHOLE, frame, ramp, save, sevenscenes, transforms, workspace
 
 from gvtools.errors import OptionError, ProjectError
+from gvtools.scenes.images import ALPHA
 from gvtools.scenes.project import open_project
 from gvtools.scenes.rgbd import RgbdOptions
 
@@ -82,3 +83,24 @@ def test_pictures_without_cameras_are_told_from_unknown_folders(tmp_path):
     video.touch()
     with pytest.raises(ProjectError, match=r"a video without cameras; .* gvtools capture"):
         open_project(video)
+
+
+@pytest.mark.parametrize(
+    ("alpha", "masked", "value"),
+    [("mask", True, 100), ("ignore", False, 100), ("white", False, 255), ("black", False, 0)],
+)
+def test_alpha_of_pictures(tmp_path, alpha, masked, value):
+    picture = np.full((72, 96, 4), 100, np.uint8)
+    picture[:, :48, 3], picture[:, 48:, 3] = 0, 255
+    save(tmp_path / "images" / "a.png", picture)
+    transforms(tmp_path, [frame()], **PINHOLE)
+    scene = open_project(tmp_path, alpha=alpha)
+    loaded = scene.views[0].load()
+    assert (loaded.mask is not None and not loaded.mask[:, :40].any()) == masked
+    assert loaded.rgb[10, 10].tolist() == [value] * 3 and loaded.rgb[10, 90].tolist() == [100] * 3
+    assert any(f"alpha channel: {ALPHA[alpha]}" in item.message for item in scene.findings)
+
+
+def test_alpha_of_another_name(tmp_path):
+    with pytest.raises(OptionError, match="expected one of mask, ignore, white, black"):
+        open_project(tmp_path, alpha="none")
