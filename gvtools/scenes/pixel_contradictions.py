@@ -23,6 +23,8 @@ Grey = NDArray[np.float32]
 # On real scenes it is 0.92 and more; renumbered or mirrored it is 0.5 at most, and cropped by a
 # tenth at each border 0.2 to 0.6 in the middle of a scene's views.
 TRACKS, AGREE = 20, 0.7
+# Nothing is told by detail of a smaller deviation than this, grey levels.
+CONTRAST = 2.0
 # Detail is what a blur over this share of the longer side takes away.
 BLUR = 1 / 40
 # How pictures come to be wrong, by what sets them right.
@@ -73,7 +75,7 @@ class PixelCheck:
         mine = np.isfinite(own)
         total, views = total - np.where(mine, own, 0), views - mine
         used = mine & (views > 0)
-        if used.sum() < TRACKS or not own[used].std() > 0:
+        if used.sum() < TRACKS or own[used].std() < CONTRAST:
             return None
         return float(np.corrcoef(own[used], total[used] / views[used])[0, 1])
 
