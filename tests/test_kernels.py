@@ -73,6 +73,7 @@ def test_where_nothing_can_be_written_the_cache_is_a_folder_that_goes(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_a_cache_of_types_that_moved_is_compiled_again(tmp_path, monkeypatch):
     source = """
 from typing import NamedTuple

@@ -82,7 +82,9 @@ class _Pair:
         return float((far * scale[b] < NEAR).mean())
 
 
-def pose_findings(scene: Scene, names: Sequence[str] | None = None) -> list[Finding]:
+def pose_findings(
+    scene: Scene, names: Sequence[str] | None = None, *, most_pairs: int = PAIRS
+) -> list[Finding]:
     """A warning where the photographs of a scene without tracks contradict its poses."""
     chosen = [
         number for number, view in enumerate(scene.views) if names is None or view.name in names
@@ -91,7 +93,7 @@ def pose_findings(scene: Scene, names: Sequence[str] | None = None) -> list[Find
         return []
     cameras = scene.cameras
     scale = np.minimum(SIDE / np.maximum(cameras.width, cameras.height), 1)
-    pairs = _pairs(scene, chosen, scale)
+    pairs = _pairs(scene, chosen, scale, most_pairs=most_pairs)
     poses = cameras.cam_from_world
 
     def shares(form: Callable[[Float64], Float64] = np.asarray) -> list[float]:
@@ -116,11 +118,12 @@ def pose_findings(scene: Scene, names: Sequence[str] | None = None) -> list[Find
     return [Finding("warning", line)]
 
 
-def _pairs(scene: Scene, chosen: Sequence[int], scale: Float64) -> list[_Pair]:
+def _pairs(scene: Scene, chosen: Sequence[int], scale: Float64, *, most_pairs: int) -> list[_Pair]:
     """A few pairs of views, evenly spread, that show the same from places apart."""
     matcher, features = SiftMatcher(max_features=1500), dict[int, Features | None]()
     pairs = []
-    for row in sorted({*np.linspace(0, len(chosen) - 2, PAIRS).round().astype(int).tolist()}):
+    ends = np.linspace(0, len(chosen) - 2, most_pairs)
+    for row in sorted({*ends.round().astype(int).tolist()}):
         found = None
         for step in STEPS:
             if row + step >= len(chosen):

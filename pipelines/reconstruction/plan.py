@@ -336,7 +336,11 @@ def describe(plan: Plan, console: Console) -> None:
             f"{plan.source.name}"
         )
     scene, context = plan.scene, plan.context
-    met = *probed(scene, context), *pose_findings(scene, context), *unit_findings(scene)
+    met = (
+        *probed(scene, context),
+        *pose_findings(scene, context, most_pairs=2),
+        *unit_findings(scene),
+    )
     for finding in (*scene.findings, *met):
         if finding.level == "warning":
             console.warn(finding.message)

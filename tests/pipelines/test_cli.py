@@ -101,10 +101,6 @@ def _small_depth(scan: Path) -> None:
     Image.fromarray(np.full((50, 50), 1000, np.uint16)).save(scan / "frame-000000.depth.png")
 
 
-def _nan_pose(scan: Path) -> None:
-    np.savetxt(scan / "frame-000001.pose.txt", np.full((4, 4), np.nan))
-
-
 def _scaled_pose(scan: Path) -> None:
     path = scan / "frame-000001.pose.txt"
     np.savetxt(path, np.diag([2, 2, 2, 1.0]) @ np.loadtxt(path))
@@ -133,7 +129,6 @@ def _malformed_text_model(scan: Path) -> None:
         (_empty, ("COLMAP", "transforms.json")),
         (_torn_picture, ("frame-000003.color.png",)),
         (_small_depth, ("frame-000000", "50")),
-        (_nan_pose, ("frame-000001", "NaN")),
         (_scaled_pose, ("frame-000001", "scale")),
         (_model_without_images, ("image",)),
         (_malformed_text_model, ("parameters",)),
