@@ -62,27 +62,26 @@ class PixelCheck:
         found[inside] = cv2.blur(grey, (3, 3))[y[inside], x[inside]]
         return found
 
-    def agreement(self, number: int) -> float | None:
-        """Correlation of a view with the others; None where they have too few tracks in common."""
+    def agreements(self) -> dict[int, float]:
+        """Correlation with the others, of each view that has enough tracks in common with them."""
         if self.points is None:
-            return None
-        rows, index = self.rows[number], self.points.point_index
-        own = self.values[rows]
+            return {}
+        index, count = self.points.point_index, len(self.points.positions)
         known = np.isfinite(self.values)
-        count = len(self.points.positions)
-        total = np.bincount(index[known], self.values[known], count)[index[rows]]
-        views = np.bincount(index[known], minlength=count)[index[rows]]
-        mine = np.isfinite(own)
-        total, views = total - np.where(mine, own, 0), views - mine
-        used = mine & (views > 0)
-        if used.sum() < TRACKS or own[used].std() < CONTRAST:
-            return None
-        return float(np.corrcoef(own[used], total[used] / views[used])[0, 1])
+        total = np.bincount(index[known], self.values[known], count)
+        views = np.bincount(index[known], minlength=count)
+        found = {}
+        for number, rows in enumerate(self.rows):
+            shared = rows[known[rows] & (views[index[rows]] > 1)]
+            own, at = self.values[shared], index[shared]
+            if len(shared) >= TRACKS and own.std() >= CONTRAST:
+                others = (total[at] - own) / (views[at] - 1)
+                found[number] = float(np.corrcoef(own, others)[0, 1])
+        return found
 
     def findings(self) -> list[Finding]:
         """A warning where photographs and detections disagree."""
-        scores = {number: self.agreement(number) for number in range(len(self.rows))}
-        judged = {number: score for number, score in scores.items() if score is not None}
+        judged = self.agreements()
         wrong = sorted((n for n, s in judged.items() if s < AGREE), key=lambda n: judged[n])
         if not wrong:
             return []
@@ -116,8 +115,9 @@ class PixelCheck:
                 other.values[self.rows[number]] = (
                     np.nan if grey is None else self._at_detections(number, grey)
                 )
-            scores = [score for n in chosen if (score := other.agreement(n)) is not None]
-            if scores and np.median(scores) > AGREE:
+            scores = other.agreements()
+            fit = [scores[number] for number in chosen if number in scores]
+            if fit and np.median(fit) > AGREE:
                 return f"; {reason}"
         return ""
 

@@ -24,7 +24,7 @@ def told(scene):
     ("listed", "there"),
     [
         ("images\\a.png", "a.png"),
-        ("/home/me/scene/images/a.png", "a.png"),
+        ("/data/scene/images/a.png", "a.png"),
         ("C:\\scene\\a.png", "a.png"),
         ("../other/a.png", "a.png"),
         ("a.png", "left/a.png"),
@@ -86,7 +86,7 @@ def test_frames_of_another_computer(tmp_path):
     for name in ("a", "b"):
         save(tmp_path / "images" / f"{name}.png", ramp())
         save(tmp_path / "masks" / f"{name}.png", MASK)
-    names = "C:\\scene\\images\\a.JPG", "/home/me/images/b.png"
+    names = "C:\\scene\\images\\a.JPG", "/data/images/b.png"
     masks = "masks\\A.png", "./masks/b.PNG"
     listed = [frame(name, i, mask_path=masks[i]) for i, name in enumerate(names)]
     transforms(tmp_path, listed, **PINHOLE)
