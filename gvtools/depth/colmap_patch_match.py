@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from gvtools.depth.source import DepthMap, RecordedDepth
 from gvtools.errors import DegenerateError, ProjectError
 from gvtools.scenes.colmap import depth_map_path
-from gvtools.scenes.colmap_model import write_colmap
+from gvtools.scenes.colmap_writer import write_colmap
 from gvtools.scenes.images import read_depth
 from gvtools.scenes.scene import Frame, Scene, View
 

@@ -31,7 +31,7 @@ from gvtools.poses.colmap import (
 )
 from gvtools.poses.motions import centers_of, mean_near, motions_between, move_pose, nearest_pairs
 from gvtools.poses.refinement import RefinedPoses
-from gvtools.scenes.colmap_model import build_reconstruction
+from gvtools.scenes.colmap_writer import build_reconstruction
 from gvtools.scenes.scene import Frame, Scene
 from gvtools.similarity import align_poses
 

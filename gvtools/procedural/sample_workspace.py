@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
 from gvtools.errors import ProjectError
-from gvtools.scenes.colmap_model import write_colmap
+from gvtools.scenes.colmap_writer import write_colmap
 from gvtools.scenes.images import write_depth_map
 
 RECORD = "sample.json"

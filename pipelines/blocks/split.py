@@ -37,7 +37,7 @@ from gvtools.runs.layout import file_stems
 from gvtools.runs.poses import with_poses
 from gvtools.runs.target_files import write_png
 from gvtools.scenes.colmap import CHUNK_BOX
-from gvtools.scenes.colmap_model import write_colmap
+from gvtools.scenes.colmap_writer import write_colmap
 from gvtools.scenes.images import read_image
 from gvtools.scenes.resized import reduced
 from gvtools.scenes.scene import Frame, Scene, View

@@ -19,7 +19,7 @@ from gvtools.files import link_or_copy, write_text
 from gvtools.memory.thinning import thin
 from gvtools.runs.run import load_run
 from gvtools.runs.target_files import write_png
-from gvtools.scenes.colmap_model import write_colmap as write_model
+from gvtools.scenes.colmap_writer import write_colmap as write_model
 from gvtools.scenes.images import IMAGE_SUFFIXES, read_image
 from gvtools.scenes.matching import named
 from gvtools.scenes.scene import View

@@ -20,7 +20,7 @@ from tiny_scan import write_scan
 import gvtools
 from gvtools.cameras import Cameras
 from gvtools.errors import GvError
-from gvtools.scenes.colmap_model import write_colmap
+from gvtools.scenes.colmap_writer import write_colmap
 from pipelines.cli import COMMANDS, build_parser, main
 
 RUN = ("--context", "first:2", "--targets", "range:2-5", "--views-per-round", "2", "--quiet")

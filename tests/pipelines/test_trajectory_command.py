@@ -13,7 +13,7 @@ from trajectory_writers import write_kitti, write_tum
 from walks import disturbed, line, moved, path
 
 from gvtools.cameras import Cameras, invert_rigid
-from gvtools.scenes.colmap_model import write_colmap
+from gvtools.scenes.colmap_writer import write_colmap
 from pipelines.cli import main
 
 

@@ -12,7 +12,7 @@ from scenes_workspace import workspace
 from gvtools.cameras import Cameras
 from gvtools.errors import GvError, ProjectError, ShapeError
 from gvtools.scenes.colmap import read_colmap
-from gvtools.scenes.colmap_model import write_colmap
+from gvtools.scenes.colmap_writer import write_colmap
 from gvtools.scenes.images import read_depth, stored_depth_size, write_depth_map
 
 VIEWS, POINTS = 5, 60

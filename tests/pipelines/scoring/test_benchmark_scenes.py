@@ -13,7 +13,7 @@ from gvtools.cameras import Cameras
 from gvtools.errors import ProjectError
 from gvtools.evaluation.published import load_benchmark
 from gvtools.runs.run import Run
-from gvtools.scenes.colmap_model import write_colmap
+from gvtools.scenes.colmap_writer import write_colmap
 from gvtools.scenes.data_sets import catalogue
 from pipelines.scoring import benchmark_scenes as scenes
 from pipelines.scoring.benchmark_scenes import (
