@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import cache
+
 import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
 from gvtools.errors import GvError
-from gvtools.scenes.scene import Finding, Scene
+from gvtools.scenes.scene import Finding, Scene, View
 
 # Factors that depth may lack, a tenth apart, and how far depths that agree may differ.
 FACTORS, SAME = 10 ** (np.arange(-96, 97) / 24), 0.01
@@ -21,25 +24,20 @@ def unit_findings(scene: Scene) -> list[Finding]:
     """A warning when depth of neighbours agrees with the poses in another unit alone."""
     numbers = [number for number, view in enumerate(scene.views) if view.has_depth]
     first = sorted({*np.linspace(0, len(numbers) - 1, PROBES).astype(int).tolist()})
+    depth_of = cache(_depth)
     pairs = [(at, at + gap) for at in first for gap in GAPS if at + gap < len(numbers)]
-    maps: dict[int, NDArray[np.float32] | None] = {}
-    total, agreed = 0, np.zeros(len(FACTORS))
+    compared = []
     for pair in pairs:
-        a, b = (numbers[place] for place in pair)
-        for number in (a, b):
-            if number not in maps:
-                maps[number] = _depth(scene, number)
-        one, other = maps[a], maps[b]
-        if one is None or other is None:
-            continue
-        cameras = scene.views[a].camera, scene.views[b].camera
-        if np.linalg.norm(cameras[0].centers - cameras[1].centers) > 0:
-            count, agreeing = _agreeing(one, other, cameras)
-            total, agreed = total + count, agreed + agreeing
-    if not total:
+        a, b = (scene.views[numbers[place]] for place in pair)
+        maps = depth_of(a), depth_of(b)
+        if maps[0] is not None and maps[1] is not None:
+            if np.linalg.norm(a.camera.centers - b.camera.centers) > 0:
+                compared.append((maps[0], maps[1], (a.camera, b.camera)))
+    count, (now,) = _agreeing(compared, np.ones(1))
+    if not count or now > SHARE:  # no factor makes so much more agree
         return []
-    now, best = agreed[len(FACTORS) // 2] / total, agreed.max() / total
-    factor = float(FACTORS[agreed.argmax()])
+    _, agreeing = _agreeing(compared, FACTORS)
+    best, factor = agreeing.max(), float(FACTORS[agreeing.argmax()])
     if best < AGREE or now > SHARE * best or max(factor, 1 / factor) < FAR:
         return []
     times = f"{float(f'{factor:.2g}'):g}"
@@ -52,32 +50,33 @@ def unit_findings(scene: Scene) -> list[Finding]:
     return [Finding("warning", line)]
 
 
-def _depth(scene: Scene, number: int) -> NDArray[np.float32] | None:
+def _depth(view: View) -> NDArray[np.float32] | None:
     try:
-        return scene.views[number].load().depth
+        return view.load().depth
     except GvError:  # said elsewhere
         return None
 
 
 def _agreeing(
-    one: NDArray[np.float32], other: NDArray[np.float32], cameras: tuple[Cameras, Cameras]
+    pairs: Sequence[tuple[NDArray[np.float32], NDArray[np.float32], tuple[Cameras, Cameras]]],
+    factors: NDArray[np.float64],
 ) -> tuple[int, NDArray[np.float64]]:
-    """How many pixels of the first view are compared, and how many agree at each factor."""
-    rows, columns = np.nonzero(one > 0)
-    chosen = np.linspace(0, len(rows) - 1, min(PIXELS, len(rows))).astype(int)
-    rows, columns = rows[chosen], columns[chosen]
-    agreeing = np.zeros(len(FACTORS))
-    if not len(rows):
-        return 0, agreeing
-    pixels = np.column_stack([columns + 0.5, rows + 0.5, np.ones(len(rows))])
-    rays = (pixels @ np.linalg.inv(cameras[0].K[0]).T) * one[rows, columns][:, None]
-    world = cameras[0].world_from_cam[0]
-    for i, factor in enumerate(FACTORS):
-        points = (rays * factor) @ world[:3, :3].T + world[:3, 3]
-        xy, z = cameras[1].project(points)
-        with np.errstate(invalid="ignore"):
-            inside = (z[0] > 0) & (xy[0] >= 0).all(1) & (xy[0] < other.shape[::-1]).all(1)
-            x, y = np.where(inside[:, None], xy[0], 0).astype(int).T
-            near = np.abs(z[0] - factor * other[y, x]) < SAME * factor * other[y, x]
-        agreeing[i] = (inside & near).sum()
-    return len(rows), agreeing
+    """How many pixels of first views are compared, and the share that agrees at each factor."""
+    total, agreed = 0, np.zeros(len(factors))
+    for one, other, cameras in pairs:
+        rows, columns = np.nonzero(one > 0)
+        chosen = np.linspace(0, len(rows) - 1, min(PIXELS, len(rows))).astype(int)
+        rows, columns = rows[chosen], columns[chosen]
+        pixels = np.column_stack([columns + 0.5, rows + 0.5, np.ones(len(rows))])
+        rays = (pixels @ np.linalg.inv(cameras[0].K[0]).T) * one[rows, columns][:, None]
+        to_other = cameras[1].cam_from_world[0] @ cameras[0].world_from_cam[0]
+        points = factors[:, None, None] * (rays @ to_other[:3, :3].T) + to_other[:3, 3]
+        z = points[..., 2]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            xy = (points @ cameras[1].K[0].T)[..., :2] / z[..., None]
+            inside = (z > 0) & (xy >= 0).all(-1) & (xy < other.shape[::-1]).all(-1)
+        x, y = np.moveaxis(np.where(inside[..., None], xy, 0).astype(int), -1, 0)
+        expected = factors[:, None] * other[y, x]
+        total += len(rows)
+        agreed += (inside & (np.abs(z - expected) < SAME * expected)).sum(1)
+    return total, agreed / max(total, 1)

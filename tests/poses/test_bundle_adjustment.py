@@ -19,7 +19,7 @@ VIEWS = 12
 @pytest.fixture(scope="module")
 def room(tmp_path_factory):
     folder = tmp_path_factory.mktemp("room") / "room"
-    write_room(folder)
+    write_room(folder, width=360, height=270)
     scene = open_project(folder)
     names = scene.names[:VIEWS]
     return [scene[name].load() for name in names], scene.subset(names).cameras
@@ -110,7 +110,7 @@ def test_other_cameras_move_only_if_they_err_alike(room):
     ])  # fmt: skip
     rng = np.random.default_rng(0)
     alike = np.stack([move_pose(pose, rng.normal(0, 0.001, 6)) for pose in turned])
-    tracks = tracks_through(cameras)
+    tracks = tracks_through(cameras, noise=0.2)
     one = replace(cameras, cam_from_world=alike)
     assert not adjusted_poses(frames, off(cameras), tracks=tracks).refined(off(cameras)).spread
     found = adjusted_poses(frames, one, tracks=tracks)

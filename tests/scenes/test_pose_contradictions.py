@@ -179,7 +179,11 @@ def test_near_views_that_share_no_sparse_point_are_told() -> None:
 
 @pytest.mark.data
 @pytest.mark.parametrize(
-    "name", ["fox_colmap", "fern_colmap", "sceaux_colmap", "sevenscenes_reg", "sevenscenes_clip"]
+    "name",
+    [
+        *("fox_colmap", "fern_colmap", "sceaux_colmap"),
+        *(pytest.param(f"sevenscenes_{part}", marks=pytest.mark.slow) for part in ("reg", "clip")),
+    ],
 )
 def test_real_scenes_raise_no_false_alarm(shared: Path, name: str) -> None:
     assert contradiction_messages(open_project(shared / "data" / name)) == []

@@ -60,6 +60,7 @@ def test_pixels_and_cameras_are_those_of_the_scenes(folder):
     assert seen == [(s, view) for s in collection.names for view in collection.read(s).names]
 
 
+@pytest.mark.slow  # torch waits 5 s for workers that webdataset has kept
 def test_two_workers_see_every_sample_once(folder):
     data = wds.WebDataset(tars(folder), shardshuffle=False, workersplitter=wds.split_by_worker)
     loader = torch.utils.data.DataLoader(data.map(place), batch_size=None, num_workers=2)
