@@ -92,24 +92,7 @@ def read_poses(path: str | Path, *, layout: str = "auto", lost: bool = False) ->
             f"{path}: all {len(rows)} poses hold NaN or infinity; expected finite ones"
         )
     rows = kept
-    poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    stamps = np.empty(len(rows))
-    for i, (number, words) in enumerate(rows):
-        where = f"{path}:{number}"
-        if form.columns is None:
-            stamps[i], poses[i] = _matrix(words, len(rows[0][1]), where=where)
-        else:
-            if len(words) > max(form.columns) and (len(words) == 8 or form.more):
-                words = [words[column] for column in form.columns]
-            values = _numbers(words, 8, where=where)
-            poses[i, :3, :3] = _rotation(values[4:], where=where)
-            stamps[i], poses[i, :3, 3] = values[0], values[1:4]
-        try:
-            nearest, defect = rigid_transform(poses[i], what=where)
-        except ShapeError as error:
-            raise ProjectError(str(error)) from None
-        if defect > ROTATION_ROUNDING:
-            poses[i] = nearest
+    stamps, poses = _read(rows, form.columns, more=form.more, path=path)
     if form.columns is None and len(rows[0][1]) % 4 == 0:
         return Trajectory(poses)
     unit = form.unit or unit_of(stamps)
@@ -328,6 +311,41 @@ def _head(line: str) -> tuple[tuple[int, ...], str] | None:
     return (tuple(found[key] for key in keys), unit) if set(keys) <= set(found) else None
 
 
+def _read(
+    rows: list[tuple[int, list[str]]], columns: tuple[int, ...] | None, *, more: bool, path: Path
+) -> tuple[Float64, Float64]:
+    """Stamps, and (N, 4, 4) poses."""
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    stamps = np.empty(len(rows))
+    if columns is None:
+        for i, (number, words) in enumerate(rows):
+            where = f"{path}:{number}"
+            stamps[i], poses[i] = _matrix(words, len(rows[0][1]), where=where)
+            try:
+                nearest, defect = rigid_transform(poses[i], what=where)
+            except ShapeError as error:
+                raise ProjectError(str(error)) from None
+            if defect > ROTATION_ROUNDING:
+                poses[i] = nearest
+        return stamps, poses
+    values = np.empty((len(rows), 8))
+    for i, (number, words) in enumerate(rows):
+        if len(words) > max(columns) and (len(words) == 8 or more):
+            words = [words[column] for column in columns]
+        values[i] = _numbers(words, 8, where=f"{path}:{number}")
+    norms = np.linalg.norm(values[:, 4:], axis=1)
+    if (wrong := np.flatnonzero(np.abs(norms - 1) > QUATERNION_TOLERANCE)).size:
+        raise ProjectError(
+            f"{path}:{rows[wrong[0]][0]}: a quaternion of length {norms[wrong[0]]:.6g}; expected 1 "
+            "(order qx qy qz qw)"
+        )
+    from scipy.spatial.transform import Rotation
+
+    poses[:, :3, :3] = Rotation.from_quat(values[:, 4:]).as_matrix()
+    poses[:, :3, 3] = values[:, 1:4]
+    return values[:, 0], poses
+
+
 def _matrix(words: list[str], count: int, *, where: str) -> tuple[float, Float64]:
     """What stands in front, and the (4, 4) matrix of 12 or 16 numbers."""
     if count not in MATRICES:
@@ -351,18 +369,6 @@ def _numbers(words: list[str], count: int, *, where: str) -> Float64:
     if not np.isfinite(values).all():
         raise ProjectError(f"{where}: NaN or infinity; remove the line or mend it")
     return values
-
-
-def _rotation(quaternion: Float64, *, where: str) -> Float64:
-    """The rotation of a quaternion (x, y, z, w) of about unit length."""
-    from scipy.spatial.transform import Rotation
-
-    norm = float(np.linalg.norm(quaternion))
-    if abs(norm - 1) > QUATERNION_TOLERANCE:
-        raise ProjectError(
-            f"{where}: a quaternion of length {norm:.6g}; expected 1 (order qx qy qz qw)"
-        )
-    return np.asarray(Rotation.from_quat(quaternion).as_matrix())
 
 
 def _with_intrinsics(poses: Float64, like: Cameras, names: list[str], *, path: Path) -> Cameras:
