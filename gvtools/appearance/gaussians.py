@@ -86,7 +86,7 @@ class Gaussians:
         not their logarithms as ``values`` and splat files do. ``rot`` are quaternions w, x, y, z,
         ``opacity`` is before the sigmoid, ``f_dc`` and ``f_rest`` are spherical harmonics.
         """
-        import open3d as o3d
+        from gvtools.o3d import o3d
 
         tensor = o3d.core.Tensor.from_numpy(self.values)
         cloud = o3d.t.geometry.PointCloud()

@@ -84,7 +84,7 @@ def pixels_with_depth(
 
 def _sizes(positions: NDArray[np.float64]) -> NDArray[np.float64]:
     """(N,) root mean squared distance to the nearest neighbours, scene units."""
-    import open3d as o3d
+    from gvtools.o3d import o3d
 
     points = o3d.core.Tensor(np.ascontiguousarray(positions - positions.mean(axis=0)))
     search = o3d.core.nns.NearestNeighborSearch(points)

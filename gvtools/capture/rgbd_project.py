@@ -120,7 +120,7 @@ def unpack_bag(bag: Path, folder: Path) -> float:
     The recording has one colour and one depth stream of the same rate; depth is registered to
     colour.
     """
-    import open3d as o3d
+    from gvtools.o3d import o3d
 
     if not hasattr(o3d.t.io, "RSBagReader"):
         raise ProjectError(

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 def read_point_cloud(path: Path) -> o3d.t.geometry.PointCloud:
     """A binary PLY as a point cloud in its own frame, read strictly."""
-    import open3d as o3d
+    from gvtools.o3d import o3d
 
     vertices = read_ply(path)
     names = vertices.dtype.names or ()

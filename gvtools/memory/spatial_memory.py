@@ -388,7 +388,7 @@ def to_uint8(colors: NDArray[Any], name: str) -> NDArray[np.uint8]:
 
 def _neighbour_distance(positions: NDArray[np.float64]) -> float:
     """The median distance of points to their nearest other, scene units; 0 without two."""
-    import open3d as o3d
+    from gvtools.o3d import o3d
 
     if len(positions) < 2:
         return 0.0

@@ -168,7 +168,7 @@ def first_poses(views: Sequence[int], pairs: Sequence[Pair]) -> dict[int, Float6
 
 def optimise(start: dict[int, Float64], pairs: Sequence[Pair]) -> dict[int, Float64]:
     """``world_from_cam`` by view that agree with all pairs best; the first view stays in place."""
-    import open3d as o3d
+    from gvtools.o3d import o3d
 
     registration = o3d.pipelines.registration
     graph = registration.PoseGraph()

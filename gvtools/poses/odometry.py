@@ -135,7 +135,8 @@ class RgbdFrames:
 
     def _load(self, index: int) -> SmallFrame:
         import cv2
-        import open3d as o3d
+
+        from gvtools.o3d import o3d
 
         frame = self.scene.views[index].load()
         assert frame.depth is not None
@@ -179,7 +180,7 @@ class RgbdFrames:
 
 def compare(frames: RgbdFrames, source: int, target: int, *, start: Float64) -> Pair | None:
     """The relative pose of two frames, from an initial ``target_from_source``; None if unlike."""
-    import open3d as o3d
+    from gvtools.o3d import o3d
 
     first, second = frames[source], frames[target]
     method = o3d.t.pipelines.odometry.Method
@@ -211,7 +212,7 @@ def _odometry(
     first: SmallFrame, second: SmallFrame, K: Float64, *, start: Float64, method: Any, reach: float
 ) -> Float64 | None:
     """(4, 4) ``second_from_first``, metres; None if odometry fails."""
-    import open3d as o3d
+    from gvtools.o3d import o3d
 
     odometry = o3d.t.pipelines.odometry
     try:
@@ -333,7 +334,7 @@ def register(
     Both images have this size and intrinsics (the first pixel's centre is (0.5, 0.5)), and depth
     scaled to TYPICAL_DEPTH.
     """
-    import open3d as o3d
+    from gvtools.o3d import o3d
 
     odometry = o3d.pipelines.odometry
     # Open3D counts pixels from the first one's centre.

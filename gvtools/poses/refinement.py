@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-import open3d as o3d
 import torch
 from kornia.filters import gaussian_blur2d
 from numpy.typing import NDArray
 
+from gvtools.o3d import o3d
 from gvtools.poses.motions import (
     Pair,
     mean_near,

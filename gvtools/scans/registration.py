@@ -333,7 +333,7 @@ class _Task:
         scaled: bool = True,
     ) -> Float64:
         """After ICP, with scale or without, at ever smaller correspondence distances."""
-        import open3d as o3d
+        from gvtools.o3d import o3d
 
         registration = o3d.pipelines.registration
         method = registration.TransformationEstimationPointToPoint(with_scaling=scaled)
@@ -393,7 +393,7 @@ def unevenness(surface: Surface) -> float:
     >>> round(unevenness(Surface(np.stack([u, v, 0 * u], axis=1))), 3)
     0.0
     """
-    import open3d as o3d
+    from gvtools.o3d import o3d
 
     rng = np.random.default_rng(0)
     positions = subsample(surface, rng).positions
@@ -414,7 +414,7 @@ class SurfaceFeatures:
     """
 
     def __init__(self, surface: Surface, cell: float, *, outward: bool) -> None:
-        import open3d as o3d
+        from gvtools.o3d import o3d
 
         whole = cloud_of(surface.positions)
         if surface.seen_from is not None:
@@ -442,7 +442,7 @@ class SurfaceFeatures:
 
     def matches(self, other: SurfaceFeatures) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Rows of points whose features are each other's nearest."""
-        import open3d as o3d
+        from gvtools.o3d import o3d
 
         if self._features is None or other._features is None:
             return np.zeros(0, np.int64), np.zeros(0, np.int64)
@@ -492,6 +492,6 @@ def rows_of(surface: Surface, most: int, rng: np.random.Generator) -> NDArray[np
 
 def cloud_of(positions: Float64) -> o3d.geometry.PointCloud:
     """(N, 3) positions as a cloud of Open3D."""
-    import open3d as o3d
+    from gvtools.o3d import o3d
 
     return o3d.geometry.PointCloud(o3d.utility.Vector3dVector(positions))

@@ -29,10 +29,10 @@ def unit_findings(scene: Scene) -> list[Finding]:
     compared = []
     for pair in pairs:
         a, b = (scene.views[numbers[place]] for place in pair)
-        maps = depth_of(a), depth_of(b)
-        if maps[0] is not None and maps[1] is not None:
-            if np.linalg.norm(a.camera.centers - b.camera.centers) > 0:
-                compared.append((maps[0], maps[1], (a.camera, b.camera)))
+        one, other = depth_of(a), depth_of(b)
+        moved = np.linalg.norm(a.camera.centers - b.camera.centers) > 0
+        if one is not None and other is not None and moved:
+            compared.append((one, other, (a.camera, b.camera)))
     count, (now,) = _agreeing(compared, np.ones(1))
     if not count or now > SHARE:  # no factor makes so much more agree
         return []

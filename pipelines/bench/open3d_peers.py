@@ -8,10 +8,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import open3d as o3d
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
+from gvtools.o3d import o3d
 
 BLOCK_SIDE = 16  # voxels, Open3D's default
 FAR = 1e3  # scene units; beyond every depth here

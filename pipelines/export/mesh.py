@@ -76,7 +76,7 @@ def tsdf_mesh(
 
     ``voxel`` is the edge, scene units; ``observed`` leaves out generated points and views.
     """
-    import open3d as o3d
+    from gvtools.o3d import o3d
 
     kind = o3d.core.float32
     blocks_held = _blocks(memory, BLOCK_SIDE * voxel)
@@ -126,7 +126,7 @@ def _blocks(memory: SpatialMemory, edge: float) -> int:
 
 def _ordered(mesh: o3d.t.geometry.TriangleMesh) -> o3d.t.geometry.TriangleMesh:
     """The mesh with vertices and triangles sorted: Open3D's threads give them in any order."""
-    import open3d as o3d
+    from gvtools.o3d import o3d
 
     positions, colors = mesh.vertex.positions.numpy(), mesh.vertex.colors.numpy()
     order = np.lexsort(positions.T)
@@ -181,7 +181,7 @@ def poisson_mesh(
     Normals are those of the nearest points, turned to the view that saw the point. ``voxel`` is
     the edge of the finest cells, scene units; ``observed`` leaves out what a completer made.
     """
-    import open3d as o3d
+    from gvtools.o3d import o3d
 
     chosen = ~memory.generated if observed else np.ones(len(memory), np.bool_)
     if not chosen.any():
@@ -300,7 +300,7 @@ def _photographs(source: ExportSource) -> Iterator[tuple[Cameras, NDArray[np.uin
 
 
 def _save_ply(triangles: Triangles, path: Path) -> None:
-    import open3d as o3d
+    from gvtools.o3d import o3d
 
     mesh = o3d.geometry.TriangleMesh(
         o3d.utility.Vector3dVector(triangles.vertices), o3d.utility.Vector3iVector(triangles.faces)
@@ -361,7 +361,7 @@ def _trimesh(
 
 def simplify(mesh: o3d.t.geometry.TriangleMesh, max_triangles: int) -> o3d.t.geometry.TriangleMesh:
     """The mesh with at most so many triangles; as it is where it has no more."""
-    import open3d as o3d
+    from gvtools.o3d import o3d
 
     if len(mesh.triangle.indices) <= max_triangles:
         return mesh

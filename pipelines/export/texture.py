@@ -194,9 +194,9 @@ def _add_photographs(
     ``sums`` (N, 4) holds the weighted sum of colours and the sum of weights.
     """
     import cv2
-    import open3d as o3d
 
     from gvtools.capture.photographs import sharpness
+    from gvtools.o3d import o3d
 
     rays = o3d.t.geometry.RaycastingScene()
     rays.add_triangles(

@@ -225,7 +225,7 @@ def _shown(splats: Splats) -> ShownGaussians:
 
 
 def _memory(path: Path, positions: NDArray[Any], colors: NDArray[Any] | None) -> SpatialMemory:
-    import open3d as o3d
+    from gvtools.o3d import o3d
 
     cloud = o3d.t.geometry.PointCloud()
     if colors is None:

@@ -52,7 +52,9 @@ def one_line(capsys: pytest.CaptureFixture[str], *parts: str) -> None:
     assert any(part in lines[0] for part in parts), lines[0]
 
 
-@pytest.mark.parametrize("spare", [40_000, *(pytest.param(at, marks=pytest.mark.slow) for at in (0, 300_000))])
+@pytest.mark.parametrize(
+    "spare", [40_000, *(pytest.param(at, marks=pytest.mark.slow) for at in (0, 300_000))]
+)
 def test_a_run_on_a_full_disk_goes_on_when_there_is_room(scan, run, tmp_path, capsys, spare):
     with mounted(tmp_path / "disk", "size=4m") as disk:
         full(disk, spare)

@@ -231,10 +231,21 @@ def test_a_termination_is_one_line_and_143(before):
     assert run.stderr.startswith("gvtools: terminated; ") and run.stderr.count("\n") == 1
 
 
-def test_pycolmap_is_imported_in_one_place():
+@pytest.mark.parametrize(("name", "place"), [("pycolmap", "colmap"), ("open3d as o3d", "o3d")])
+def test_what_is_set_up_at_its_import_is_imported_in_one_place(name, place):
+    """pycolmap's handlers of signals; Open3D's threads."""
     root = Path(gvtools.__file__).parents[1]
+    inside = re.compile(rf"^(    )*import {name}$", re.M)
     for package in ("gvtools", "pipelines", "viz"):
         for file in (root / package).rglob("*.py"):
-            text = file.read_text(encoding="utf-8").split("if TYPE_CHECKING:")[0]
-            if file != root / "gvtools" / "colmap.py":
-                assert not re.search(r"^\s*import pycolmap$", text, re.M), file
+            text = re.sub(
+                r"^if TYPE_CHECKING:\n(    .*\n|\n)*", "", file.read_text("utf-8"), flags=re.M
+            )
+            assert file == root / "gvtools" / f"{place}.py" or not inside.search(text), file
+
+
+def test_open3d_takes_as_many_threads_as_other_libraries():
+    code = "from gvtools.o3d import o3d; print(o3d.utility.get_max_threads())"
+    limited = {**os.environ, "OMP_NUM_THREADS": "1"}
+    run = subprocess.run([sys.executable, "-c", code], env=limited, capture_output=True, text=True)
+    assert run.stdout.split() == ["1"], run.stderr

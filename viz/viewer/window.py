@@ -44,7 +44,7 @@ class Open3dViewer:
         mode: str = "color",
         say: Callable[[str], None] = print,
     ) -> None:
-        import open3d as o3d
+        from gvtools.o3d import o3d
 
         self.run = run
         self.round = run.last_round if round is None else round
@@ -96,7 +96,7 @@ class Open3dViewer:
             view.set_front(turn @ (position - look_at))
             view.set_up(turn @ self.run.up())
             return
-        import open3d as o3d
+        from gvtools.o3d import o3d
 
         self._camera = number % len(self.run.cameras)
         shown = self.run.cameras[self._camera]
@@ -119,7 +119,7 @@ class Open3dViewer:
         self._refresh()
 
     def _fill(self) -> None:
-        import open3d as o3d
+        from gvtools.o3d import o3d
 
         memory, rows = self.run.memory, self._detail.rows
         if not len(self._rgb):

@@ -170,7 +170,7 @@ def project_open3d(
     Open3D multiplies depths by 1000 and cuts at 3 units unless told otherwise, and its pixel
     centres are integers; both are set here.
     """
-    import open3d as o3d
+    from gvtools.o3d import o3d
 
     if camera.K[0, 0, 1] != 0:
         raise OptionError(

@@ -67,7 +67,7 @@ class Columns:
     """
 
     def __init__(self, device: str = "cpu") -> None:
-        import open3d as o3d
+        from gvtools.o3d import o3d
 
         device = "cpu" if device.lower() in ("cpu", "cpu:0") else device
         kind = device.split(":")[0].lower()
@@ -81,7 +81,7 @@ class Columns:
         self._arrays: ColumnArrays | None = None
 
     def _empty(self, name: str, rows: int) -> o3d.core.Tensor:
-        import open3d as o3d
+        from gvtools.o3d import o3d
 
         dtype, width = LAYOUT[name]
         if self.device == "cpu":
@@ -144,7 +144,7 @@ class Columns:
 
     def to(self, device: str) -> Columns:
         """A copy of the rows in use on a device."""
-        import open3d as o3d
+        from gvtools.o3d import o3d
 
         other = Columns(device)
         other.count = self.count
@@ -159,7 +159,7 @@ class Columns:
 
     def with_colors(self, colors: NDArray[np.uint8]) -> Columns:
         """The rows in use with other colours (N, 3); the other columns are shared."""
-        import open3d as o3d
+        from gvtools.o3d import o3d
 
         other = Columns(self.device)
         other.count = self.count
@@ -170,7 +170,7 @@ class Columns:
 
     def cloud(self) -> o3d.t.geometry.PointCloud:
         """The rows in use as a point cloud in the store's own memory."""
-        import open3d as o3d
+        from gvtools.o3d import o3d
 
         cloud = o3d.t.geometry.PointCloud(o3d.core.Device(self.device))
         for name in ATTRIBUTES:
