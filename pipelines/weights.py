@@ -46,7 +46,7 @@ from gvtools.errors import CheckpointError, ProjectError
 from gvtools.evaluation.images import psnr
 from gvtools.files import folder_replaced_when_written, link_or_copy, make_folder, write_text
 from gvtools.networks.depth_anything.network import RELEASED, DepthAnything3, tied_norms
-from gvtools.networks.tensors import Shapes
+from gvtools.networks.tensors import Shapes, shapes_alone
 from gvtools.training.records import STAGES, read_log
 from gvtools.training.run import SETTINGS, WEIGHTS
 from gvtools.untrusted import open_picture, read_json, reading
@@ -90,7 +90,7 @@ def print_depth(console: Console) -> None:
         "depth of photographs, by one of the models of depth-anything (approximate sizes):"
     )
     for name, released in RELEASED.items():
-        with torch.device("meta"):
+        with shapes_alone():
             network = DepthAnything3(released.config)
         twice = {name for names in tied_norms("head.") for name in names[1:]}
         numbers = sum(p.numel() for name, p in network.named_parameters() if name not in twice)

@@ -1,5 +1,3 @@
-"""The structure of the code: imports without circles, short ways, sizes of rooms."""
-
 from __future__ import annotations
 
 import ast

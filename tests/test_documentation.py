@@ -1,5 +1,3 @@
-"""The README and the generated pages keep up with the code."""
-
 from __future__ import annotations
 
 import re
@@ -18,7 +16,6 @@ README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 @pytest.fixture(scope="module")
 def hooks() -> ModuleType:
-    """What MkDocs runs for each build."""
     pytest.importorskip("mkdocs")
     from importlib.util import module_from_spec, spec_from_file_location
 

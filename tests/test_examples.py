@@ -1,5 +1,3 @@
-"""The scripts in ``examples/`` run on a small room and leave what they promise."""
-
 from __future__ import annotations
 
 import re

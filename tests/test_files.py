@@ -1,5 +1,3 @@
-"""Folders are replaced as a whole or not at all."""
-
 from __future__ import annotations
 
 import os

@@ -1,5 +1,3 @@
-"""Kernels in threads, and sets of kernels compiled by other processes."""
-
 from __future__ import annotations
 
 import importlib

@@ -1,5 +1,3 @@
-"""Containers and the conda recipe, held against what they are made from."""
-
 from __future__ import annotations
 
 import configparser

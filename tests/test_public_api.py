@@ -1,5 +1,3 @@
-"""What ``import gvtools`` offers: lazily, all of it, with examples in the docstrings that run."""
-
 from __future__ import annotations
 
 import ast

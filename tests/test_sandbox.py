@@ -12,7 +12,6 @@ from gvtools.sandbox import Item, ReaderError, read_apart
 
 
 def reader(path: Path, *, how: str) -> Iterator[Item]:
-    """Two items, and what ``how`` says after them."""
     yield {}, {}
     for number in range(2):
         yield {"number": number}, {"values": np.arange(number + 1)}

@@ -1,5 +1,3 @@
-"""What a bare machine is told."""
-
 from __future__ import annotations
 
 import ctypes
@@ -21,7 +19,6 @@ ROOT = Path(__file__).resolve().parents[1]
 
 @pytest.fixture
 def bare(monkeypatch):
-    """A machine without libGL and libusb."""
     load = ctypes.CDLL
 
     def lacking(name: str, *words: Any, **options: Any) -> object:

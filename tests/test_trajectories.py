@@ -235,7 +235,6 @@ def test_keys_that_all_but_repeat_another_do_no_harm(gap, where):
 @pytest.mark.parametrize("noise", [0.0, 1e-17, 1e-14])
 @pytest.mark.parametrize("offset", [0.0, 5e6])
 def test_a_turn_on_the_spot_counts_though_centres_differ_by_rounding(noise, offset):
-    """Three keys turn in place, the fourth moves: all of them lie on the path."""
     centers = [(offset + x, 0, 0) for x in (0, noise, 2 * noise, 3 * noise, 1)]
     turns = [(0, angle, 0) for angle in (0, 0.5, 1, 1.5, 1.5)]
     path = interpolate(keys(centers, turns), 401)

@@ -1,5 +1,3 @@
-"""Guards of files that others made: what they refuse, and that sound files pass."""
-
 from __future__ import annotations
 
 import io

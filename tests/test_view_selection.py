@@ -1,5 +1,3 @@
-"""Nearest and covisible views: which stand near some cameras, and which see what they show."""
-
 from __future__ import annotations
 
 import numpy as np
@@ -11,7 +9,6 @@ from gvtools.view_selection import covisible_views, evenly_spread, in_view, near
 
 
 def looking(centre: tuple[float, float, float], angle: float, name: str) -> Cameras:
-    """A camera in a place, turned about y."""
     pose = np.eye(4)
     pose[:3, :3] = rotation((0, 1, 0), angle).T
     pose[:3, 3] = -pose[:3, :3] @ np.array(centre)
@@ -75,7 +72,6 @@ def test_from_one_place_the_nearest_view_is_the_one_that_looks_the_same_way(shif
 
 
 def wall(distance: float) -> np.ndarray:
-    """(30, 40) depth of a wall straight ahead."""
     return np.full((30, 40), distance, np.float32)
 
 

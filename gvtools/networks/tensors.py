@@ -8,17 +8,20 @@ tensor's own bytes are read.
 
 from __future__ import annotations
 
+import math
 import os
 import pickle
 import re
 import warnings
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
+from torch.overrides import TorchFunctionMode
 
 from gvtools.errors import CheckpointError
 from gvtools.untrusted import archive, named_file, parse_json, read_json, regular
@@ -88,6 +91,27 @@ class TensorFit:
         return f"of {self.expected} tensors " + "; ".join(problems)
 
 
+_DRAWS = (Tensor.uniform_, Tensor.normal_)
+
+
+class _NothingDrawn(TorchFunctionMode):
+    """Leaves out how new modules fill their tensors, which takes as long on the meta device."""
+
+    def __torch_function__(self, func: Any, types: Any, *given: Any) -> Any:
+        """``given``: positional and named arguments, where there are any."""
+        args, named = (*given, (), {})[:2]
+        if getattr(func, "__module__", None) == "torch.nn.init" or func in _DRAWS:
+            return args[0] if args else named["tensor"]
+        return func(*args, **(named or {}))
+
+
+@contextmanager
+def shapes_alone() -> Iterator[None]:
+    """Modules that are made within have names and shapes, on the meta device, and no numbers."""
+    with torch.device("meta"), _NothingDrawn():
+        yield
+
+
 def compare_tensors(stored: Mapping[str, Tensor], expected: Shapes) -> TensorFit:
     """Compare names, shapes and types."""
     found = shapes(stored)
@@ -155,8 +179,8 @@ def not_finite(tensors: Mapping[str, Tensor]) -> str | None:
     for name, tensor in tensors.items():
         # Both ends are NaN where any number is; one pass, and nothing of the tensor's size is made.
         if tensor.numel() and tensor.is_floating_point():
-            ends = torch.stack(torch.aminmax(tensor.detach()))
-            if not bool(torch.isfinite(ends).all()):
+            ends = torch.stack(torch.aminmax(tensor.detach())).tolist()
+            if not all(map(math.isfinite, ends)):
                 return name
     return None
 

@@ -83,7 +83,6 @@ def test_a_fit_to_what_inpaint_fills_is_inpaint(cases):
 
 
 def test_a_fit_finds_weights_that_differ_by_fill_and_distance(cases):
-    """Truth that is made with known weights is given back on another scene."""
     rng = np.random.default_rng(0)
     true = BlendCompleter(rng.uniform(0.1, 0.4, (len(FILLS), len(DISTANCES))))
     made = [

@@ -104,7 +104,6 @@ def test_the_truth_wins_every_figure(cases):
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory) -> Path:
-    """A micro model after a few steps of every stage."""
     out = tmp_path_factory.mktemp("training")
     torch.set_num_threads(1)
     steps = [f"{name}.optimizer.steps=2" for name in ("encoder", "denoiser", "reflow")]
@@ -224,7 +223,6 @@ def test_ablations_train_their_variants_and_test_them(weights, tmp_path):
 
 @pytest.mark.slow
 def test_a_scan_is_judged_by_tuned_weights_too(weights, shared, tmp_path):
-    """A real scan's few context views are enough to tune to."""
     scan, tuned = str(shared / "data" / "sevenscenes_reg"), str(tmp_path / "tuned")
     tune = ["train", "tune", "--scene", scan, "--context", "every:20", "--steps", "2", "--quiet"]
     assert run_command([*tune, "--init", str(weights / "reflow" / "weights"), "--out", tuned]) == 0

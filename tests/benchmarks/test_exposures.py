@@ -1,5 +1,3 @@
-"""Exposures of photographs: factors that were put in come out."""
-
 from __future__ import annotations
 
 from dataclasses import replace

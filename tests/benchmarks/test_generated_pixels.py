@@ -19,7 +19,6 @@ SHAPE = (2, 12, 16)
 def scored(
     *, color: float = 0.0, depth: float = 1.0, seed: int = 0, holes: bool = True
 ) -> GeneratedScore:
-    """Truth with a constant colour error and depth factor."""
     rng = np.random.default_rng(seed)
     rgb = rng.uniform(0.2, 0.8, (*SHAPE, 3)).astype(np.float32)
     lengths = rng.uniform(1, 4, SHAPE).astype(np.float32)
@@ -85,7 +84,6 @@ def test_gradient_energy_leaves_out_pairs_across_the_rim():
 
 
 def test_intervals_are_paired():
-    """Scenes of very different difficulty, one method a constant factor worse on each."""
     errors = np.geomspace(0.01, 0.3, 12)
     better = [scored(color=e, seed=i) for i, e in enumerate(errors)]
     worse = [scored(color=1.05 * e, seed=i) for i, e in enumerate(errors)]

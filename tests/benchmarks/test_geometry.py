@@ -1,5 +1,3 @@
-"""Figures of geometry: numbers of which the answer is known."""
-
 from __future__ import annotations
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""The table of a CUDA card, without one: its writer, its refusal, its parts on a posed device."""
-
 from __future__ import annotations
 
 import subprocess

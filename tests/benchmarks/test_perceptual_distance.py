@@ -48,7 +48,6 @@ def test_distances_are_ordered_as_people_see_them(network):
 
 
 def test_the_trained_classes_are_recognised(network):
-    """Conv weights in the right order and normalisation: features of a face differ from noise."""
     noise = np.random.default_rng(0).random((1, 128, 128, 3)).astype(np.float32)
     deepest = network.features(picture()[None])[-1]
     assert deepest.shape == (1, 512, 7, 7)

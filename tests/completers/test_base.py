@@ -38,8 +38,6 @@ class _PainterSettings(CompleterSettings):
 
 
 class _Painter(Completer):
-    """Paints holes grey, as far away as the farthest that is known."""
-
     name = "painter"
     settings_type = _PainterSettings
     made = 0
@@ -138,8 +136,6 @@ def test_a_completer_of_ones_own_serves_a_run_and_is_made_once(painter, tmp_path
 
 
 class _Careless(Completer):
-    """Returns what it was made with."""
-
     name = "careless"
 
     def __init__(self, outcome):

@@ -18,8 +18,6 @@ OWN = ScaleAlignment(ScaleStatus.CAMERA_CENTRES)
 
 
 class Recorder(Completer):
-    """Paints holes red, and keeps the names of the targets of each call."""
-
     name = "recorder"
     batches_targets = True
     costly = True

@@ -207,7 +207,6 @@ def test_what_stands_in_front_does_not_grow_into_a_hole_that_leaves_the_picture(
 
 
 def test_what_the_pictures_edge_cut_off_goes_on_a_little():
-    """Square and wall end at one straight line, as at the edge of a photograph."""
     _, seen, valid = _wall_with_square()
     valid[:, 70:] = False
     result = _fill(seen, valid)
@@ -288,7 +287,6 @@ def test_the_fill_stays_within_limits():
 
 
 def test_an_observed_rim_outweighs_a_generated_one():
-    """A hole with one wall on its left and right, and a nearer one above and below it."""
     window = np.s_[45:75, 65:95]
     inverse = np.full((HEIGHT, WIDTH), 0.3)
     inverse[45:75] = 0.25

@@ -29,7 +29,6 @@ def windows_of_two(values: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, 
 
 
 def between(values: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Bilinear, pixel by pixel."""
     found = np.zeros((len(values), *size))
     for i, j in np.ndindex(*size):
         places = []

@@ -1,5 +1,3 @@
-"""Every path that can run on CUDA, run on a device that is not there: see posed_cuda.py."""
-
 from __future__ import annotations
 
 import re

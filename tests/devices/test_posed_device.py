@@ -1,5 +1,3 @@
-"""The device that is not there refuses, rounds and moves as CUDA does."""
-
 from __future__ import annotations
 
 import copy

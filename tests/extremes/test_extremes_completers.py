@@ -25,7 +25,6 @@ SIZE = (24, 32)
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Micro models of both compositions."""
     place = tmp_path_factory.mktemp("models")
     fills = {"decoded": "push-pull", "correction": "surfaces"}
     return {
@@ -54,7 +53,6 @@ def complete(
 
 
 def flat(valid: np.ndarray, *, color: float = 0.4, depth: float = 3.0) -> Guidance:
-    """One view of one colour and depth where ``valid`` (H, W)."""
     plain = micro.guidance(1, size=valid.shape)
     known = valid[None]
     return replace(
@@ -68,7 +66,6 @@ def flat(valid: np.ndarray, *, color: float = 0.4, depth: float = 3.0) -> Guidan
 
 
 def check(made: Completion, known: Guidance) -> None:
-    """What any completion promises, whatever went in."""
     for values in (made.rgb, made.depth, made.confidence):
         assert np.isfinite(values).all()
     assert made.rgb.min() >= 0 and made.rgb.max() <= 1
@@ -208,7 +205,6 @@ def test_one_known_pixel_fills_everything_and_none_fills_nothing(dtype, size):
 
 
 def halves() -> tuple[torch.Tensor, torch.Tensor]:
-    """Pictures (1, 3, 16, 16) and the validity of their left half."""
     generator = torch.Generator().manual_seed(0)
     valid = torch.zeros(1, 1, 16, 16, dtype=torch.bool)
     valid[..., :8] = True

@@ -111,7 +111,6 @@ def wall(
     rgb: np.ndarray = TEXTURE,
     mask: np.ndarray | None = None,
 ) -> PosedPicture:
-    """A wall at ``depth``, seen from ``shift`` along x."""
     size = rgb.shape[:2]
     pose = np.eye(4)
     pose[0, 3] = -shift
@@ -154,7 +153,6 @@ def path(count: int = 9, *, unit: float = 1.0) -> np.ndarray:
 
 
 def turned(poses: np.ndarray, angle: float, axis: tuple[float, float, float]) -> np.ndarray:
-    """Every camera turned about an axis of the world, where it stands."""
     rotation = Rotation.from_rotvec(angle * np.array(axis) / np.linalg.norm(axis)).as_matrix()
     out = poses.copy()
     out[:, :3, :3] = rotation @ poses[:, :3, :3]

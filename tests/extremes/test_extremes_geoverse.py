@@ -38,7 +38,6 @@ SHAPE = (2, 3, 4, 5, 5)
 
 
 def states(dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-    """Clean latents and noise."""
     first, second = (
         seeded_noise(SHAPE, [[k, k + 1, k + 2], [k + 3, k + 4, k + 5]], dtype=dtype)
         for k in (0, 10)

@@ -1,5 +1,3 @@
-"""Confidence from nothing to the largest float32, a million fusions, and views from far away."""
-
 from __future__ import annotations
 
 import dataclasses
@@ -53,7 +51,6 @@ def test_any_positive_confidence_gives_the_colour_and_the_depth(confidence, back
 
 @pytest.mark.parametrize("column", ["confidence", "spacing"])
 def test_a_point_cloud_without_a_usable_point_is_refused(column, tmp_path):
-    """It gave a memory of nothing, and empty pictures."""
     memory = SpatialMemory(0.1)
     memory.fuse(points([(0, 0, 2), (1, 0, 2), (0, 1, 2)]), round=0)
     path = tmp_path / "cloud.ply"
@@ -153,7 +150,6 @@ def test_what_only_a_far_view_saw_is_neither_lost_nor_nan(depths, backend):
 
 
 def test_a_million_points_of_one_view_in_one_voxel():
-    """Summed in float64: the mean is that of numpy, and equal points stay what they are."""
     rng = np.random.default_rng(0)
     where = rng.uniform((0.1, 0.1, 2.1), (0.9, 0.9, 2.9), (MILLION, 3)).astype(np.float32)
     color = rng.integers(0, 256, (MILLION, 3)).astype(np.uint8)
@@ -215,7 +211,6 @@ WIDE = {"width": 224, "height": 16, "focal": 60}
 
 
 def _halves(near: float, far: float) -> np.ndarray:
-    """A near wall on the left of the picture, a far one on the right."""
     depth = np.full((WIDE["height"], WIDE["width"]), far, np.float32)
     depth[:, : WIDE["width"] // 2] = near
     return depth
@@ -292,7 +287,6 @@ def test_random_depths_look_as_float64_says(seed, decades):
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("degrees", [1e-2, 1.0, 60.0, 170.0])
 def test_a_wall_is_seen_again_through_any_lens(degrees, backend):
-    """Back-projected, fused and projected into the camera that saw it."""
     source = camera(**SIZE, focal=focal(degrees))
     spacing = 4 / focal(degrees)
     memory = SpatialMemory(spacing / 2)
@@ -332,7 +326,6 @@ def test_the_cosine_of_a_slant_holds_to_float32_depth(degrees, off):
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), scale=st.sampled_from([1e-6, 1.0, 1e6]))
 def test_points_at_and_behind_the_camera_plane_leave_the_wall_as_it_is(seed, scale, backend):
-    """Zero, tiny and negative depths, beside and at the centre of projection."""
     rng = np.random.default_rng(seed)
     z = rng.choice([0.0, -0.0, -1e-30, 1e-30, -1e-3, -50.0], 40)
     beside = rng.choice([0.0, 1e-9, 0.3, -2.0], (40, 2))
@@ -377,7 +370,6 @@ def _cells(memory: SpatialMemory) -> np.ndarray:
     steps=st.integers(1, 40),
 )
 def test_points_on_borders_belong_to_one_voxel_and_stay_there(edge, corner, steps):
-    """Multiples of the edge and their two neighbours in float32, on either side of zero."""
     on = (np.arange(steps)[:, None] + corner).astype(np.float64) * edge
     on = on.astype(np.float32)
     sides = [on, np.nextafter(on, np.float32(np.inf)), np.nextafter(on, np.float32(-np.inf))]
@@ -418,7 +410,6 @@ def test_averages_of_points_at_a_border_do_not_cross_it(edge, seed, tmp_path_fac
 @settings(max_examples=15, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_the_order_of_points_of_one_depth_is_no_matter(seed, backend):
-    """A wall of points at one depth with different colours, several to a pixel and to a voxel."""
     rng = np.random.default_rng(seed)
     count = 600
     where = np.concatenate([rng.uniform(-1, 1, (count, 2)), np.full((count, 1), 2.0)], 1)
@@ -474,7 +465,6 @@ def test_all_points_in_one_pixel(count, backend):
 @pytest.mark.parametrize("degrees", [1.0, 60.0, 170.0])
 @pytest.mark.parametrize("shift", [0.0, 0.5, 1e-3, 1 - 1e-3])
 def test_every_part_of_a_pixel_belongs_to_one_pixel(shift, degrees):
-    """A grid of one point a pixel fills the picture, wherever in the pixels the points fall."""
     f = focal(degrees)
     columns, rows = np.meshgrid(np.arange(SIZE["width"]), np.arange(SIZE["height"]))
     depth = 4.0

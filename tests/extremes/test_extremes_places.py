@@ -91,7 +91,6 @@ def test_a_point_is_held_to_half_a_step_of_float32_as_far_as_voxels_go(far):
 @pytest.mark.parametrize("end", [0, 1])
 @pytest.mark.parametrize("backend", ["cpu", "torch", "nearest"])
 def test_the_ends_of_the_range_of_voxels_hold(end, backend):
-    """A wall of pixels as wide as a voxel."""
     voxel = VOXEL_RANGE[end]
     source = camera(width=32, height=24, focal=4000)
     memory = SpatialMemory(voxel)
@@ -116,7 +115,6 @@ def test_an_origin_where_float64_is_coarser_than_voxels_is_refused():
 
 @pytest.mark.parametrize("scale", [1e-6, 1e-3, 1, 1e4])
 def test_a_ply_of_any_unit_keeps_its_points(scale, tmp_path):
-    """Whole scene units are no origin for a scene of a millionth of one."""
     rng = np.random.default_rng(0)
     offset = np.array((0.4, -12.3, 7.45))
     where = offset + scale * rng.uniform(-1, 1, (400, 3))
@@ -216,7 +214,6 @@ def test_inverting_twice_keeps_the_place(seed, power):
     ],
 )
 def test_cameras_without_a_picture_are_refused_in_a_line(name, entry, value, said):
-    """They gave an empty picture, or another library's error."""
     bad = replace(camera(**SIZE, focal=60), names=("cam7",))
     array = getattr(bad, name).copy()
     array[entry] = value

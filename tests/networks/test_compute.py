@@ -210,8 +210,6 @@ SIZE = (GRID[0] * micro.PATCH, GRID[1] * micro.PATCH)
 
 
 class Largest(TorchDispatchMode):
-    """The most numbers in a tensor that was created."""
-
     def __init__(self) -> None:
         super().__init__()
         self.count = 0

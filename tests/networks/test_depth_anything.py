@@ -259,7 +259,6 @@ def network(*, rays: bool) -> DepthAnything3:
 
 
 def scaled(batch: ViewBatch, factor: float, *, depth: bool = True) -> ViewBatch:
-    """The same views in another unit."""
     pose = batch.cam_from_world.clone()
     pose[..., :3, 3] *= factor
     return replace(batch, cam_from_world=pose, depth=batch.depth * (factor if depth else 1))

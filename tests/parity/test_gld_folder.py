@@ -1,5 +1,3 @@
-"""A folder of GLD's published files, in full size, with numbers by formula, sampled as GLD does."""
-
 from __future__ import annotations
 
 import zlib
@@ -37,7 +35,6 @@ def numbers(key: str, shape: tuple[int, ...]) -> torch.Tensor:
 
 
 def write_folder(folder: Path) -> None:
-    """Names and shapes of the key lists, in the publishers' layout."""
     for file, (keys, inside, start) in FILES.items():
         stored = {}
         for line in (ORACLE / "keys" / f"{keys}.txt").read_text(encoding="utf-8").splitlines():

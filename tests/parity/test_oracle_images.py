@@ -1,5 +1,3 @@
-"""PSNR and SSIM against scikit-image's and GLD's, on every image pair of the reference values."""
-
 from __future__ import annotations
 
 from typing import Any

@@ -32,7 +32,6 @@ BY_CASE: set[str] = set()
 
 
 def names(start: str) -> list[str]:
-    """The fixtures with such names."""
     CLAIMED.add(start)
     return [name for name in FIXTURES if name.startswith(start)]
 
@@ -50,14 +49,12 @@ def cases(*starts: str) -> list[tuple[str, int]]:
 
 @functools.lru_cache(maxsize=1)
 def depth_anything(name: str) -> tuple[Fixture, DepthAnything3]:
-    """A fixture and its network, kept for its other cases."""
     fixture = Fixture(ORACLE / name)
     return fixture, oracle_depth_anything_cases.network(fixture)
 
 
 @functools.lru_cache(maxsize=1)
 def fixture_of(name: str) -> Fixture:
-    """A fixture, kept for its other cases."""
     return Fixture(ORACLE / name)
 
 
@@ -155,7 +152,6 @@ def test_every_stored_output_belongs_to_a_case_that_is_run(name: str) -> None:
 
 
 def key_list(path: Path) -> dict[str, tuple[int, ...]]:
-    """Name and shape of every line of a key list."""
     found = {}
     for line in path.read_text(encoding="utf-8").splitlines():
         name, shape = line.split("\t")[:2]
@@ -164,7 +160,6 @@ def key_list(path: Path) -> dict[str, tuple[int, ...]]:
 
 
 def small() -> DepthAnythingConfig:
-    """Depth Anything 3 Small."""
     return DepthAnythingConfig(*oracle_depth_anything_cases.SIZES["small"])
 
 

@@ -1,5 +1,3 @@
-"""Pose errors against evo's, on every trajectory of the reference values."""
-
 from __future__ import annotations
 
 from pathlib import Path

@@ -39,12 +39,10 @@ def scene(sample: WrittenSample) -> Scene:
 
 @pytest.fixture(scope="module")
 def twin(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    """The same room without noise."""
     return open_project(write_room(tmp_path_factory.mktemp("room") / "room", seed=0, **SIZE).folder)
 
 
 def wall(z: float, *, albedo: float = 0.8, glossy: bool = False, size: int = 240) -> SensorView:
-    """A wall across the view, at one depth."""
     shape = (size, size)
     camera = Cameras.pinhole(size, size, focal=400.0)
     return SensorView(

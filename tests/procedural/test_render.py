@@ -27,7 +27,6 @@ def _rays(cameras: Cameras, view: int) -> np.ndarray:
 
 
 def _white(look: Look, **changes) -> Look:
-    """Every surface white and dark but for the light that is given."""
     black = {
         "texels": np.ones_like(look.texels),
         "gain": np.ones_like(look.gain),

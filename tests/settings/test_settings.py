@@ -1,5 +1,3 @@
-"""The one parser of settings, on a run's, and what it prints of them."""
-
 from __future__ import annotations
 
 import json

@@ -1,5 +1,3 @@
-"""Sources of samples: their mixture, recorded scenes, pools, and trainings that draw from them."""
-
 from __future__ import annotations
 
 import json
@@ -114,7 +112,6 @@ PARTS = [range(4 * i, 4 * i + 4) for i in range(4)]
 
 @pytest.fixture(scope="module")
 def home(tmp_path_factory) -> Path:
-    """A project, a download of 7-Scenes with two sequences, and shards of it."""
     home = tmp_path_factory.mktemp("home")
     write_scan(home / "kitchen", views=8)
     for name in ("chess/seq-01", "fire/seq-02"):
@@ -285,7 +282,6 @@ def test_other_shards_are_refused_when_a_training_goes_on(home, tmp_path, capsys
 
 @pytest.mark.slow
 def test_two_processes_count_together(home, tmp_path, capsys):
-    """Each its own samples, with the totals of one process."""
     more = ("--set", "data.workers=1", "--quiet")
     assert train(tmp_path / "one", home, *more) == 0
     on_two(*words(tmp_path / "two", home), *more)
@@ -316,8 +312,6 @@ PAPER = {
 
 
 class Numbered:
-    """Samples that are nothing but their number and attempt; some are invalid."""
-
     def __init__(self, name: str = "", invalid=lambda index, attempt: None) -> None:
         self.name, self.invalid = name, invalid
 

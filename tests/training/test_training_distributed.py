@@ -1,5 +1,3 @@
-"""``gvtools train`` on two processes: what one process would do, and the end of their group."""
-
 from __future__ import annotations
 
 import json
@@ -82,7 +80,6 @@ def same_gradients(found: Path, wanted: Path, most: float) -> None:
 
 
 def model_of(config: GeoVerseConfig) -> GeoVerse:
-    """A model in which nothing is zero, so that every parameter that is trained has a gradient."""
     torch.manual_seed(5)
     model = GeoVerse(config)
     for parameter in model.parameters():
@@ -93,7 +90,6 @@ def model_of(config: GeoVerseConfig) -> GeoVerse:
 
 @pytest.fixture(scope="module")
 def start(tmp_path_factory) -> Path:
-    """Weights that every training here starts from."""
     folder = tmp_path_factory.mktemp("start")
     save_pretrained(model_of(read(SHIPPED / "micro_model.json")), folder)
     return folder
@@ -101,7 +97,6 @@ def start(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def one(start, tmp_path_factory) -> Path:
-    """What one process comes to."""
     out = tmp_path_factory.mktemp("one")
     more = ["--init", str(start), "--sheets", str(STEPS), *LARGE, *PARTS, "--quiet"]
     assert main(arguments("micro", "denoiser", out, *more)) == 0
@@ -110,7 +105,6 @@ def one(start, tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def two(start, tmp_path_factory) -> tuple[Path, str]:
-    """What two processes come to, and what they say."""
     out = tmp_path_factory.mktemp("two")
     more = ["--init", str(start), "--sheets", str(STEPS), *LARGE, *PARTS, *SHARDED]
     return out / "denoiser", train_on_two("micro", "denoiser", out, *more)
@@ -191,7 +185,6 @@ def test_the_encoders_stage_is_shared_out_as_well(tmp_path):
 
 
 def test_teacher_and_video_prior_are_shared_out_as_well(tmp_path):
-    """All stages of a model with the video prior, in one call."""
     pytest.importorskip("diffusers", reason="the extra wan is not installed")
     import published_folder
     import tiny_wan

@@ -1,5 +1,3 @@
-"""``gvtools train --init``: GLD's published files as a start, and the training of ``base``."""
-
 from __future__ import annotations
 
 import json
@@ -29,7 +27,6 @@ STAGES = ("encoder", "denoiser", "reflow")
 
 
 def small_base() -> GeoVerseConfig:
-    """The conventions of ``base`` with the sizes of ``micro``, and without the video prior."""
     base, micro = named("base"), read(SHIPPED / "micro_model.json")
     return replace(
         base,
@@ -46,7 +43,6 @@ def small_base() -> GeoVerseConfig:
 
 
 def random_model(config: GeoVerseConfig) -> GeoVerse:
-    """A model none of whose parameters is left at zero."""
     torch.manual_seed(3)
     model = GeoVerse(config)
     for parameter in model.parameters():
@@ -60,14 +56,12 @@ def random_model(config: GeoVerseConfig) -> GeoVerse:
 
 @pytest.fixture(scope="module")
 def gld() -> GeoVerse:
-    """What GLD has: no projected depth."""
     config = small_base()
     return random_model(replace(config, level1=replace(config.level1, depth_condition=False)))
 
 
 @pytest.fixture(scope="module")
 def published(gld, tmp_path_factory) -> Path:
-    """A folder as it is downloaded."""
     folder = write_published(gld, tmp_path_factory.mktemp("gld"))
     (folder / "config.json").unlink()
     return folder
@@ -75,7 +69,6 @@ def published(gld, tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def training(tmp_path_factory) -> str:
-    """A training's file, its model's beside it."""
     folder = tmp_path_factory.mktemp("config")
     (folder / "model.json").write_text(json.dumps(to_json(small_base())))
     data = json.loads((SHIPPED / "micro.json").read_text())
@@ -93,7 +86,6 @@ def train(training: str, out: Path, stage: str, *more: str) -> int:
 
 
 def unseen_targets(training: str) -> ViewBatch:
-    """Real cameras and context views; nothing is projected into the targets."""
     config, folder = shipped_or_read(training)
     views = TrainingSamples(config, config.network(folder)).aside(0, 2).views
     shown = torch.zeros_like(views.valid)
@@ -104,7 +96,6 @@ def unseen_targets(training: str) -> ViewBatch:
 
 @torch.no_grad()
 def gld_velocity(gld: GeoVerse, batch: ViewBatch, state: Tensor, t: Tensor) -> Tensor:
-    """As GLD calls its denoiser: the context's own latents, zeros on the targets."""
     context, statistics = batch.context, gld.level_statistics[1]
     level = gld.geometry.encode(batch.images[:, :context], levels=2)[1]
     clean = statistics.normalise(level[:, :, 1:].transpose(2, 3).unflatten(3, state.shape[-2:]))

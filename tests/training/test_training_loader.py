@@ -26,7 +26,6 @@ def _equal(a: TrainingBatch, b: TrainingBatch) -> bool:
 
 @pytest.mark.slow
 def test_workers_make_the_same_batches() -> None:
-    """Two workers, one that begins later, and none: the same bytes."""
     parts = [range(4 * i, 4 * i + 4) for i in range(3)]
     plain = list(batches(DATA, parts, workers=0))
     before = torch.get_rng_state()
@@ -39,8 +38,6 @@ def test_workers_make_the_same_batches() -> None:
 
 
 class Refusing:
-    """A data set without samples."""
-
     def sample(self, index):
         raise DegenerateError(f"sample {index} cannot be drawn")
 

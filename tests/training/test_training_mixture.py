@@ -1,5 +1,3 @@
-"""The paper's mixture: its file is what the specs say, and a folder of downloads is told apart."""
-
 from __future__ import annotations
 
 import json

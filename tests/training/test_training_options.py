@@ -1,5 +1,3 @@
-"""Settings of training, and its log."""
-
 from __future__ import annotations
 
 import json

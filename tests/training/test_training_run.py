@@ -1,5 +1,3 @@
-"""``gvtools train`` on the micro configuration: it learns, goes on, and runs on two processes."""
-
 from __future__ import annotations
 
 import contextlib
@@ -57,7 +55,6 @@ COUNTS = {"encoder": 10, "denoiser": 6, "reflow": 3, "heads": 4, "refiner": 3}
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory) -> Path:
-    """All stages, a few steps each."""
     out = tmp_path_factory.mktemp("training")
     torch.set_num_threads(1)
     for stage, count in COUNTS.items():
@@ -137,7 +134,6 @@ def test_a_head_of_weight_0_stays_as_it_is(trained, tmp_path):
 
 @pytest.mark.slow
 def test_heads_lower_the_error_of_what_inference_composes(trained, tmp_path):
-    """Over many steps on the same few samples."""
     shutil.copytree(trained / "reflow", tmp_path / "reflow")
     more = ["--set", "heads.ray=0", "--set", "data.pool=8", *steps("heads", 30)]
     more += ["--set", "heads.optimizer.batch=8"]
@@ -175,7 +171,6 @@ def test_a_later_stage_resumes_exactly_as_well(trained, tmp_path, before, stage)
 
 @pytest.mark.slow
 def test_a_killed_training_goes_on_to_the_uninterrupted_one(tmp_path):
-    """Killed in the middle of whatever it does after its first state."""
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
 
     def started(out: str, *more: str) -> subprocess.Popen[bytes]:
@@ -308,7 +303,6 @@ def test_bad_batches_are_skipped_and_counted(tmp_path):
 
 @pytest.mark.slow
 def test_two_processes_see_what_one_would(tmp_path):
-    """The same global batch on two CPU processes gives the same curve."""
     arguments = ["train", "micro", "--stage", "encoder", *SHORT, *steps("encoder", 4)]
     arguments += ["--set", "encoder.statistics=1"]
     assert main([*arguments, "--out", str(tmp_path / "one")]) == 0

@@ -1,5 +1,3 @@
-"""Losses of the stages: the floor of a clean prediction's velocity, and the refiner."""
-
 from __future__ import annotations
 
 from dataclasses import replace

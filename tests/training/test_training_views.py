@@ -1,5 +1,3 @@
-"""Samples of procedural scenes and of windows of recorded ones, and their faults."""
-
 from __future__ import annotations
 
 import pickle
@@ -60,7 +58,6 @@ def _equal(a: TrainingSample, b: TrainingSample) -> bool:
 
 
 def _legacy_state() -> np.ndarray:
-    """Of numpy's global generator."""
     state = np.random.get_state(legacy=True)
     assert isinstance(state, tuple)
     return np.array(state[1])
@@ -265,8 +262,6 @@ TALL, WIDE = 96, 128
 
 
 class Loaded:
-    """Pixels that are there already."""
-
     def __init__(self, frame: Frame) -> None:
         self.frame = frame
 
@@ -321,7 +316,6 @@ def test_samples_follow_from_their_number() -> None:
 
 
 def test_cropped_cameras_fit_their_pictures() -> None:
-    """Hints of cropped and reduced views lie where their truth is."""
     errors, cover = [], []
     for index in range(6):
         sample = _views().sample(index)

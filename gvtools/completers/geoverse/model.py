@@ -48,7 +48,7 @@ from gvtools.errors import CheckpointError, GvError, ShapeError
 from gvtools.networks.compute import hold_in, on_device
 from gvtools.networks.depth_anything.geometry_head import ViewGeometry
 from gvtools.networks.depth_anything.network import DepthAnything3
-from gvtools.networks.tensors import first_line
+from gvtools.networks.tensors import first_line, shapes_alone
 
 # Stages of a pass, which a model's ``clock`` is called with.
 HINTS = "hint encoding"
@@ -496,7 +496,7 @@ class GeoVerse(nn.Module):
 def empty_model(config: GeoVerseConfig, *, where: object) -> GeoVerse:
     """The model on the meta device: names and shapes, no numbers, no memory."""
     try:
-        with torch.device("meta"):
+        with shapes_alone():
             return GeoVerse(config)
     except GvError:
         raise

@@ -25,7 +25,7 @@ from torch import Tensor, nn
 
 from gvtools.errors import CheckpointError
 from gvtools.networks.compute import constant, on_device
-from gvtools.networks.tensors import Shapes, TensorFiles, check_fit, shapes
+from gvtools.networks.tensors import Shapes, TensorFiles, check_fit, shapes, shapes_alone
 from gvtools.untrusted import read_json
 
 # Pictures that the VAE encodes at once on a GPU: a pass of base still fits a card of 24 GB.
@@ -276,7 +276,7 @@ def empty_network(component: str, config: Mapping[str, Any]) -> nn.Module:
     """A network of a diffusers config, on the meta device: shapes, no numbers, no memory."""
     kind = network_class(component)
     try:
-        with torch.device("meta"):
+        with shapes_alone():
             network: nn.Module = kind.from_config(dict(config))
     except Exception as error:
         raise CheckpointError(

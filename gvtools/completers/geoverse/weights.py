@@ -39,6 +39,7 @@ from gvtools.networks.tensors import (
     read_pickled,
     read_tensors,
     save_tensors,
+    shapes_alone,
     share_tied,
 )
 
@@ -187,10 +188,11 @@ def parts_of(config: GeoVerseConfig) -> tuple[Part, ...]:
 
 def expected_of(module: nn.Module, part: Part) -> dict[str, tuple[int, ...]]:
     """What a part's file has to hold for a (meta) ``GeoVerse``: its module without extensions."""
+    own = module.get_submodule(part.module.removesuffix("."))
     return {
-        name.removeprefix(part.module): tuple(tensor.shape)
-        for name, tensor in module.state_dict().items()
-        if name.startswith(part.module) and (part is WHOLE or not is_extension(name))
+        name: tuple(tensor.shape)
+        for name, tensor in own.state_dict().items()
+        if part is WHOLE or not is_extension(part.module + name)
     }
 
 
@@ -578,7 +580,7 @@ def fresh_extension(model: GeoVerse, loaded: Mapping[str, Tensor]) -> dict[str, 
 
 
 def _published_level1(model: GeoVerse, loaded: Mapping[str, Tensor]) -> Denoiser:
-    with torch.device("meta"):
+    with shapes_alone():
         denoiser = Denoiser(replace(model.config.level1, depth_condition=False))
     tensors = {
         name.removeprefix("level1."): tensor

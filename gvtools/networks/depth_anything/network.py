@@ -29,7 +29,14 @@ from gvtools.networks.depth_anything.geometry_head import (
     GeometryHeadConfig,
     ViewGeometry,
 )
-from gvtools.networks.tensors import TensorFiles, load, not_finite, read_tensors, share_tied
+from gvtools.networks.tensors import (
+    TensorFiles,
+    load,
+    not_finite,
+    read_tensors,
+    shapes_alone,
+    share_tied,
+)
 from gvtools.untrusted import read_json
 
 
@@ -223,7 +230,7 @@ def load_depth_anything(
                 "(768) or Large (1024)"
             )
         config = by_width[width]
-    with torch.device("meta"):
+    with shapes_alone():
         network = DepthAnything3(config)
     bad = not_finite(tensors)
     if bad is not None:

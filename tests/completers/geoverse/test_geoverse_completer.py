@@ -57,7 +57,6 @@ def statuses(result: Completion) -> list[ScaleStatus]:
 
 
 def watched(monkeypatch: pytest.MonkeyPatch) -> list[tuple[ViewBatch, Any, Generated]]:
-    """Batches, names and results of the passes to come."""
     seen: list[tuple[ViewBatch, Any, Generated]] = []
     generate = GeoVerse.generate
 
@@ -281,7 +280,6 @@ def test_a_pass_that_went_wrong_leaves_holes_and_says_so(weights, monkeypatch):
 
 @pytest.mark.filterwarnings("error")
 def test_without_any_support_for_a_scale_there_is_no_depth(weights, monkeypatch):
-    """The requested cameras' rays stand where the predicted ones have no unit."""
     monkeypatch.setattr(
         "gvtools.completers.geoverse.composition.pass_scale",
         lambda *a, **k: PassScale(float("nan"), ScaleStatus.UNSUPPORTED),
@@ -470,7 +468,6 @@ def weights(tmp_path_factory) -> Path:
 
 
 def reconstruct(scan: Path, weights: Path, out: Path, *words: str) -> int:
-    """Exit status of the command."""
     given = ("--completer", "geoverse", "--set", f"completer.weights={weights}", "--quiet")
     return main(
         ["reconstruct", str(scan), "--refine", "0", "--out", str(out), *OPTIONS, *given, *words]

@@ -73,7 +73,6 @@ def test_a_change_of_everything_is_none_and_one_of_the_hole_is_whole():
 
 
 def test_every_depth_correction_has_a_gradient_while_training():
-    """The one that does not exist yet, too, and the one that is far off."""
     batch = micro.batch(1)
     batch = replace(batch, depth=torch.full_like(batch.depth, 2.0))
     shape = (1, batch.images.shape[1] - batch.context, *batch.images.shape[-2:])

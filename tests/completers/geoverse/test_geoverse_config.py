@@ -116,7 +116,6 @@ STATED: tuple[tuple[str, str, str, Any], ...] = (
 
 
 def columns(title: str) -> dict[str, list[str]]:
-    """The cells of a section's table by the first one."""
     section = TABLE.read_text(encoding="utf-8").split(f"## {title}\n")[1].split("\n## ")[0]
     rows = [line.strip("| ").split(" | ") for line in section.splitlines() if line[:3] == "| `"]
     return {row[0].strip("`"): row[1:] for row in rows}

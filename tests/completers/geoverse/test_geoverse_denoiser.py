@@ -25,7 +25,6 @@ LAYERS = micro.LAYERS
 
 
 def extended(base: Denoiser) -> Any:
-    """The same weights with a fresh depth embedder."""
     fresh = Denoiser(micro.DENOISER).eval()
     missing = fresh.load_state_dict(base.state_dict(), strict=False)
     assert not missing.unexpected_keys
@@ -47,7 +46,6 @@ def shared_attention(*, gated: bool = True) -> SharedAttention:
 
 
 def extensions(net: Denoiser, x: Tensor, t: Tensor, known: Conditions) -> dict[str, dict]:
-    """Fresh extensions by name, as keywords of ``forward``."""
     samples, views = x.shape[:2]
     features = micro.video_features(samples, views).tensors
     positions = Positions(net.config, known.camera, micro.GRID)

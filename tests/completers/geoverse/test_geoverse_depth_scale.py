@@ -158,7 +158,6 @@ def test_each_alignment_uses_its_own_evidence():
 
 @pytest.mark.parametrize("views", [2, 3, 4])
 def test_the_papers_scale_is_s_star_whatever_is_known(views):
-    """Two centres suffice; neither the context's depth nor the memory's replaces or refuses it."""
     known = poses(views)
     made = geometry(model_centres(known, 2.0))
     deep = np.full((1, 8, 10), 30.0, np.float32)

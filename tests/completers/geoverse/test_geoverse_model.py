@@ -42,7 +42,6 @@ BOUNDS = (1.0, 0.7, 0.5, 0.2, 0.0)
 
 
 def built(injection: str = "none", **changes: Any) -> GeoVerse:
-    """A model whose every extension contributes."""
     model: GeoVerse = micro.model(micro.config(injection=injection, **changes))
     return model
 
@@ -99,7 +98,6 @@ def test_the_seed_is_all_the_chance_there_is(injection):
 
 
 def first_states(model: GeoVerse, batch: ViewBatch, **options: Any) -> dict[str, Tensor]:
-    """What the two denoisers start from."""
     seen: dict[str, Tensor] = {}
 
     def look(net: Any, args: Any) -> None:
@@ -163,7 +161,6 @@ def test_a_configuration_with_a_video_prior_asks_for_it():
 
 
 def skipping(**flow: Any) -> GeoVerse:
-    """A model whose level-1 denoiser returns zeros."""
     model = built(
         flow=FlowConfig(prediction="clean", **flow), hints={"fill": "push-pull", "mask": 0.0}
     )
@@ -205,7 +202,6 @@ def test_a_clean_prediction_is_where_its_velocity_leads():
 
 @torch.no_grad()
 def test_decoded_clean_latents_are_what_the_frozen_model_sees():
-    """Encoded to levels 0 and 1 and propagated, true pictures have the geometry of a whole run."""
     model = built(hints={"token": "own"})
     batch = micro.batch(2)
     batch = replace(

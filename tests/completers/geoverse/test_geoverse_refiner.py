@@ -142,7 +142,6 @@ def test_a_refiner_needs_corrections():
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory):
-    """Equal weights without a refiner and with one."""
     changes = {"composition": "correction", "hints": {"fill": "surfaces"}}
     with_one = micro.model(micro.config(refiner=SMALL, **changes))
     without = micro.model(micro.config(**changes))

@@ -51,7 +51,6 @@ class Case:
 
 
 def gradients(case: Case) -> dict[str, set[bool]]:
-    """Whether gradients are non-zero, by part of the branch."""
     case.branch.zero_grad()
     case.velocity(case.residuals()).square().mean().backward()
     found: dict[str, set[bool]] = {}

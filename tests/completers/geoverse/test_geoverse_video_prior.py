@@ -29,8 +29,6 @@ LAYOUTS = ("per_view", "video9", "repeat4")
 
 
 class Spy:
-    """Records what reaches the networks."""
-
     def __init__(self, prior: VideoPrior) -> None:
         self.clips: list[Tensor] = []
         self.calls: list[dict[str, Any]] = []

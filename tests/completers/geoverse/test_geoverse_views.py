@@ -13,7 +13,6 @@ from gvtools.completers.geoverse.views import model_size, view_batch
 
 
 def blob(camera: Cameras, point: np.ndarray, sigma: float) -> np.ndarray:
-    """A picture of a soft dot where a camera sees a point."""
     (((x, y),),), _ = camera.project(point[None])
     columns = np.arange(int(camera.width[0])) + 0.5
     rows = np.arange(int(camera.height[0]))[:, None] + 0.5
@@ -31,7 +30,6 @@ def blob(camera: Cameras, point: np.ndarray, sigma: float) -> np.ndarray:
     ],
 )  # fmt: skip
 def test_cameras_follow_pictures_that_are_cropped_and_resized(context_size, target_size):
-    """A dot drawn where a 3-D point is seen is found where the batch's camera puts the point."""
     point = np.array([0.05, -0.1, 3.2])
     views = []
     for seed in range(2):

@@ -63,7 +63,6 @@ def network() -> Any:
 
 @pytest.fixture(scope="module")
 def diffusers_source(network: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """As Wan2.2-VACE-Fun lies in diffusers' form: two experts, in several files."""
     folder = tmp_path_factory.mktemp("source") / "wan"
     tiny.transformer(LAYERS, HINTS, seed=77).save_pretrained(folder / "transformer")
     network.save_pretrained(folder / "transformer_2", max_shard_size="120KB")
@@ -75,7 +74,6 @@ def diffusers_source(network: Any, tmp_path_factory: pytest.TempPathFactory) -> 
 
 @pytest.fixture
 def source(diffusers_source: Path, tmp_path: Path) -> Path:
-    """One to be damaged."""
     return Path(shutil.copytree(diffusers_source, tmp_path / "wan"))
 
 
@@ -88,7 +86,6 @@ def truncated(diffusers_source: Path, tmp_path_factory: pytest.TempPathFactory) 
 
 
 def check_folder(folder: Path, **options: Any) -> VideoPrior:
-    """The prior of a folder of which headers alone are read."""
     return VideoPrior.from_pretrained(folder, config=replace(tiny.CONFIG, **options), device="meta")
 
 
@@ -232,7 +229,6 @@ def original_with(network: Any, tmp_path: Path, change: Any) -> Path:
 
 
 def without(*starts: str) -> Any:
-    """Takes tensors away."""
     return lambda tensors: [tensors.pop(n) for n in list(tensors) if n.startswith(starts)]
 
 
