@@ -24,7 +24,7 @@ from gvtools.settings import Settings
 
 # What every point format takes, and what a mesh takes beside it.
 POINTS = ("max_points", "observed")
-MESH = ("observed", "method", "voxel", "max_triangles", "texture")
+MESH = ("observed", "method", "voxel", "least_piece", "max_triangles", "texture")
 FormatName = Literal[
     "ply", "splat", "spz", "mesh", "las", "usd", "rrd", "glb", "colmap", "transforms"
 ]
@@ -42,6 +42,9 @@ class ExportOptions(Settings):
     """Mesh: how it is made."""
     voxel: float | None = Field(None, gt=0)
     """Mesh: edge of the voxels that it is made in, scene units (from the memory's). [EDGE]"""
+    least_piece: float = Field(0.001, ge=0, le=1)
+    """Mesh: leave out connected pieces below this share of the largest one's area; 0 keeps all.
+    [SHARE]"""
     max_triangles: int | None = Field(None, ge=1)
     """Mesh: simplify to at most N triangles. [N]"""
     texture: int | None = Field(None, ge=64, le=4096)

@@ -253,6 +253,7 @@ def write_mesh(source: ExportSource, path: Path, options: ExportOptions) -> str:
         _check_texture(source, path)
     voxel = mesh_voxel(memory) if options.voxel is None else options.voxel
     mesh = METHODS[method](memory, voxel, observed=options.observed)
+    mesh, islands = without_islands(mesh, options.least_piece)
     made = len(mesh.triangle.indices)
     most = options.max_triangles
     if size is not None and most is None:
@@ -264,11 +265,26 @@ def write_mesh(source: ExportSource, path: Path, options: ExportOptions) -> str:
     SAVERS[path.suffix.lower()](triangles, path)
     count = len(triangles.faces)
     fewer = f", simplified from {made}" if count < made else ""
+    fewer += f", without {islands} small pieces (--least-piece)" if islands else ""
     colors = "" if size is None else f", a texture of {size} x {size}"
     return (
         f"{count} triangles{fewer}, {len(mesh.vertex.positions)} vertices{colors} ({method}, "
         f"voxels of {voxel:.4g}) in {path}"
     )
+
+
+def without_islands(
+    mesh: o3d.t.geometry.TriangleMesh, least: float
+) -> tuple[o3d.t.geometry.TriangleMesh, int]:
+    """The mesh without pieces below a share of the largest one's area, and how many these were."""
+    from gvtools.o3d import o3d
+
+    labels, _, areas = mesh.to_legacy().cluster_connected_triangles()
+    small = np.asarray(areas) < least * max(areas)
+    if not small.any():
+        return mesh, 0
+    kept = o3d.core.Tensor(~small[np.asarray(labels)])
+    return mesh.select_faces_by_mask(kept), int(small.sum())
 
 
 def _check_texture(source: ExportSource, path: Path) -> None:

@@ -13,7 +13,7 @@ from export_runs import export_run, glb_colors
 from gvtools.errors import DegenerateError, OptionError
 from gvtools.memory.spatial_memory import SpatialMemory
 from pipelines.export import mesh as meshes
-from pipelines.export.mesh import simplify, tsdf_mesh
+from pipelines.export.mesh import simplify, tsdf_mesh, without_islands
 from pipelines.export.texture import atlas
 
 trimesh = pytest.importorskip("trimesh")
@@ -248,3 +248,17 @@ def test_files_that_no_export_wrote_are_kept(reconstructed_run, tmp_path):
     with pytest.raises(OptionError, match=r"out.png: is there already"):
         export_run(reconstructed_run.path, "mesh", tmp_path / "out.obj", "--texture", 256, *FEW)
     assert (tmp_path / "out.png").read_bytes() == b"mine"
+
+
+def test_small_pieces_are_left_out():
+    """Beside a sphere of area 12 one of a hundredth of its radius, with the attributes of both."""
+    spheres = [o3d.geometry.TriangleMesh.create_sphere(radius) for radius in (1.0, 0.01)]
+    spheres[1].translate((5, 0, 0))
+    both = (spheres[0] + spheres[1]).paint_uniform_color((0.25, 0.5, 1))
+    mesh = o3d.t.geometry.TriangleMesh.from_legacy(both)
+    for least, pieces, left_out in ((0.001, 1, 1), (1e-5, 2, 0), (0, 2, 0)):
+        kept, count = without_islands(mesh, least)
+        assert count == left_out
+        assert len(kept.triangle.indices) == pieces * len(spheres[0].triangles)
+        assert (kept.vertex.positions.numpy()[:, 0].max() > 2) == (pieces == 2)
+        assert np.ptp(kept.vertex.colors.numpy(), axis=0).max() == 0
