@@ -90,6 +90,14 @@ def _posed_where_asked_for(request: pytest.FixtureRequest) -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _no_waiting_for_the_disk() -> Iterator[None]:
+    """What is written is read again at once; that a disk holds it, too, no test looks at."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda file: None)
+        yield
+
+
 @pytest.fixture(scope="session")
 def shared() -> Path:
     """The folder of real scenes and oracles; the test is skipped where it is absent."""
@@ -112,10 +120,9 @@ def small_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("small")
     scan, run = write_scan(root / "scan", views=8), root / "run"
     options = ("--context", "first:3", "--targets", "range:4-7", "--views-per-round", "2")
-    assert (
-        main(["reconstruct", str(scan), "--refine", "0", "--out", str(run), *options, "--quiet"])
-        == 0
-    )
+    words = ["reconstruct", str(scan), "--refine", "0", "--out", str(run), *options, "--quiet"]
+    with unpainted_figures():
+        assert main(words) == 0
     return run
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import platform
 from collections.abc import Iterable, Iterator
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -76,6 +77,7 @@ def folder_digest(folder: Path, *, without: str) -> str:
     return _sha256(parts())[:16]
 
 
+@cache
 def versions() -> dict[str, str]:
     """Versions of what a run's bytes depend on."""
     out = {"gvtools": gvtools.__version__, "python": platform.python_version()}

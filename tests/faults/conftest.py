@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from figures import unpainted_figures
 from kill_commands import PLAIN
 from tiny_scan import write_scan
 
 from pipelines.cli import main
+
+
+@pytest.fixture(scope="package", autouse=True)
+def _unpainted() -> Iterator[None]:
+    with unpainted_figures():
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -29,10 +29,24 @@ def weights(*arguments: object) -> int:
     return main(["weights", *map(str, arguments)])
 
 
+@pytest.fixture(scope="module")
+def own(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Not to be changed."""
+    folder = tmp_path_factory.mktemp("own")
+    save_pretrained(micro.model(PLAIN), folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Files as they are published, without the network that turns depth into a condition."""
+    bare = replace(PLAIN, level1=replace(PLAIN.level1, depth_condition=False))
+    return published.write_published(micro.model(bare), tmp_path_factory.mktemp("published"))
+
+
 @pytest.fixture
-def own(tmp_path: Path) -> Path:
-    save_pretrained(micro.model(PLAIN), tmp_path / "own")
-    return tmp_path / "own"
+def folder(original: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(original, tmp_path / "published"))
 
 
 @pytest.fixture
@@ -117,9 +131,7 @@ def test_a_folder_that_fits(capsys: pytest.CaptureFixture[str], own: Path, tmp_p
     assert part["missing"] == part["unexpected"] == part["shape_mismatch"] == []
 
 
-def test_what_does_not_fit_is_said_for_each_part(capsys, tmp_path):
-    bare = replace(PLAIN, level1=replace(PLAIN.level1, depth_condition=False))
-    folder = published.write_published(micro.model(bare), tmp_path / "published")
+def test_what_does_not_fit_is_said_for_each_part(capsys, folder, tmp_path):
     assert weights("check", folder) == 0
     assert "absent: pretrained_models/da3/dpt_decoder.pt" in capsys.readouterr().out
     (folder / published.CASCADE).unlink()
@@ -174,9 +186,7 @@ def test_a_photograph_is_encoded_and_decoded(capsys, own, tmp_path, monkeypatch)
 
 
 @pytest.mark.parametrize("dtype", ["float16", "bfloat16"])
-def test_published_files_are_packed_into_one(capsys, tmp_path, dtype):
-    bare = replace(PLAIN, level1=replace(PLAIN.level1, depth_condition=False))
-    folder = published.write_published(micro.model(bare), tmp_path / "published")
+def test_published_files_are_packed_into_one(capsys, folder, tmp_path, dtype):
     (folder / "video" / "vae").mkdir(parents=True)
     (folder / "video" / "vae" / "numbers").write_bytes(b"1234")
     words = ("weights", "pack", folder, tmp_path / "out", "--dtype", dtype)
@@ -186,7 +196,7 @@ def test_published_files_are_packed_into_one(capsys, tmp_path, dtype):
     torch.save({"token_embedding.weight": embedding, "norm.weight": torch.ones(5)}, tmp_path / "t5")
     assert main([str(word) for word in (*words, "--text-encoder", tmp_path / "t5")]) == 0
     packed, whole = (from_pretrained(place).state_dict() for place in (tmp_path / "out", folder))
-    buffers = {name for name, _ in micro.model(bare).named_buffers()}
+    buffers = {name for name, _ in from_pretrained(folder).named_buffers()}
     for name, tensor in whole.items():
         exact = name in buffers or name.endswith(".t_embedder.W")
         kept = tensor if exact else tensor.to(getattr(torch, dtype)).float()
@@ -200,9 +210,7 @@ def test_published_files_are_packed_into_one(capsys, tmp_path, dtype):
     assert "lies within" in refused(capsys, "weights", "pack", folder, folder / "packed")
 
 
-def test_an_older_revision_is_named(capsys, tmp_path, monkeypatch):
-    bare = replace(PLAIN, level1=replace(PLAIN.level1, depth_condition=False))
-    folder = published.write_published(micro.model(bare), tmp_path / "published")
+def test_an_older_revision_is_named(capsys, folder, monkeypatch):
     path = folder / published.LEVEL1
     monkeypatch.setattr("pipelines.weights.of_published_size", lambda config: True)
     monkeypatch.setattr(micro.GeoVerse, "reconstruct", lambda model, picture: picture)

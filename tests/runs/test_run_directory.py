@@ -18,7 +18,8 @@ from pipelines.cli import main
 
 pytestmark = pytest.mark.usefixtures("unpainted")
 
-RUN = ("--context", "first:2", "--targets", "range:2-5", "--views-per-round", "2", "--quiet")
+RUN = ("--context", "first:2", "--targets", "range:2-5", "--views-per-round", "2", "--quiet",
+       "--refine", "0", "--set", "refine.poses=false")  # fmt: skip
 
 
 @pytest.fixture
@@ -27,9 +28,7 @@ def scan(tmp_path):
 
 
 def reconstruct(scan, out, *options: object) -> int:
-    return main(
-        ["reconstruct", str(scan), "--refine", "0", "--out", str(out), *RUN, *map(str, options)]
-    )
+    return main(["reconstruct", str(scan), "--out", str(out), *RUN, *map(str, options)])
 
 
 @pytest.fixture(scope="module")
@@ -48,6 +47,22 @@ def finished(whole, tmp_path):
     return whole[0], tmp_path / "run"
 
 
+@pytest.fixture
+def own(finished, tmp_path):
+    """A copy of the scan, too, and the run as if it were of that."""
+    scan, out = finished
+    record = json.loads((out / "run.json").read_text())
+    shutil.copytree(scan, tmp_path / "scan")
+    write_json(out / "run.json", {**record, "project": str(tmp_path / "scan")})
+    return tmp_path / "scan", out
+
+
+def differing(scan, out, capsys, *options: object) -> str:
+    """What differs from the run that is to be resumed."""
+    assert reconstruct(scan, out, "--resume", *options) == 2
+    return capsys.readouterr().err
+
+
 def test_a_first_attempt_that_failed_does_not_bind_the_next(scan, tmp_path):
     out = tmp_path / "run"
     broken = scan / "frame-000001.color.png"
@@ -56,53 +71,42 @@ def test_a_first_attempt_that_failed_does_not_bind_the_next(scan, tmp_path):
     broken.write_bytes(whole[: len(whole) // 2])
     assert reconstruct(scan, out, "--voxel", "0.02") == 2
     broken.write_bytes(whole)
-    assert reconstruct(scan, out, "--voxel", "0.03") == 0
+    assert reconstruct(scan, out, "--voxel", "0.03", "--rounds", "0") == 0
     assert json.loads((out / "run.json").read_text())["settings"]["voxel"] == 0.03
 
 
 def test_the_settings_of_a_run_with_rounds_bind(finished, capsys):
-    scan, out = finished
-    shutil.rmtree(out / "round_002")
-    assert reconstruct(scan, out, "--resume", "--voxel", "0.3") == 2
-    assert "settings, derived differ" in capsys.readouterr().err
+    shutil.rmtree(finished[1] / "round_002")
+    assert "settings, derived differ" in differing(*finished, capsys, "--voxel", "0.3")
 
 
-def test_a_changed_reading_of_the_project_is_another_run(scan, tmp_path, capsys):
-    out = tmp_path / "run"
-    assert reconstruct(scan, out, "--depth-max", "2.5") == 0
-    assert reconstruct(scan, out, "--resume", "--depth-max", "2.6") == 2
-    assert "reading" in capsys.readouterr().err
+def test_a_changed_reading_of_the_project_is_another_run(own, capsys):
+    assert "reading" in differing(*own, capsys, "--depth-max", "2.6")
     # The same through the folder's own file, which no option tells of.
-    other = tmp_path / "other"
-    assert reconstruct(scan, other) == 0
-    (scan / "rgbd.json").write_text(json.dumps({"depth_unit": 0.002}))
-    assert reconstruct(scan, other, "--resume") == 2
-    assert "pixels" in capsys.readouterr().err
+    (own[0] / "rgbd.json").write_text(json.dumps({"depth_unit": 0.002}))
+    assert "pixels" in differing(*own, capsys)
 
 
-def test_a_changed_camera_is_another_run(scan, tmp_path, capsys):
-    out = tmp_path / "run"
-    assert reconstruct(scan, out) == 0
-    pose = scan / "frame-000001.pose.txt"
+def test_a_changed_camera_is_another_run(own, capsys):
+    pose = own[0] / "frame-000001.pose.txt"
     matrix = np.loadtxt(pose)
     matrix[0, 3] += 0.01
     np.savetxt(pose, matrix)
-    assert reconstruct(scan, out, "--resume") == 2
-    assert "cameras" in capsys.readouterr().err
+    assert "cameras" in differing(*own, capsys)
 
 
 def test_changed_sparse_points_are_another_run(tmp_path, capsys):
     """Computed depth stands on them."""
     project = write_colmap_scan(tmp_path / "colmap")
     out = tmp_path / "run"
-    words = ("--completer", "none", "--context", "first:3", "--targets", "last:1")
-    assert reconstruct(project, out, *words, "--voxel", "0.03") == 0
-    assert reconstruct(project, out, *words, "--voxel", "0.03", "--resume") == 0
+    words = ("--completer", "none", "--context", "first:3", "--targets", "last:1",
+             "--voxel", "0.03", "--set", "stereo.max_side=64")  # fmt: skip
+    assert reconstruct(project, out, *words) == 0
+    assert reconstruct(project, out, *words, "--resume") == 0
     other = write_colmap_scan(tmp_path / "other", points=70)
     shutil.rmtree(project / "sparse")
     shutil.copytree(other / "sparse", project / "sparse")
-    assert reconstruct(project, out, *words, "--voxel", "0.03", "--resume") == 2
-    assert "(points differ)" in capsys.readouterr().err
+    assert "(points differ)" in differing(project, out, capsys, *words)
 
 
 def test_removing_a_round_forgets_it_and_what_came_after(finished):
@@ -157,12 +161,6 @@ def test_cuda_without_a_device_is_refused_before_anything_is_written(
         assert reconstruct(scan, tmp_path / "run", "--device", "cuda", *more) == 2
         assert "no CUDA device" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
-
-
-def test_json_holds_the_figures(scan, tmp_path):
-    file = tmp_path / "figures.json"
-    assert reconstruct(scan, tmp_path / "run", "--json", file) == 0
-    assert json.loads(file.read_text()) == json.loads((tmp_path / "run/metrics.json").read_text())
 
 
 def test_a_demo_in_a_folder_with_files_is_refused_before_its_sample(tmp_path, capsys, monkeypatch):
@@ -235,11 +233,12 @@ def test_a_run_without_its_first_round_is_done_anew(finished):
 
 
 def test_a_kill_while_the_record_is_written_leaves_a_usable_folder(scan, tmp_path):
-    out = tmp_path / "run"
+    out, file = tmp_path / "run", tmp_path / "figures.json"
     out.mkdir()
     (out / ".run.json.part").write_text("{")
-    assert reconstruct(scan, out, "--resume") == 0
+    assert reconstruct(scan, out, "--resume", "--json", file) == 0
     assert not (out / ".run.json.part").exists()
+    assert json.loads(file.read_text()) == json.loads((out / "metrics.json").read_text())
 
 
 def test_a_memory_that_went_with_a_removed_round_is_said(finished, capsys):
@@ -261,7 +260,7 @@ def test_a_dry_run_tells_what_a_run_would_be_refused_for(finished, capsys):
 def test_a_completer_may_be_named_in_its_section(scan, tmp_path):
     file = tmp_path / "config.json"
     file.write_text(json.dumps({"completer": {"name": "inpaint", "sweeps": 3}}))
-    assert reconstruct(scan, tmp_path / "run", "--config", file) == 0
+    assert reconstruct(scan, tmp_path / "run", "--config", file, "--rounds", "0") == 0
     config = json.loads((tmp_path / "run" / "run.json").read_text())["settings"]
     assert config["completer"] == "inpaint"
     assert config["completer_options"] == {"sweeps": 3}

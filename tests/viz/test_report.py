@@ -178,12 +178,14 @@ def test_a_project_that_is_gone(own, small_scan, capsys):
     assert [tile.label for row in shown for tile in row.tiles] == LABELS * 4
 
 
-def test_a_run_that_has_its_project_open_writes_the_same_page(own, small_scan, page):
+def test_a_run_that_has_its_project_open_writes_the_same_page(own, small_scan):
+    written(own)
     refine = FitOptions(seconds=0)
     config = RunSettings(context="first:3", targets="range:4-7", views_per_round=2, refine=refine)
     before = (own / "report.html").read_bytes()
     (own / "report.html").unlink()
-    write_report(make_plan(open_project(small_scan), config), own)
+    with unpainted_figures():
+        write_report(make_plan(open_project(small_scan), config), own)
     assert (own / "report.html").read_bytes() == before
 
 

@@ -138,7 +138,7 @@ def test_the_live_viewer_is_there_as_long_as_the_run_is_at_work(small_run, tmp_p
     pytest.importorskip("viser", reason="viser is not installed")
     port = free_port()
     later = tmp_path / "run"
-    threading.Timer(1.0, shutil.copytree, (small_run, later)).start()
+    threading.Timer(0.3, shutil.copytree, (small_run, later)).start()
 
     def reached() -> bool:
         with socket.socket() as probe:
@@ -148,12 +148,12 @@ def test_the_live_viewer_is_there_as_long_as_the_run_is_at_work(small_run, tmp_p
         end = time.monotonic() + 60
         while not reached():
             assert time.monotonic() < end
-            time.sleep(0.2)
+            time.sleep(0.02)
         # Told by this process, whose progress bar it has to go around.
         said = ""
         while f"{later}: look at http://127.0.0.1:{port} (Ctrl-C ends)\n" not in said:
             assert time.monotonic() < end
-            time.sleep(0.1)
+            time.sleep(0.02)
             said += capsys.readouterr().out
     assert not reached()
 

@@ -146,7 +146,7 @@ def test_a_block_is_read_like_the_project_and_survives_a_copy(walk: Path, tmp_pa
 def test_computed_depth_is_that_of_each_views_owner(tmp_path: Path) -> None:
     scan = write_colmap_scan(tmp_path / "scan", views=6)
     split(open_project(scan), tmp_path / "blocks", blocks=2, overlap=1.0)
-    options = {"depth": "plane-sweep", "rounds": 0, "voxel": 0.05}
+    options = {"depth": "plane-sweep", "rounds": 0, "voxel": 0.05, "stereo.max_side": 64}
     runs = block_runs(tmp_path / "blocks", tmp_path / "runs", **options)
     # With all views in every block, a view's depth is the unsplit run's, up to rounding of poses.
     whole = reconstruct(scan, tmp_path / "whole", **options)

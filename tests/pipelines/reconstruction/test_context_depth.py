@@ -22,7 +22,8 @@ from pipelines.cli import main
 pytestmark = pytest.mark.usefixtures("unpainted")
 
 RUN = ("--targets", "range:3-4", "--views-per-round", "1", "--context", "first:3",
-       "--refine", "0", "--depth", "plane-sweep", "--quiet")  # fmt: skip
+       "--refine", "0", "--set", "refine.poses=false",
+       "--depth", "plane-sweep", "--quiet")  # fmt: skip
 # Every view's depth is asked for, whatever memory explains.
 ALL = ("--set", "savings.depth_from_memory=none")
 

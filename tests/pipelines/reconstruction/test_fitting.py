@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import signal
 from dataclasses import replace
 from pathlib import Path
@@ -31,6 +32,7 @@ from gvtools.scenes.project import open_project
 from gvtools.settings import with_texts
 from pipelines.console import Console
 from pipelines.reconstruction import fitting
+from pipelines.reconstruction import run as runs
 from pipelines.reconstruction.fitting import (
     Fitted,
     Sweep,
@@ -51,6 +53,7 @@ SETTINGS = ("context=first:8", "targets=range:8-9", "views_per_round=1", "depth=
 # Fewer show so little that the blend takes all of the memory's detail.
 STEPS = "refine.steps=40"
 ONE = Appearance(Gaussians(np.zeros((1, VALUES), np.float32)), 0.1)
+QUIET = Console(quiet=True)
 FITTED, POSES = "round_000/appearance.npz", "round_000/poses.npz"
 
 
@@ -65,12 +68,36 @@ def whole(scan, tmp_path_factory):
     return run(scan, tmp_path_factory.mktemp("runs") / "whole")
 
 
+@pytest.fixture(scope="module")
+def fit(scan) -> Fitted:
+    """The fit of ``whole``, made again."""
+    found = fit_appearance(planned(scan), QUIET)
+    assert found is not None
+    return found
+
+
+@pytest.fixture(scope="module")
+def unfitted(scan, tmp_path_factory) -> list[Path]:
+    """Runs without steps, or without time, to fit anything."""
+    root = tmp_path_factory.mktemp("unfitted")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(runs, "fit_appearance", not_to_be_called)
+        patch.setattr(Appearance, "picture", not_to_be_called)
+        return [run(scan, root / off, f"refine.{off}=0") for off in ("steps", "seconds")]
+
+
+@pytest.fixture(scope="module")
+def bare(tmp_path_factory) -> Path:
+    """Photographs with sparse points, and without depth."""
+    return write_colmap_scan(tmp_path_factory.mktemp("bare") / "scan", views=10)
+
+
 def run(scan: Path, out: Path, *settings: str, resume: bool = False) -> Path:
     return reconstructed(scan, out, *SETTINGS, STEPS, *settings, resume=resume)
 
 
 def planned(scan: Path, *settings: str) -> Plan:
-    config = with_texts(RunSettings(), (*SETTINGS, STEPS, *settings))
+    config = with_texts(RunSettings(), ("refine.poses=false", *SETTINGS, STEPS, *settings))
     return make_plan(open_project(scan), config)
 
 
@@ -90,16 +117,13 @@ def not_to_be_called(*args, **kwargs):
     raise AssertionError("called")
 
 
-def test_a_run_keeps_its_gaussians_beside_round_0(whole, scan):
+def test_a_run_keeps_its_gaussians_beside_round_0(whole, fit):
     fitted = Fitted.load(whole / FITTED)
     assert 100 < len(fitted.appearance.gaussians) <= 2000
     assert fitted.appearance.near > 0
     assert (whole / "memory.npz").exists()
-    plan = planned(scan)
-    again = fit_appearance(plan, Console(quiet=True))
-    assert again is not None
     np.testing.assert_array_equal(
-        again.appearance.gaussians.values, fitted.appearance.gaussians.values
+        fit.appearance.gaussians.values, fitted.appearance.gaussians.values
     )
 
 
@@ -122,21 +146,21 @@ def test_resuming_after_round_0_gives_the_same_bytes_without_a_second_fit(
         run(scan, tmp_path / "run")
     monkeypatch.undo()
     assert (tmp_path / "run" / FITTED).exists()
-    monkeypatch.setattr(fitting, "fit_appearance", not_to_be_called)
+    monkeypatch.setattr(runs, "fit_appearance", not_to_be_called)
     run(scan, tmp_path / "run", resume=True)
     assert results(tmp_path / "run") == results(whole)
     assert untimed(tmp_path / "run") == untimed(whole)
 
 
-def test_a_damaged_fit_is_named_when_a_run_is_resumed(scan, tmp_path):
-    out = run(scan, tmp_path / "run", "rounds=1")
+def test_a_damaged_fit_is_named_when_a_run_is_resumed(whole, scan, tmp_path):
+    out = shutil.copytree(whole, tmp_path / "run")
     (out / FITTED).write_bytes((out / FITTED).read_bytes()[:-3000])
     with pytest.raises(ProjectError, match=r"appearance\.npz: damaged"):
-        run(scan, out, "rounds=1", resume=True)
+        run(scan, out, resume=True)
 
 
 def test_a_run_that_nothing_can_be_fitted_to_goes_on_without_and_resumes(
-    scan, tmp_path, monkeypatch, capsys
+    scan, unfitted, tmp_path, monkeypatch, capsys
 ):
     def nowhere(*args, **kwargs):
         raise DegenerateError("no surface is known")
@@ -148,17 +172,14 @@ def test_a_run_that_nothing_can_be_fitted_to_goes_on_without_and_resumes(
     before = results(out)
     run(scan, out, resume=True)
     assert results(out) == before
-    without = run(scan, tmp_path / "without", "refine.steps=0")
-    assert (without / "memory.npz").read_bytes() == (out / "memory.npz").read_bytes()
+    assert (unfitted[0] / "memory.npz").read_bytes() == (out / "memory.npz").read_bytes()
 
 
-@pytest.mark.parametrize("off", ["refine.steps=0", "refine.seconds=0"])
-def test_without_steps_or_time_a_run_knows_nothing_of_gaussians(scan, tmp_path, monkeypatch, off):
-    monkeypatch.setattr(fitting, "fit_appearance", not_to_be_called)
-    monkeypatch.setattr(Appearance, "picture", not_to_be_called)
-    out = run(scan, tmp_path / "run", off)
+@pytest.mark.parametrize("row", [0, 1])
+def test_without_steps_or_time_a_run_knows_nothing_of_gaussians(scan, unfitted, row):
+    out = unfitted[row]
     assert not (out / FITTED).exists()
-    plan = planned(scan, off)
+    plan = planned(scan, f"refine.{out.name}=0")
     memory = memory_of_round_0(out)
     guidance = project(memory, plan.targets.cameras[[0]], options=plan.config.splat)
     shown = guidance_of(out, 1)[guidance.valid[0]]
@@ -181,25 +202,27 @@ def test_photographs_alone_get_depth_by_the_gaussians(tmp_path, monkeypatch, poi
     """With sparse points, and without any: then a plane sweep tells where to begin."""
     # So short a fit is not as good as the memory.
     monkeypatch.setattr(fitting, "validate_fit", lambda *args: None)
-    scan = write_colmap_scan(tmp_path / "scan", views=10, points=points)
-    out = run(scan, tmp_path / "run", STEPS)
+    monkeypatch.setattr(fitting, "SWEPT_SIDE", 64)
+    scan = write_colmap_scan(tmp_path / "scan", views=6, points=points)
+    settings = ("context=first:5", "targets=range:5-5")
+    out = run(scan, tmp_path / "run", *settings)
     fitted = Fitted.load(out / FITTED)
     assert fitted.poses is None and not (out / POSES).exists()
     report = report_of(out)
     assert {entry["source"] for entry in report["depth"]} <= {"fitted", "memory"}
     assert report["depth"][0]["source"] == "fitted"
     assert report["points"] > 500
-    shown = fitted.appearance.depth(planned(scan).scene["view_1.png"].camera)
+    shown = fitted.appearance.depth(planned(scan, *settings).scene["view_1.png"].camera)
     # The wall is 3 units away, the square 1.8.
     assert 1.5 < np.median(shown[shown > 0]) < 3.5
 
 
-@pytest.mark.parametrize(("steps", "told"), [(20, True), (80, False)])
-def test_a_fit_too_short_for_its_photographs_is_told(tmp_path, monkeypatch, capsys, steps, told):
+@pytest.mark.parametrize(("steps", "told"), [(20, True), (25, False)])
+def test_a_fit_too_short_for_its_photographs_is_told(bare, monkeypatch, capsys, steps, told):
     # Where nothing judges it.
     monkeypatch.setattr(fitting, "validate_fit", lambda *args: None)
-    scan = write_colmap_scan(tmp_path / "scan", views=10, points=300)
-    plan = planned(scan, f"refine.steps={steps}")
+    monkeypatch.setattr(fitting, "SWEPT_SIDE", 64)
+    plan = planned(bare, f"refine.steps={steps}", "context=first:3")
     fit_appearance(plan, Console())
     needed = round(7.5 * len(plan.context))
     assert (f"expected at least {needed}" in capsys.readouterr().err) == told
@@ -214,10 +237,12 @@ def test_pixels_with_swept_depth_make_up_for_few_sparse_points(tmp_path, monkeyp
 
     monkeypatch.setattr(fitting, "from_points", watched)
     scan = write_colmap_scan(tmp_path / "scan", views=10, points=15)
-    plan = planned(scan, "refine.steps=1", "refine.most_gaussians=20000")
-    fit_appearance(plan, Console(quiet=True))
+    plan = planned(scan, "refine.most_gaussians=20000")
+    frame = fitting.grid_frame(plan.scene, plan.context)
+    views = fit_views(plan, frame, QUIET, sweep=Sweep.of(plan))
+    first_gaussians(plan, views, frame)
     monkeypatch.setattr(fitting, "FEW_POINTS", 150)
-    fit_appearance(plan, Console(quiet=True))
+    first_gaussians(plan, views, frame)
     few, enough = begun
     assert len(enough) == 150
     assert len(few) > 2000
@@ -230,18 +255,18 @@ def test_pixels_with_swept_depth_make_up_for_few_sparse_points(tmp_path, monkeyp
 
 
 @pytest.mark.parametrize(("seconds", "side"), [("none", 96), ("40", 96), ("15", 64), ("5", None)])
-def test_a_sweep_is_as_large_as_there_is_time(tmp_path, monkeypatch, seconds, side):
+def test_a_sweep_is_as_large_as_there_is_time(bare, monkeypatch, seconds, side):
     monkeypatch.setattr(fitting, "SWEPT_SIDE", 96)
     monkeypatch.setattr(fitting, "SMALL_SIDE", 64)
     monkeypatch.setattr(fitting, "get_num_threads", lambda: 2)
     monkeypatch.setattr(fitting, "FEW_POINTS", 15)
-    scan = write_colmap_scan(tmp_path / "scan", views=10, points=20)
-    sweep = Sweep.of(planned(scan, f"refine.seconds={seconds}"))
+    plan = planned(bare, f"refine.seconds={seconds}")
+    sweep = Sweep.of(plan)
     if side is None:
         assert sweep is None
         # A start needs points.
         monkeypatch.setattr(fitting, "FEW_POINTS", 10**6)
-        sweep, side = Sweep.of(planned(scan, f"refine.seconds={seconds}")), 64
+        sweep, side = Sweep.of(plan), 64
     assert sweep is not None
     view = sweep.scene["view_1.png"]
     assert int(view.camera.width[0]) == side
@@ -250,9 +275,8 @@ def test_a_sweep_is_as_large_as_there_is_time(tmp_path, monkeypatch, seconds, si
     assert (depth > 0).mean() > 0.3
 
 
-def test_recorded_or_named_depth_is_not_replaced(scan, tmp_path):
+def test_recorded_or_named_depth_is_not_replaced(scan, bare):
     assert Sweep.of(planned(scan)) is None
-    bare = write_colmap_scan(tmp_path / "scan", views=10)
     plan = planned(bare, "depth=plane-sweep")
     assert Fitted(ONE).apply(plan).source is plan.source
     assert Fitted(ONE).apply(planned(bare)).source.name == "fitted"
@@ -261,8 +285,7 @@ def test_recorded_or_named_depth_is_not_replaced(scan, tmp_path):
 def test_nothing_is_fitted_to_views_that_tell_no_depth(tmp_path, monkeypatch):
     scan = write_colmap_scan(tmp_path / "scan", views=10, points=6)
     monkeypatch.setattr(Sweep, "of", lambda plan, begins: None)
-    console = Console(quiet=True)
-    assert fit_appearance(planned(scan, "refine.steps=1"), console) is None
+    assert fit_appearance(planned(scan, "refine.steps=1"), QUIET) is None
 
 
 def test_refined_poses_move_context_and_targets(scan):
@@ -287,9 +310,9 @@ def test_refined_poses_move_context_and_targets(scan):
     assert kept.config.voxel == plan.config.voxel and kept.source is plan.source
 
 
-def test_photographs_with_fitted_depth_enter_the_memory_smaller(tmp_path, monkeypatch):
+def test_photographs_with_fitted_depth_enter_the_memory_smaller(bare, monkeypatch):
     monkeypatch.setattr(fitting, "SWEPT_SIDE", 64)
-    plan = planned(write_colmap_scan(tmp_path / "scan", views=10))
+    plan = planned(bare)
     changed = Fitted(ONE).apply(plan)
     assert changed.evidence is not None and plan.config.voxel is not None
     camera = changed.evidence["view_0.png"].camera
@@ -352,24 +375,19 @@ def test_a_photograph_does_not_validate_a_memory_that_has_seen_it(scan):
     assert fitted.with_best_blend(plan, memory).appearance.blend == Blend()
 
 
-def test_a_run_with_validation_photographs_keeps_the_blend_that_they_chose(tmp_path):
-    scan = write_scan(tmp_path / "scan", views=9)
-    settings = ("context=first:8", "targets=range:8-8")
-    out = run(scan, tmp_path / "run", *settings)
-    plan = planned(scan, *settings)
-    fitted = fit_appearance(plan, Console(quiet=True))
-    assert fitted is not None and list(fitted.predicted) == [plan.context[4]]
-    chosen = fitted.with_best_blend(fitted.apply(plan), memory_of_round_0(out))
+def test_a_run_with_validation_photographs_keeps_the_blend_that_they_chose(scan, whole, fit):
+    plan = planned(scan)
+    assert list(fit.predicted) == [plan.context[4]]
+    chosen = fit.with_best_blend(fit.apply(plan), memory_of_round_0(whole))
     assert chosen.appearance.blend != Blend()
-    assert Fitted.load(out / FITTED).appearance.blend == chosen.appearance.blend
+    assert Fitted.load(whole / FITTED).appearance.blend == chosen.appearance.blend
 
 
 def test_a_networks_depth_guides_the_fit_and_its_failures_do_not_stop_it(
-    tmp_path, monkeypatch, capsys
+    bare, tmp_path, monkeypatch, capsys
 ):
-    scan = write_colmap_scan(tmp_path / "scan", views=10)
     (tmp_path / "model.safetensors").write_bytes(b"only looked for")
-    plan = planned(scan, "depth=da3", f"da3.weights={tmp_path}")
+    plan = planned(bare, "depth=da3", f"da3.weights={tmp_path}")
     assert isinstance(plan.source, FoundationDepth)
 
     def depth(self, scene, view, frame):
@@ -384,7 +402,7 @@ def test_a_networks_depth_guides_the_fit_and_its_failures_do_not_stop_it(
     assert first.depth is None and first.estimate is not None and (first.estimate == 3).all()
     assert second.estimate is None
     assert "is fitted without an estimate of its depth: no scale" in capsys.readouterr().err
-    plain = fit_views(planned(scan), frame, Console(quiet=True))
+    plain = fit_views(planned(bare), frame, QUIET)
     assert all(view.depth is None and view.estimate is None for view in plain)
     # Without sparse points the fit begins there, too.
     scene = replace(plan.scene, points=None)
@@ -392,8 +410,8 @@ def test_a_networks_depth_guides_the_fit_and_its_failures_do_not_stop_it(
     assert len(start) > 50
 
 
-def test_a_fit_worse_than_the_memory_is_not_used(tmp_path, monkeypatch, capsys):
-    plan = planned(write_colmap_scan(tmp_path / "scan", views=10), "refine.steps=1")
+def test_a_fit_worse_than_the_memory_is_not_used(bare, monkeypatch, capsys):
+    plan = planned(bare, "refine.steps=1")
     sweep = Sweep.of(plan)
     assert sweep is not None
     view = plan.scene["view_3.png"]
@@ -405,6 +423,8 @@ def test_a_fit_worse_than_the_memory_is_not_used(tmp_path, monkeypatch, capsys):
     assert bad is not None and not bad.fit_is_used
     assert good.gaussians > good.memory > bad.memory > 15 > bad.gaussians
     monkeypatch.setattr(fitting, "validate_fit", lambda *args: bad)
+    # As far as it has been swept.
+    monkeypatch.setattr(Sweep, "of", lambda plan, begins: sweep)
     assert fit_appearance(plan, Console()) is None
     told = capsys.readouterr()
     assert "colours: the memory's own" in told.out and "the fit is not used" in told.err

@@ -67,7 +67,10 @@ def test_figures_and_pictures_do_not_depend_on_the_budget(tiled, in_ram):
     assert_same_results(tiled, in_ram)
 
 
-@pytest.mark.parametrize("budget", [TINY, "memory.budget=100MB", "memory.budget=none"])
+@pytest.mark.parametrize(
+    "budget",
+    [TINY, pytest.param("memory.budget=100MB", marks=pytest.mark.slow), "memory.budget=none"],
+)
 def test_a_run_goes_on_after_a_kill_with_any_budget(
     scan, tiled, in_ram, tmp_path, monkeypatch, budget
 ):

@@ -23,7 +23,8 @@ from pipelines.reconstruction import prepare
 
 pytestmark = pytest.mark.usefixtures("unpainted")
 
-SETTINGS = ("context=first:8", "targets=range:8-9", "views_per_round=1", "refine.steps=0")
+SETTINGS = ("context=first:8", "targets=range:8-9", "views_per_round=1", "refine.steps=0",
+            "refine.poses=true")  # fmt: skip
 POSES = "round_000/poses.npz"
 
 

@@ -41,7 +41,8 @@ def runs(tmp_path_factory) -> Path:
     matrix = np.diag([1 / SCALE] * 3 + [1.0])
     matrix[:3, 3] = -FAR / SCALE
     np.savetxt(root / "placement.txt", matrix, fmt="%.17g")
-    options = ["--context", "first:1", "--targets", "range:4-5", "--refine", "0", "--quiet"]
+    options = ["--context", "first:1", "--targets", "range:4-5", "--refine", "0", "--quiet",
+               "--set", "refine.poses=false"]  # fmt: skip
     given = ["--cloud", str(scan), "--cloud-placement", str(root / "placement.txt")]
     for name, more in (("with", given), ("without", [])):
         out = ["--out", str(root / name)]

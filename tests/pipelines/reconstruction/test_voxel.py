@@ -211,9 +211,9 @@ def test_too_few_views_tell_nothing(scan):
 
 def test_a_run_takes_the_measured_edge_unless_told_otherwise(scan):
     scene = open_project(scan)
-    texts = ["context=not:first:1", "targets=first:1"]
-    edges = {
-        name: make_plan(scene, with_texts(RunSettings(), [*texts, *more])).config.voxel or 0
+    texts = ["context=not:first:1", "targets=first:1", "refine.poses=false"]
+    configs = {
+        name: make_plan(scene, with_texts(RunSettings(), [*texts, *more])).config
         for name, more in {
             "footprint": ["fusion.max_psnr_drop_db=none"],
             "balanced": [],
@@ -222,13 +222,10 @@ def test_a_run_takes_the_measured_edge_unless_told_otherwise(scan):
             "given": ["voxel=0.0123", "fusion.max_psnr_drop_db=100"],
         }.items()
     }
+    edges = {name: config.voxel or 0 for name, config in configs.items()}
     assert edges["any"] == pytest.approx(SCALES[-1] * edges["footprint"], rel=0.01)
-    wide = make_plan(
-        scene, with_texts(RunSettings(), [*texts, "fusion.max_psnr_drop_db=100"])
-    ).config
-    assert (
-        wide.memory.voxels_per_footprint == SCALES[-1] * RunSettings().memory.voxels_per_footprint
-    )
+    wide = configs["any"].memory.voxels_per_footprint
+    assert wide == SCALES[-1] * RunSettings().memory.voxels_per_footprint
     assert edges["accurate"] <= edges["balanced"] and edges["given"] == 0.0123
     with pytest.raises(OptionError, match=r"fusion\.max_psnr_drop_db"):
         with_texts(RunSettings(), ["fusion.max_psnr_drop_db=-1"])

@@ -45,15 +45,14 @@ def noisy(run, seed: int, sigma: float = 8.0) -> dict[str, np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def judged(small_run, tmp_path_factory):
+def judged(small_run, small_evaluation, tmp_path_factory):
     """The run itself, its pictures as a folder, and noisy truths, with evaluate's own figures."""
     root = tmp_path_factory.mktemp("judged")
     own = {f"generated_{f.name[:-4]}.png": f.picture for _, f, _ in load_run(small_run).targets()}
     write_pictures(root / "copied", own)
     write_pictures(root / "noisy", noisy(small_run, 0))
-    assert main(["evaluate", str(small_run), "--out", str(root / "figures"), "--quiet"]) == 0
     judge(small_run, root / "copied", root / "noisy", "--against", small_run, "--out", root / "out")
-    evaluation = json.loads((root / "figures" / "evaluation.json").read_text())
+    evaluation = json.loads((small_evaluation / "evaluation.json").read_text())
     return root / "out", read(root / "out"), evaluation["runs"][0]
 
 

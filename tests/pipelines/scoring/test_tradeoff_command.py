@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -16,16 +17,29 @@ from gvtools.settings import changes, with_texts, with_values
 from pipelines.cli import main
 from pipelines.commands.sweep import asked_for
 from pipelines.reconstruction.settings import RunSettings
+from pipelines.scoring import tradeoff
 from pipelines.scoring.tradeoff import EQUAL, changed
 
 pytestmark = pytest.mark.usefixtures("unpainted")
 
 # Another edge than the first guess, as if it had been measured.
-WIDER = ("--set", "fusion.voxel_scale=1.25", "--set", "refine.seconds=0")
+WIDER = ("--set", "fusion.voxel_scale=1.25", "--set", "refine.seconds=0",
+         "--set", "refine.poses=false")  # fmt: skip
 
 
 def rows(folder: Path, name: str) -> list[dict[str, str]]:
     return list(csv.DictReader((folder / f"{name}.csv").read_text().splitlines()))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def fewer_values() -> Iterator[None]:
+    """One value of each setting is tried, and no network."""
+    with pytest.MonkeyPatch.context() as patch:
+        real = tradeoff._values
+        patch.setattr(
+            tradeoff, "_values", lambda *plan: {key: some[:1] for key, some in real(*plan).items()}
+        )
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -52,6 +66,15 @@ def test_a_sweep_leaves_table_front_plot_and_profile(swept):
     assert 1.2 * stored[coarse] < stored["start"]
 
 
+@pytest.mark.slow
+def test_the_generative_core_is_tried_as_well(scan, tmp_path, monkeypatch):
+    completers = {"completer": ("none", "inpaint", "geoverse")}
+    monkeypatch.setattr(tradeoff, "_values", lambda *plan: completers)
+    command = ["tradeoff", str(scan), "--out", str(tmp_path / "out"), "--budget", "1h", "--quiet"]
+    assert main([*command, *WIDER]) == 0
+    assert "completer geoverse" in {row["trial"] for row in rows(tmp_path / "out", "trials")}
+
+
 @pytest.mark.parametrize("label", ["recommended", "profile accurate"])
 def test_reconstruct_gives_the_figures_of_a_trial(scan, swept, tmp_path, label):
     tried = {row["trial"]: row for row in rows(swept, "trials")}
@@ -63,17 +86,9 @@ def test_reconstruct_gives_the_figures_of_a_trial(scan, swept, tmp_path, label):
     else:
         trial = tried[label]
         chosen = ["--profile", "accurate", *WIDER]
-    arguments = [
-        "reconstruct",
-        str(scan),
-        "--refine",
-        "0",
-        "--context",
-        "every:2",
-        "--targets",
-        "every:2+1",
-    ]
-    assert main([*arguments, "--out", str(tmp_path / "run"), "--quiet", *chosen]) == 0
+    words = ["reconstruct", str(scan), "--refine", "0", "--set", "refine.poses=false"]
+    words += ["--context", "every:2", "--targets", "every:2+1"]
+    assert main([*words, "--out", str(tmp_path / "run"), "--quiet", *chosen]) == 0
     found = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert found["observations"] == float(trial["observations"])
     assert found["psnr"] == pytest.approx(float(trial["PSNR (dB)"]), abs=1e-6)

@@ -1,0 +1,18 @@
+"""What ``gvtools evaluate`` says of the small run, which tests of scores share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from figures import unpainted_figures
+
+from pipelines.cli import main
+
+
+@pytest.fixture(scope="session")
+def small_evaluation(small_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("figures")
+    with unpainted_figures():
+        assert main(["evaluate", str(small_run), "--out", str(out), "--quiet"]) == 0
+    return out
