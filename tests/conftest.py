@@ -6,11 +6,15 @@ import gc
 import os
 from collections.abc import Generator, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 from figures import unpainted_figures
 from hypothesis import settings
 from shared_data import shared_folder
+
+if TYPE_CHECKING:
+    from gvtools.evaluation.posed_picture import PosedPicture
 
 # As the command line has it: threads that spin while they wait are slow where others work, too.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
@@ -130,6 +134,14 @@ def small_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def small_scan(small_run: Path) -> Path:
     """The project of ``small_run``."""
     return small_run.parent / "scan"
+
+
+@pytest.fixture(scope="session")
+def wall_walk() -> list[PosedPicture]:
+    """Ten pictures of 160x120 of three textured walls, with exact depth."""
+    from walls import walk
+
+    return walk()
 
 
 @pytest.fixture(scope="module")

@@ -14,13 +14,13 @@ import pytest
 from command_line import refused
 from PIL import Image, ImageFilter
 from scipy.spatial.transform import Rotation
+from walls import walk
 
 from gvtools.capture.mapping import _explained, find_cameras
 from gvtools.capture.matching import MappingTask, only_turned
 from gvtools.capture.photographs import complete_masks, copy_upright, find_photographs
 from gvtools.capture.project import capture_photographs
 from gvtools.errors import ProjectError
-from gvtools.procedural.room_sample import write_room
 from gvtools.similarity import fit_similarity
 
 
@@ -256,19 +256,16 @@ def test_exif_tells_focal_length_place_and_camera(texture: Image.Image, tmp_path
             assert camera.focal_length == pytest.approx(focal / 43.27 * 500, rel=0.05), image.name
 
 
-@pytest.mark.slow
-def test_of_two_places_the_larger_is_kept(tmp_path: Path) -> None:
+def test_of_two_places_the_larger_is_kept(wall_walk, tmp_path: Path) -> None:
     folder = tmp_path / "photos"
     folder.mkdir()
-    for seed, views in ((0, 6), (3, 4)):
-        room = tmp_path / f"room{seed}"
-        write_room(room, seed=seed, views=10, width=360, height=270)
-        for path in sorted((room / "images").iterdir())[:views]:
-            shutil.copy(path, folder / f"room{seed}_{path.name}")
+    for place, pictures in (("large", wall_walk[:6]), ("small", walk(seed=3)[:4])):
+        for picture in pictures:
+            Image.fromarray(picture.rgb).save(folder / f"{place}_{picture.name}")
     report = capture_photographs(folder, tmp_path / "out")
-    assert {name[:5] for name in report.registered} == {"room0"}
+    assert {name[:5] for name in report.registered} == {"large"}
     assert len(report.registered) >= 5
     assert report.other_models == (4,)
     assert "in a further model of 4 pictures, which does not connect" in report.left_out.values()
-    left_out = {name for name in report.left_out if name.startswith("room3")}
-    assert left_out == {path.name for path in folder.glob("room3*")}
+    left_out = {name for name in report.left_out if name.startswith("small")}
+    assert left_out == {path.name for path in folder.glob("small*")}

@@ -17,6 +17,7 @@ from gvtools.capture.mapping import find_cameras
 from gvtools.capture.matching import MappingTask
 from gvtools.errors import CheckpointError, OptionError
 from gvtools.features import Features, LightGlueMatcher, SiftMatcher
+from gvtools.procedural.room_sample import write_room
 from gvtools.scenes.project import open_project
 
 
@@ -115,8 +116,9 @@ def test_what_a_matcher_finds_becomes_a_model(room: Path, tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
-def test_a_model_comes_of_random_networks(weights, room, tmp_path):
+def test_a_model_comes_of_random_networks(weights, tmp_path):
     """What DISK with random weights finds in neighbours is alike enough for a rough model."""
+    room = write_room(tmp_path / "room", views=10, width=360, height=270).folder
     names = sorted(path.name for path in (room / "images").iterdir())[:4]
     matcher = LightGlueMatcher("disk", weights=weights, max_features=1024)
     mapped = find_cameras(MappingTask(room / "images", [names], tmp_path, learned=matcher))

@@ -58,8 +58,8 @@ def test_a_shift_between_claim_and_picture_is_reported(probe, take, step, turn):
 
 def test_no_half_pixel_between_keypoints_and_cameras(probe, take):
     # In a picture upside down, an offset of the keypoints from the camera's convention counts
-    # twice; in one of half the size, it is another share of the picture. Half a pixel of 320
-    # across is 0.1 degrees.
+    # twice; in one of half the size, it is another share of the picture. Half a pixel of 200
+    # across is 0.15 degrees.
     for scale, turn in ((1.0, (0, 0, 180)), (1.0, (0, 0, 90)), (0.5, (0, 0, 0))):
         camera = camera_at((0.0, 0.0, 0.2), turn=turn, scale=scale)
         found = probe.locate(take(camera))
@@ -255,7 +255,14 @@ def test_keypoints_at_depth_edges_and_holes_are_left_out():
     depth[50, 20] = 0
     depth[60, 20] = np.nan
     xy = np.array(
-        [[99.9, 30.0], [90.0, 30.0], [20.4, 50.6], [21.2, 60.1], [0.1, 0.1], [319.9, 239.9]]
+        [
+            [99.9, 30.0],
+            [90.0, 30.0],
+            [20.4, 50.6],
+            [21.2, 60.1],
+            [0.1, 0.1],
+            [WIDTH - 0.1, HEIGHT - 0.1],
+        ]
     )
     points, ok = lift_keypoints(xy, depth, camera, edge=0.05)
     assert ok.tolist() == [False, True, False, False, True, True]

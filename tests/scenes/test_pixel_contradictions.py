@@ -2,27 +2,40 @@
 
 from __future__ import annotations
 
-import shutil
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from gvtools.procedural.room_sample import write_room
+from gvtools.cameras import concatenate
 from gvtools.scenes.inspection import inspect
 from gvtools.scenes.pixel_contradictions import probed
-from gvtools.scenes.project import open_project
+from gvtools.scenes.scene import Frame, Scene, SparsePoints, View
 
 
 @pytest.fixture(scope="module")
-def room(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("room") / "room"
-    write_room(folder, views=8)
-    return folder
+def room(wall_walk):
+    """A scene of eight views, and points of the first one's surface that the others show, too."""
+    camera, depth = wall_walk[0].camera, wall_walk[0].depth
+    x, y = (each.ravel() for each in np.meshgrid(*(np.arange(4, side, 8) for side in (160, 120))))
+    local = (depth[..., None] * camera.rays())[y, x]
+    pose = camera.world_from_cam[0]
+    points = local @ pose[:3, :3].T + pose[:3, 3]
+    xy, z = concatenate([view.camera for view in wall_walk[:8]]).project(points)
+    view, point = np.nonzero((z > 0) & (xy > 1).all(axis=2) & (xy < (159, 119)).all(axis=2))
+    sparse = SparsePoints(
+        points, np.zeros((len(points), 3), np.uint8), np.zeros(len(points), np.float32),
+        point.astype(np.int32), view.astype(np.int32), xy[view, point],
+    )  # fmt: skip
+    views = tuple(View(each.name, each.camera, partial(Frame, each.rgb)) for each in wall_walk[:8])
+    return Scene(Path("walls"), "colmap", views, sparse)
 
 
-def said(folder):
-    return [f.message for f in inspect(open_project(folder)).findings if "do not show" in f.message]
+def said(scene):
+    return [f.message for f in inspect(scene).findings if "do not show" in f.message]
 
 
 def shifted(pictures):
@@ -38,7 +51,7 @@ def cropped(pictures):
 
 
 def test_right_pictures_are_believed(room):
-    assert said(room) == [] and probed(open_project(room), open_project(room).names) == []
+    assert said(room) == [] and probed(room, room.names) == []
 
 
 @pytest.mark.parametrize(
@@ -51,16 +64,15 @@ def test_right_pictures_are_believed(room):
         (lambda pictures: [*pictures[:-1], pictures[-1][::-1]], "they fit turned upside down"),
     ],
 )
-def test_wrong_pictures_are_said_with_their_reason(room, tmp_path, change, reason):
-    folder = tmp_path / "room"
-    shutil.copytree(room, folder)
-    files = sorted(path for path in (folder / "images").iterdir())
-    pictures = change([cv2.imread(str(file)) for file in files])
-    for file, picture in zip(files, pictures, strict=True):
-        cv2.imwrite(str(file), np.ascontiguousarray(picture))
-    (message,) = said(folder)
+def test_wrong_pictures_are_said_with_their_reason(room, change, reason):
+    pictures = change([view.load().rgb for view in room])
+    views = [
+        replace(view, load=partial(Frame, np.ascontiguousarray(rgb)))
+        for view, rgb in zip(room.views, pictures, strict=True)
+    ]
+    scene = replace(room, views=tuple(views))
+    (message,) = said(scene)
     assert reason in message
-    scene = open_project(folder)
     wrong = 1 if "upside" in reason else 8
     assert f"{wrong} of 8 photographs" in message
     assert probed(scene, scene.names)

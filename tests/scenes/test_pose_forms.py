@@ -7,25 +7,19 @@ import os
 
 import numpy as np
 import pytest
+from walls import write_project
 
-from gvtools.procedural.room_sample import write_room
 from gvtools.scenes.inspection import inspect
 from gvtools.scenes.pose_forms import pose_findings
 from gvtools.scenes.project import open_project
-from gvtools.scenes.transforms import write_transforms
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 @pytest.fixture(scope="module")
-def room(tmp_path_factory):
-    """Six views of a room without tracks: ``transforms.json``."""
-    folder = tmp_path_factory.mktemp("room") / "room"
-    write_room(folder, views=6)
-    cameras = open_project(folder).cameras
-    names = [folder / "images" / name for name in cameras.names]
-    write_transforms(folder / "transforms.json", cameras, image_paths=names)
-    return folder / "transforms.json"
+def room(wall_walk, tmp_path_factory):
+    """Six views without tracks: ``transforms.json``."""
+    return write_project(tmp_path_factory.mktemp("room") / "room", wall_walk[:6])
 
 
 @pytest.mark.parametrize(
