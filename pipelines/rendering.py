@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from functools import cached_property
@@ -28,6 +28,7 @@ from gvtools.evaluation.images import FIGURES, view_figures
 from gvtools.evaluation.lpips_distance import Lpips
 from gvtools.files import replaced_when_written
 from gvtools.guidance import Guidance
+from gvtools.memory.panoramas import Rig
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.splat.api import SplatOptions
 from gvtools.optional import require
@@ -37,6 +38,7 @@ from gvtools.scenes.scene import Frame
 from gvtools.trajectories import PATHS, named_path
 from pipelines.reconstruction.rounds import CachedProjection, Clock, complete_targets
 from pipelines.reconstruction.settings import RunSettings
+from pipelines.spherical_metadata import mark_mp4, write_panorama
 from viz.viewer.render import picture_of
 
 
@@ -46,12 +48,23 @@ def render_view(
     options: SplatOptions | None = None,
     *,
     appearance: Appearance | None = None,
+    rig: Rig | None = None,
+    fill: Callable[[Guidance], Guidance] | None = None,
 ) -> tuple[Guidance, float]:
-    """One projection, with the colours of an appearance if there is one, and its seconds."""
+    """One projection, with the colours of an appearance if there is one, and its seconds.
+
+    Args:
+        rig: of another lens than the camera's.
+        fill: completes a pinhole camera's projection.
+    """
     start = time.perf_counter()
-    guidance = memory.project(camera, options=options)
-    if appearance is not None:
-        guidance = recolor(guidance, appearance.picture(camera), blend=appearance.blend)
+    views = []
+    for face in [camera] if rig is None else rig.cameras(camera):
+        guidance = memory.project(face, options=options)
+        if appearance is not None:
+            guidance = recolor(guidance, appearance.picture(face), blend=appearance.blend)
+        views.append(guidance if fill is None else fill(guidance))
+    guidance = views[0] if rig is None else rig.joined(views, camera)
     return guidance, time.perf_counter() - start
 
 
@@ -121,8 +134,13 @@ def _reason(key: str) -> str:
     return "no pixel to compare"
 
 
-def write_view(folder: Path, stem: PurePosixPath, guidance: Guidance) -> None:
-    """Write the four files of one view; sub-folders of ``stem`` are made, too."""
+def write_view(
+    folder: Path, stem: PurePosixPath, guidance: Guidance, *, panorama: bool = False
+) -> None:
+    """Write the four files of one view; sub-folders of ``stem`` are made, too.
+
+    Of a panorama the picture is written as ``NAME.jpg`` besides: many viewers take no other.
+    """
     confidence = guidance.confidence[0].astype(np.float64)
     pictures = {
         "rgb": to_bytes(guidance.rgb[0]),
@@ -132,7 +150,10 @@ def write_view(folder: Path, stem: PurePosixPath, guidance: Guidance) -> None:
     base = folder / stem
     for kind, picture in pictures.items():
         with replaced_when_written(base.with_name(f"{base.name}.{kind}.png")) as temporary:
-            write_png(temporary, picture)
+            (write_panorama if panorama and kind == "rgb" else write_png)(temporary, picture)
+    if panorama:
+        with replaced_when_written(base.with_name(f"{base.name}.jpg")) as temporary:
+            write_panorama(temporary, pictures["rgb"], form="JPEG")
     path = base.with_name(f"{base.name}.depth.npz")
     with replaced_when_written(path) as temporary, temporary.open("wb") as file:
         np.savez_compressed(file, depth=guidance.depth[0].astype(np.float32))
@@ -240,11 +261,13 @@ class FilmRenderer:
     """Draws the frames of one film, of a run's folder or a memory file.
 
     All ``cameras`` have one size; the memory is drawn as it was after round ``up_to``, None: the
-    last.
+    last. ``rig`` is of another lens than theirs.
     """
 
-    def __init__(self, path: Path, cameras: Cameras, *, up_to: int | None = None) -> None:
-        self.path, self.cameras, self.up_to = path, cameras, up_to
+    def __init__(
+        self, path: Path, cameras: Cameras, *, up_to: int | None = None, rig: Rig | None = None
+    ) -> None:
+        self.path, self.cameras, self.up_to, self.rig = path, cameras, up_to, rig
         self.memory = load_memory(path, up_to=up_to)
         self.appearance: Appearance | None = load_appearance(path)
         # Seconds spent on projecting the memory and drawing the Gaussians.
@@ -260,22 +283,35 @@ class FilmRenderer:
     def _panel(self, index: int, panel: str) -> Picture:
         camera = self.cameras[index]
         if panel == "observed":
-            return picture_of(self._projected(self._observed, camera))
+            return self._shown(self._projected(self._observed, camera))
         if panel == "completed":
-            return self._filled(self._projected(self._completed, camera))
+            return self._shown(self._projected(self._completed, camera, fill=self._filled))
         guidance = self._projected(self.memory, camera)
-        return self._depth(guidance) if panel == "depth" else picture_of(guidance)
+        return self._depth(guidance) if panel == "depth" else self._shown(guidance)
 
-    def _projected(self, memory: SpatialMemory, camera: Cameras) -> Guidance:
-        guidance, seconds = render_view(memory, camera, appearance=self.appearance)
+    def _projected(
+        self, memory: SpatialMemory, camera: Cameras, *,
+        fill: Callable[[Guidance], Guidance] | None = None,
+    ) -> Guidance:  # fmt: skip
+        guidance, seconds = render_view(
+            memory, camera, appearance=self.appearance, rig=self.rig, fill=fill
+        )
         self.projecting += seconds
         return guidance
 
-    def _filled(self, guidance: Guidance) -> Picture:
+    def _filled(self, guidance: Guidance) -> Guidance:
         if guidance.valid.all() or not guidance.valid.any():
-            return picture_of(guidance)
+            return guidance
         completion = run_completer(self._inpaint, (), guidance)
-        return picture_of(replace(guidance, rgb=completion.rgb, valid=completion.depth > 0))
+        return replace(guidance, rgb=completion.rgb, valid=completion.depth > 0)
+
+    def _shown(self, guidance: Guidance) -> Picture:
+        return self._outside_black(picture_of(guidance))
+
+    def _outside_black(self, picture: Picture) -> Picture:
+        if self.rig is not None:
+            picture[~self.rig.inside] = 0
+        return picture
 
     def _depth(self, guidance: Guidance) -> Picture:
         from matplotlib import colormaps
@@ -286,7 +322,7 @@ class FilmRenderer:
         colors = colormaps["turbo"](np.clip(np.nan_to_num(share), 0, 1))[..., :3]
         picture = np.rint(255 * colors).astype(np.uint8)
         picture[~guidance.valid[0]] = 255
-        return picture
+        return self._outside_black(picture)
 
     @cached_property
     def _inpaint(self):
@@ -323,10 +359,14 @@ class FilmRenderer:
         return float(near), float(max(far, near * 1.001))
 
     def _spread_cameras(self, most: int) -> list[Cameras]:
-        """At most so many of the cameras, evenly along the path."""
+        """At most so many of the cameras, evenly along the path; of a rig twice so many faces."""
         count = len(self.cameras)
+        most = most if self.rig is None else max(1, 2 * most // len(self.rig.faces))
         rows = np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(int))
-        return [self.cameras[int(row)] for row in rows]
+        spread = [self.cameras[int(row)] for row in rows]
+        if self.rig is None:
+            return spread
+        return [face for camera in spread for face in self.rig.cameras(camera)]
 
 
 def captioned(picture: Picture, text: str) -> Picture:
@@ -352,11 +392,18 @@ def check_suffix(path: Path) -> None:
         require("av", extra="film", purpose=purpose, instead=instead)
 
 
-def write_film(path: Path, frames: Iterable[NDArray[np.uint8]], *, fps: float) -> None:
-    """Write frames of one even size to a file with one of SUFFIXES; it appears when whole."""
+def write_film(
+    path: Path, frames: Iterable[NDArray[np.uint8]], *, fps: float, panorama: bool = False
+) -> None:
+    """Write frames of one even size to a file with one of SUFFIXES; it appears when whole.
+
+    An MP4 of panoramas says so.
+    """
     with replaced_when_written(path) as temporary:
         if path.suffix.lower() == ".mp4":
             _write_mp4(temporary, frames, fps=fps)
+            if panorama:
+                mark_mp4(temporary)
         else:
             _write_animation(temporary, frames, form=path.suffix[1:].upper(), fps=fps)
 

@@ -9,12 +9,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
 
+from gvtools.cameras import Cameras, concatenate
 from gvtools.errors import CheckpointError, OptionError
 from gvtools.scenes.layout import FORM, is_address
 from pipelines.options import Arguments
 
 if TYPE_CHECKING:
     from gvtools.evaluation.lpips_distance import Lpips
+    from gvtools.memory.panoramas import Rig
+    from gvtools.memory.spatial_memory import SpatialMemory
     from gvtools.scenes.scene import Scene
     from pipelines.scoring.measurement import MeasureOptions
 
@@ -104,6 +107,36 @@ class SceneArguments(RecordingArguments, RootArguments):
         from gvtools.scenes.project import open_as
 
         return open_as(path, self.reading())
+
+
+class LensArguments(Arguments):
+    """The lens of pictures and films."""
+
+    lens: Literal["perspective", "equirectangular", "fisheye"] = "perspective"
+    """Equirectangular is a level panorama of all directions, fisheye an equidistant circle."""
+    field_of_view: float | None = Field(None, ge=10, le=360)
+    """Across a fisheye's circle (180). [degrees]"""
+    width: int | None = Field(None, ge=16, le=32768)
+    """Of a picture; the height follows (the cameras'; of another lens as fine as they are, at most
+    8192, in a film 2048). [pixels]"""
+
+    def rig(
+        self, cameras: Cameras, memory: SpatialMemory, *, widest: int
+    ) -> tuple[Rig | None, Cameras]:
+        """What takes pictures in the place of some cameras, None where these do; and from where."""
+        from gvtools.memory.panoramas import LensOptions, Rig, picture_cameras
+
+        if self.field_of_view is not None and self.lens != "fisheye":
+            raise OptionError("--field-of-view: belongs to --lens fisheye; give that or neither")
+        if self.lens == "perspective":
+            return None, cameras
+        options = LensOptions(
+            kind=self.lens, width=self.width, field_of_view=self.field_of_view or 180.0
+        )
+        views = [view.camera for view in memory.views.photographed]
+        captured = concatenate(views) if views else cameras
+        rig = Rig.of(options, cameras, widest=widest)
+        return rig, picture_cameras(cameras, options, captured=captured)
 
 
 class LpipsArguments(Arguments):

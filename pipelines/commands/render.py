@@ -10,8 +10,12 @@ from typing import TYPE_CHECKING
 from pydantic import Field
 
 from gvtools.errors import OptionError
-from pipelines.commands.arguments import EMPTY, LpipsArguments, SceneArguments
-from pipelines.options import Arguments
+from pipelines.commands.arguments import (
+    EMPTY,
+    LensArguments,
+    LpipsArguments,
+    SceneArguments,
+)
 
 if TYPE_CHECKING:
     import numpy as np
@@ -24,13 +28,15 @@ if TYPE_CHECKING:
     from pipelines.console import Console
 
 
-class RenderCommand(LpipsArguments, SceneArguments):
+class RenderCommand(LensArguments, LpipsArguments, SceneArguments):
     """Project a saved memory into cameras, and measure it against their pictures."""
 
     examples = (
         "gvtools render runs/kitchen --cameras scans/kitchen --views every:20 --out renders",
         "gvtools render runs/kitchen --cameras scans/kitchen --views every:20+10 --against-images "
         "--out renders --json figures.json",
+        "gvtools render runs/kitchen --cameras scans/kitchen --views first:1 "
+        "--lens equirectangular --out panoramas",
     )
     positional = ("memory",)
 
@@ -56,9 +62,9 @@ class RenderCommand(LpipsArguments, SceneArguments):
 
     def run(self, console: Console) -> None:
         from gvtools.files import write_json
+        from gvtools.memory.panoramas import WIDEST_STILL
         from gvtools.runs.layout import file_stems
-        from gvtools.runs.run import at_run_poses, load_appearance, load_memory
-        from gvtools.scenes.selection import select
+        from gvtools.runs.run import load_appearance, load_memory
         from pipelines.rendering import measure, render_view, summary, write_view
 
         if self.out is None and not self.against_images:
@@ -69,32 +75,25 @@ class RenderCommand(LpipsArguments, SceneArguments):
         memory, appearance = load_memory(self.memory), load_appearance(self.memory)
         if not len(memory.views):
             raise OptionError(f"{self.memory}: {EMPTY}")
-        cameras, scene = _cameras(self, memory)
-        poses = ""
-        if scene is not None:
-            scene, poses = at_run_poses(scene, self.memory)
-            cameras = scene.cameras
-            if poses:
-                console.line(poses)
-        if self.against_images and scene is None:
-            raise OptionError(
-                f"--against-images: {self.cameras} is a trajectory without pictures; give a project"
-            )
-        names = select(cameras.names, self.views)
-        row_of = {name: row for row, name in enumerate(cameras.names)}
-        stems = file_stems(names)
+        cameras, scene, poses = self._cameras(memory)
+        if poses:
+            console.line(poses)
+        rig, cameras = self.rig(cameras, memory, widest=WIDEST_STILL)
+        stems = file_stems(cameras.names)
         lpips, no_lpips = self.open_lpips() if self.against_images else (None, None)
         # The first projection compiles or loads the kernels and is not timed.
-        memory.project(cameras[row_of[names[0]]], options=options)
+        memory.project(cameras[0], options=options)
         views = []
-        for name in console.track(names, "rendering"):
-            guidance, seconds = render_view(
-                memory, cameras[row_of[name]], options, appearance=appearance
-            )
+        for camera in console.track(list(cameras), "rendering"):
+            (name,) = camera.names
+            guidance, seconds = render_view(memory, camera, options, appearance=appearance, rig=rig)
             frame = scene[name].load() if scene is not None and self.against_images else None
             if self.out is not None:
-                write_view(self.out, stems[name], guidance)
+                panorama = self.lens == "equirectangular"
+                write_view(self.out, stems[name], guidance, panorama=panorama)
             views.append(measure(name, guidance, frame, seconds=seconds, lpips=lpips))
+            if rig is not None:
+                views[-1]["coverage"] = float(guidance.valid[0][rig.inside].mean())
         figures = summary(views, compared=self.against_images, no_lpips=no_lpips)
         if poses:
             figures["poses"] = poses
@@ -111,6 +110,51 @@ class RenderCommand(LpipsArguments, SceneArguments):
         if self.out is not None:
             console.line(f"{len(views)} views in {self.out}")
 
+    def _cameras(self, memory: SpatialMemory) -> tuple[Cameras, Scene | None, str]:
+        """The chosen cameras, their project, if it is one, and what is said of its poses."""
+        from gvtools.cameras import concatenate
+        from gvtools.runs.run import at_run_poses
+        from gvtools.scenes.selection import select
+
+        scene, poses = None, ""
+        if self.cameras.is_file() and self.cameras.suffix.lower() != ".json":
+            cameras = self._trajectory(memory)
+        else:
+            scene, poses = at_run_poses(self.open_scene(self.cameras), self.memory)
+            cameras = scene.cameras
+        if self.against_images:
+            if scene is None:
+                raise OptionError(
+                    f"--against-images: {self.cameras} is a trajectory without pictures; give a "
+                    "project"
+                )
+            if self.lens != "perspective" or self.width:
+                raise OptionError(
+                    "--against-images: compares pictures as the project has them; leave --lens and "
+                    "--width out"
+                )
+        cameras = cameras[list(map(cameras.names.index, select(cameras.names, self.views)))]
+        if self.lens == "perspective" and self.width:
+            shares = self.width / cameras.width
+            heights = np.maximum(1, np.rint(cameras.height * shares)).astype(int)
+            cameras = concatenate(
+                [c.resized(self.width, int(h)) for c, h in zip(cameras, heights, strict=True)]
+            )
+        return cameras, scene, poses
+
+    def _trajectory(self, memory: SpatialMemory) -> Cameras:
+        from gvtools.trajectory_files import read_trajectory
+
+        if self.memory.suffix.lower() == ".ply":
+            raise OptionError(
+                f"--cameras {self.cameras}: a trajectory takes its camera from the memory's views, "
+                f"and {self.memory} is a PLY without any; give the run or its memory.npz"
+            )
+        photographed = memory.views.photographed
+        if not photographed:
+            raise OptionError(f"{self.memory}: no photograph's view; give a project as --cameras")
+        return read_trajectory(self.cameras, photographed[0].camera)
+
 
 def splat_options(texts: Sequence[str]) -> SplatOptions:
     """The projection's options, changed by ``splat.KEY=VALUE`` texts."""
@@ -123,30 +167,14 @@ def splat_options(texts: Sequence[str]) -> SplatOptions:
     return with_texts(RunSettings(), texts).splat
 
 
-def _cameras(args: RenderCommand, memory: SpatialMemory) -> tuple[Cameras, Scene | None]:
-    if args.cameras.is_file() and args.cameras.suffix.lower() != ".json":
-        from gvtools.trajectory_files import read_trajectory
-
-        if args.memory.suffix.lower() == ".ply":
-            raise OptionError(
-                f"--cameras {args.cameras}: a trajectory takes its camera from the memory's views, "
-                f"and {args.memory} is a PLY without any; give the run or its memory.npz"
-            )
-        photographed = memory.views.photographed
-        if not photographed:
-            raise OptionError(f"{args.memory}: no photograph's view; give a project as --cameras")
-        return read_trajectory(args.cameras, photographed[0].camera), None
-    scene = args.open_scene(args.cameras)
-    return scene.cameras, scene
-
-
-class FilmCommand(Arguments):
+class FilmCommand(LensArguments):
     """Write a film of a path through a memory."""
 
     examples = (
         "gvtools film runs/kitchen --path spiral:240 --out kitchen.mp4",
         "gvtools film runs/kitchen --path orbit:120 --compare observed,completed --out both.mp4",
         "gvtools film runs/kitchen --path interpolate:60 --growth --width 480 --out growth.gif",
+        "gvtools film runs/kitchen --path interpolate:240 --lens equirectangular --out around.mp4",
     )
     positional = ("memory",)
     exclusive = (("complete", "depth", "compare"),)
@@ -161,8 +189,6 @@ class FilmCommand(Arguments):
     """FILE.mp4, FILE.gif or FILE.webp. [FILE]"""
     fps: float = Field(24.0, gt=0, le=240)
     """Frames a second. [N]"""
-    width: int | None = Field(None, ge=16)
-    """Of a panel; the height follows (the cameras'). [pixels]"""
     round: int | None = None
     """The memory as it was after round R. [R]"""
     complete: bool = False
@@ -175,6 +201,7 @@ class FilmCommand(Arguments):
     """The path once for each round, as memory was then."""
 
     def run(self, console: Console) -> None:
+        from gvtools.memory.panoramas import WIDEST_FRAME
         from gvtools.runs.run import load_memory
         from pipelines.rendering import (
             FilmRenderer,
@@ -191,7 +218,10 @@ class FilmCommand(Arguments):
         memory = load_memory(self.memory, up_to=self.round)
         if not len(memory):
             raise OptionError(f"{self.memory}: {EMPTY}")
-        cameras = film_cameras(memory, self.path, width=self.width, run=self.memory)
+        width = self.width if self.lens == "perspective" else None
+        cameras = film_cameras(memory, self.path, width=width, run=self.memory)
+        rig, cameras = self.rig(cameras, memory, widest=WIDEST_FRAME)
+        columns, rows = rig.size if rig else (int(cameras.width[0]), int(cameras.height[0]))
         rounds = memory.rounds if self.growth else (self.round,)
         del memory
         start, projecting = time.perf_counter(), 0.0
@@ -199,7 +229,7 @@ class FilmCommand(Arguments):
         def frames() -> Iterator[NDArray[np.uint8]]:
             nonlocal projecting
             for number in rounds:
-                renderer = FilmRenderer(self.memory, cameras, up_to=number)
+                renderer = FilmRenderer(self.memory, cameras, up_to=number, rig=rig)
                 of_round = f" of round {number}" if self.growth else ""
                 for index in console.track(range(len(cameras)), f"drawing frames{of_round}"):
                     frame = renderer.frame(index, panels, captions=len(panels) > 1)
@@ -208,12 +238,13 @@ class FilmCommand(Arguments):
                     yield frame
                 projecting += renderer.projecting
 
-        write_film(self.out, frames(), fps=self.fps)
+        panorama = self.lens == "equirectangular" and len(panels) == 1
+        write_film(self.out, frames(), fps=self.fps, panorama=panorama)
         count = len(cameras) * len(rounds)
         each = (time.perf_counter() - start) / count
         console.line(
-            f"{self.out}: {count} frames of {len(panels) * int(cameras.width[0])}x"
-            f"{int(cameras.height[0])}, {count / self.fps:.1f} s; {each:.3f} s a frame, of which "
+            f"{self.out}: {count} frames of {len(panels) * columns}x{rows}, "
+            f"{count / self.fps:.1f} s; {each:.3f} s a frame, of which "
             f"projecting {projecting / count:.3f}"
         )
 
