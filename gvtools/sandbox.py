@@ -99,7 +99,10 @@ def main() -> None:
 def _limited(items: Iterator[Item], size: int) -> Iterator[Item]:
     """The items of a reader that has loaded its packages before the first, under limits."""
     next(items)
-    import resource
+    try:
+        import resource
+    except ImportError:  # Windows: nothing is limited
+        return items
 
     seconds = int(SECONDS + SECONDS_PER_BYTE * size)
     resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))

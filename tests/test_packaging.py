@@ -127,3 +127,40 @@ def test_a_foreign_package_first_on_the_path_is_one_line(name, content, tmp_path
         env={**os.environ, "PYTHONPATH": path}, capture_output=True,
     )  # fmt: skip
     assert done.returncode == 1 and f"ImportError: package {name!r} is found at" in done.stderr
+
+
+ELSEWHERE = """
+import importlib, os, pkgutil, sys
+import cv2, kornia, matplotlib.pyplot, numba, open3d, pycolmap, scipy.optimize, skimage, torch
+for name in ("fcntl", "grp", "posix", "pty", "pwd", "resource", "syslog", "termios", "tty"):
+    sys.modules[name] = None
+for name in ("fork", "getloadavg", "getuid", "kill", "sched_getaffinity", "setsid", "statvfs"):
+    delattr(os, name)
+sys.platform = sys.argv[1]
+own = ("gvtools", "pipelines", "viz")
+for module in (m for name in own for m in pkgutil.walk_packages([name], name + ".")):
+    try:
+        importlib.import_module(module.name)
+    except ImportError as error:  # of an extra that is not installed
+        if error.name in sys.modules or error.name.split(".")[0] in own:
+            print(f"{module.name}: {error!r}")
+from tiny_scan import write_scan
+from pathlib import Path
+from pipelines.cli import main
+scan = write_scan(Path(sys.argv[2]) / "scan", views=5)
+words = ("--refine", "0", "--quiet", "--out", str(scan.with_name("run")))
+sys.exit(main(["reconstruct", str(scan), *words]))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("platform", ["win32", "darwin"])
+def test_all_modules_and_a_run_need_nothing_of_posix(platform, tmp_path):
+    path = os.pathsep.join([str(ROOT), str(ROOT / "tests" / "fixtures")])
+    done = subprocess.run(
+        [sys.executable, "-c", ELSEWHERE, platform, tmp_path], cwd=ROOT, text=True,
+        env={**os.environ, "PYTHONPATH": path}, capture_output=True,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert done.stdout.strip() == ""
+    assert (tmp_path / "run" / "memory.npz").is_file()

@@ -267,16 +267,19 @@ def folder_lock(path: Path) -> Iterator[None]:
     """Make the folder if need be; as long as the block lasts, other processes are kept out."""
     try:
         path.mkdir(parents=True, exist_ok=True)
-        handle = os.open(path, os.O_RDONLY)
+        # Windows opens no folder, and knows no locks of them.
+        handle = os.open(path, os.O_RDONLY) if os.name == "posix" else None
     except OSError as error:
         raise ProjectError(
             f"{path}: cannot be made ({error.strerror}); give another --out"
         ) from None
     try:
-        _lock(path, handle)
+        if handle is not None:
+            _lock(path, handle)
         yield
     finally:
-        os.close(handle)
+        if handle is not None:
+            os.close(handle)
 
 
 def _lock(path: Path, handle: int) -> None:

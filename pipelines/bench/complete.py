@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import os
-import resource
 import statistics
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -25,6 +24,7 @@ from gvtools.completers.geoverse.weights import from_pretrained
 from gvtools.networks.compute import autocast, name_of
 from pipelines.bench.options import CompleteOptions
 from pipelines.bench.random_model import random_features, random_model, random_video, random_views
+from pipelines.machine import load_average, process_peak_bytes
 
 if TYPE_CHECKING:
     from pipelines.console import Console
@@ -100,7 +100,7 @@ def peak_bytes(device: torch.device) -> int:
     """See ``PEAK``."""
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device)
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    return process_peak_bytes() or 0
 
 
 PASS = "pass"
@@ -238,7 +238,7 @@ def _conditions(options: CompleteOptions, config: GeoVerseConfig) -> dict[str, A
         "torch": torch.__version__,
         "threads": torch.get_num_threads(),
         "cpus": os.cpu_count(),
-        "load": os.getloadavg()[0],
+        "load": load_average(),
     }
 
 

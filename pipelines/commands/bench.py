@@ -13,6 +13,7 @@ from pydantic import Field
 
 from gvtools.errors import OptionError
 from pipelines.bench.options import CompleteOptions
+from pipelines.machine import load_average
 from pipelines.options import Arguments, add_settings
 
 if TYPE_CHECKING:
@@ -73,7 +74,6 @@ class BenchCommand(Arguments):
             names = ", ".join(sorted(f"--{name.replace('_', '-')}" for name in given))
             raise OptionError(f"bench {self.what}: {names} given, which only complete knows")
         points = POINTS[self.what] if self.points is None else self.points
-        import os
 
         if self.what == "fuse":
             from pipelines.bench.side_by_side import fuse_rows
@@ -83,7 +83,7 @@ class BenchCommand(Arguments):
             from pipelines.bench.side_by_side import splat_rows
 
             rows = splat_rows(points, repeat=self.repeat)
-        report(rows, console, self.json_, bench=self.what, points=points, load=os.getloadavg()[0])
+        report(rows, console, self.json_, bench=self.what, points=points, load=load_average())
 
 
 def _run_complete(args: BenchCommand, given: dict[str, Any], console: Console) -> None:

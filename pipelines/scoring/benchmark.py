@@ -25,6 +25,7 @@ from gvtools.evaluation.published import Benchmark, load_benchmark
 from gvtools.files import digest, make_folder, write_json
 from gvtools.untrusted import read_json
 from pipelines.console import Console, Silent
+from pipelines.machine import process_peak_bytes
 from pipelines.scoring.benchmark_scenes import (
     at_benchmark_size,
     masked_figures,
@@ -248,7 +249,7 @@ def _of_run(opened: _OpenCell) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     from pipelines.scoring.evaluation import evaluate_run
 
     seconds = _reconstruct(opened)
-    peak = peak_bytes()
+    peak = process_peak_bytes()
     run = load_run(opened.cell.run)
     figures = evaluate_run(run, opened.options, console=Silent())
     pictures = {target.name: files.picture for target, files, _ in run.targets()}
@@ -351,21 +352,6 @@ def _summary(evaluation: Mapping[str, Any]) -> dict[str, Any]:
         "masked_share": evaluation["images"]["settings"]["masked_share"],
         "notes": evaluation["images"]["notes"],
     }
-
-
-def peak_bytes() -> int | None:
-    """Peak memory (RSS) of this process, bytes; None where the system does not tell."""
-    try:
-        with open("/proc/self/status", encoding="ascii") as status:
-            return next(int(line.split()[1]) * 1024 for line in status if line[:6] == "VmHWM:")
-    except (OSError, StopIteration):
-        pass
-    try:
-        import resource
-    except ImportError:
-        return None
-    # Bytes on macOS; Linux, where these are kilobytes, was read above.
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
 def _gpu_bytes() -> int | None:

@@ -22,7 +22,7 @@ from pipelines.scoring.benchmark import (
     _end_of_process,
     measure_apart,
     parse_methods,
-    peak_bytes,
+    process_peak_bytes,
     read_cell,
 )
 from pipelines.scoring.benchmark_scenes import (
@@ -121,9 +121,9 @@ def test_pictures_are_sought_by_scene_and_number_of_views(tmp_path):
 
 
 def test_peak_memory_follows_what_is_held():
-    before = peak_bytes()
+    before = process_peak_bytes()
     held = np.ones(60_000_000, np.uint8)
-    after = peak_bytes()
+    after = process_peak_bytes()
     assert held.sum() and before is not None and after is not None
     assert after >= max(before, 60_000_000)
 
