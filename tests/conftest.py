@@ -157,6 +157,6 @@ def one_thread() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def unpainted() -> Iterator[None]:
-    """Figures and reports of runs are made, and not painted."""
+    """Figures of runs are neither drawn nor painted; reports are made of one pixel for each."""
     with unpainted_figures():
         yield

@@ -64,6 +64,12 @@ def said(run: Path) -> str:
     return str(caught.value)
 
 
+def resumed(run: Path) -> int:
+    project = json.loads((run / "run.json").read_text())["project"]
+    words = ["reconstruct", project, "--out", str(run), "--resume", "--quiet"]
+    return main([*words, *settings(*FIT)])
+
+
 READ = ("run.json", "round_000/report.json", "round_001/report.json", "memory.npz",
         "round_000/appearance.npz", "round_001/generated_*.png", "round_001/valid_*.png",
         "round_001/depth_*.npz")  # fmt: skip
@@ -82,9 +88,7 @@ def test_what_only_people_read_is_written_anew(run, whole):
     """rounds.jsonl, metrics.json and the PLY are made of the others by the next --resume."""
     for name in ("rounds.jsonl", "metrics.json", "memory.ply"):
         cut(run / name)
-    record = json.loads((run / "run.json").read_text())
-    words = ["reconstruct", record["project"], "--out", str(run), "--quiet", *settings(*FIT)]
-    assert main([*words, "--resume"]) == 0
+    assert resumed(run) == 0
     assert (run / "rounds.jsonl").read_bytes() == (whole / "rounds.jsonl").read_bytes()
     assert (run / "memory.ply").read_bytes() == (whole / "memory.ply").read_bytes()
     json.loads((run / "metrics.json").read_text())
@@ -169,9 +173,7 @@ def _assert_same_arrays(path: Path, before: Path) -> None:
 def test_a_flipped_bit_is_named_when_the_run_goes_on(run, name, capsys):
     (path,) = (run / "round_001").glob(name)
     flip(path, path.stat().st_size // 2, 0)
-    record = json.loads((run / "run.json").read_text())
-    words = ["reconstruct", record["project"], "--out", str(run), "--quiet", *settings(*FIT)]
-    assert main([*words, "--resume"]) == 2
+    assert resumed(run) == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert path.name in line and ("damaged" in line or "no readable report" in line)
 

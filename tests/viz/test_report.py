@@ -75,7 +75,7 @@ def own(small_run, tmp_path):
 
 
 def written(run: Path, *more: object, painted: bool = False) -> Page:
-    with nullcontext() if painted else unpainted_figures():
+    with nullcontext() if painted else unpainted_figures(drawn=True):
         assert main(["report", str(run), "--quiet", *map(str, more)]) == 0
     return Page(run / "report.html")
 
@@ -184,7 +184,7 @@ def test_a_run_that_has_its_project_open_writes_the_same_page(own, small_scan):
     config = RunSettings(context="first:3", targets="range:4-7", views_per_round=2, refine=refine)
     before = (own / "report.html").read_bytes()
     (own / "report.html").unlink()
-    with unpainted_figures():
+    with unpainted_figures(drawn=True):
         write_report(make_plan(open_project(small_scan), config), own)
     assert (own / "report.html").read_bytes() == before
 
@@ -262,7 +262,7 @@ def test_no_text_of_a_users_files_becomes_markup(own, tmp_path):
         sheets=Sheets([SheetRow(evil, tiles)], evil),
         poses=replace(report.poses, note=evil, errors=[(evil, 1.0, None)]),
     )  # fmt: skip
-    with unpainted_figures():
+    with unpainted_figures(drawn=True):
         (tmp_path / "evil.html").write_text(report_html(report), encoding="utf-8")
     page = Page(tmp_path / "evil.html")
     assert "script" not in page.tags

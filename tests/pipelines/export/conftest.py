@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 from box_project import write_box
 from export_runs import SavedRun, saved_run
+from figures import unpainted_figures
 
 import gvtools
 from gvtools.runs.run import Run
@@ -35,6 +36,8 @@ def reconstructed_run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     folder = tmp_path_factory.mktemp("reconstructed")
     write_box(folder)
     settings = {"rounds": 2, "views_per_round": 1, "voxel": 0.03, "refine.seconds": 0}
-    return gvtools.reconstruct(
-        folder, folder / "run", context="every:3", targets="every:3+1", settings=settings
-    )
+    settings["refine.poses"] = False
+    with unpainted_figures():
+        return gvtools.reconstruct(
+            folder, folder / "run", context="every:3", targets="every:3+1", settings=settings
+        )

@@ -52,8 +52,21 @@ def scenes(tmp_path):
     return path
 
 
+def quick(scenes: Path) -> None:
+    scenes.write_text(LIST.format(first=QUICK).replace("weights list {first}", QUICK))
+
+
 def planned(path: Path, out: Path) -> list[Task]:
     return tasks_of(read_list(path), str(out), folder=path.parent)
+
+
+def task_of(tmp_path: Path, command: str, **needs: object) -> Task:
+    """The task of a list of one scene and one stage."""
+    (tmp_path / "a").mkdir()
+    stage = {"command": command, **needs}
+    spec = FleetSpec(stages={"stage": stage}, scenes=[{"project": "a"}])
+    (task,) = tasks_of(spec, str(tmp_path / "o"), folder=tmp_path)
+    return task
 
 
 class Script:
@@ -127,7 +140,7 @@ def test_lost_workers_are_replaced_and_a_failure_skips_what_follows(scenes, tmp_
 
 
 def test_a_list_runs_once_and_its_failures_are_told(scenes, tmp_path, capsys):
-    scenes.write_text(LIST.format(first=QUICK).replace("weights list {first}", QUICK))
+    quick(scenes)
     out = tmp_path / "out"
     scenes.write_text(scenes.read_text().replace("[scans/*]", "[scans/a]"))
     command = ["fleet", str(scenes), "--engine", "processes", "--out", str(out)]
@@ -162,12 +175,8 @@ def test_a_command_that_was_killed_may_be_tried_again_and_a_wrong_input_not(
 
 def test_a_capture_that_ended_before_its_record_is_made_again(tmp_path, monkeypatch):
     """It refuses a folder that is there, and would so fail each time that the fleet goes on."""
-    (tmp_path / "a").mkdir()
-    spec = FleetSpec(
-        stages={"take": {"command": "capture {project} --out {out}"}}, scenes=[{"project": "a"}]
-    )
-    (task,) = tasks_of(spec, str(tmp_path / "o"), folder=tmp_path)
-    out = tmp_path / "o" / "a" / "take"
+    task = task_of(tmp_path, "capture {project} --out {out}")
+    out = tmp_path / "o" / "a" / "stage"
     seen = []
 
     def ran(*_, **__):
@@ -182,18 +191,14 @@ def test_a_capture_that_ended_before_its_record_is_made_again(tmp_path, monkeypa
     assert seen == [False, False]
     # What no attempt of the fleet has made is never removed.
     Path(task.record()).unlink()
-    (tmp_path / "o" / "a" / "take.log").unlink()
+    (tmp_path / "o" / "a" / "stage.log").unlink()
     with pytest.raises(FileExistsError):
         run_task(task)
     assert seen[2:] == [True]
 
 
 def test_a_merge_goes_on_where_an_attempt_stopped(tmp_path, monkeypatch):
-    (tmp_path / "a").mkdir()
-    spec = FleetSpec(
-        stages={"join": {"command": "merge {project} --out {out}"}}, scenes=[{"project": "a"}]
-    )
-    (task,) = tasks_of(spec, str(tmp_path / "o"), folder=tmp_path)
+    task = task_of(tmp_path, "merge {project} --out {out}")
     words: list[list[str]] = []
 
     def failing(command, **_):
@@ -202,7 +207,7 @@ def test_a_merge_goes_on_where_an_attempt_stopped(tmp_path, monkeypatch):
 
     monkeypatch.setattr("pipelines.fleet.task.subprocess.run", failing)
     run_task(task)
-    (tmp_path / "o" / "a" / "join").mkdir()
+    (tmp_path / "o" / "a" / "stage").mkdir()
     run_task(task)
     assert ["--resume" in command for command in words] == [False, True]
 
@@ -264,7 +269,7 @@ def test_a_second_driver_of_a_folder_is_refused(scenes, tmp_path, capsys):
 
 
 def test_slurm_scripts_run_each_task_and_collect_tells_what_is_missing(scenes, tmp_path, capsys):
-    scenes.write_text(LIST.format(first=QUICK).replace("weights list {first}", QUICK))
+    quick(scenes)
     out = tmp_path / "out"
     assert main(["fleet", str(scenes), "--engine", "slurm", "--out", str(out), "--quiet"]) == 0
     scripts = [*out.glob("stage-*.sh"), out / "submit.sh"]
@@ -282,11 +287,9 @@ def test_slurm_scripts_run_each_task_and_collect_tells_what_is_missing(scenes, t
 
 
 def test_slurm_asks_for_what_a_stage_needs(tmp_path):
-    (tmp_path / "a").mkdir()
-    stage = {"command": "check {project}", "cpus": 3, "gpus": 0.5, "memory_gb": 1.5}
-    spec = FleetSpec(stages={"look": stage}, scenes=[{"project": "a"}])
-    write_slurm(tasks_of(spec, str(tmp_path / "o"), folder=tmp_path), tmp_path / "o")
-    script = (tmp_path / "o" / "stage-look.sh").read_text()
+    task = task_of(tmp_path, "check {project}", cpus=3, gpus=0.5, memory_gb=1.5)
+    write_slurm([task], tmp_path / "o")
+    script = (tmp_path / "o" / "stage-stage.sh").read_text()
     for option in ("--cpus-per-task=3", "--gres=gpu:1", "--mem=1500M", "--array=0-0"):
         assert f"#SBATCH {option}\n" in script
 
@@ -355,7 +358,7 @@ def test_a_local_ray_cluster_runs_a_list(scenes, tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     # Ray keeps a token there.
     monkeypatch.setenv("HOME", str(tmp_path))
-    scenes.write_text(LIST.format(first=QUICK).replace("weights list {first}", QUICK))
+    quick(scenes)
     out = tmp_path / "out"
     main(["fleet", str(scenes), "--out", str(out), "--address", "local"])
     records = json.loads((out / "results.json").read_text())["tasks"]
