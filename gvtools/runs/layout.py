@@ -5,6 +5,7 @@
     round_000/poses.npz  tuned/{config.json,geoverse.safetensors,tuning.json}
     round_*/SHA256SUMS
     round_001/report.json  round_001/{guidance,valid,generated,after,depth}_TARGET.*
+    round_001/panorama_PICTURE.png
 
 Other modules of this package read and write these files; nothing outside knows their names.
 """
@@ -27,6 +28,8 @@ TILES, TILES_AT_WORK = "memory.tiles", ".tiles.part"
 # Weights of the generative core that were tuned to the run's context.
 TUNED = "tuned"
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".ppm")
+# The picture of another lens that targets are the faces of.
+PANORAMA = "panorama"
 # Pictures that a round leaves of each target.
 GUIDANCE, VALID, COMPLETION, AFTER = "guidance", "valid", "generated", "after"
 
@@ -37,7 +40,7 @@ def round_folder(run: Path, number: int) -> Path:
 
 
 def target_picture(folder: Path, kind: str, stem: str) -> Path:
-    """The picture of a target in a round's folder: GUIDANCE, VALID, COMPLETION or AFTER."""
+    """The picture of a target in a round's folder: GUIDANCE, VALID, COMPLETION, AFTER, PANORAMA."""
     return folder / f"{kind}_{stem}.png"
 
 

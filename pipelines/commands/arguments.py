@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
 
-from gvtools.cameras import Cameras, concatenate
 from gvtools.errors import CheckpointError, OptionError
 from gvtools.scenes.layout import FORM, is_address
 from pipelines.options import Arguments
 
 if TYPE_CHECKING:
+    from gvtools.cameras import Cameras
     from gvtools.evaluation.lpips_distance import Lpips
     from gvtools.memory.panoramas import Rig
     from gvtools.memory.spatial_memory import SpatialMemory
@@ -124,6 +124,7 @@ class LensArguments(Arguments):
         self, cameras: Cameras, memory: SpatialMemory, *, widest: int
     ) -> tuple[Rig | None, Cameras]:
         """What takes pictures in the place of some cameras, None where these do; and from where."""
+        from gvtools.cameras import concatenate
         from gvtools.memory.panoramas import LensOptions, Rig, picture_cameras
 
         if self.field_of_view is not None and self.lens != "fisheye":

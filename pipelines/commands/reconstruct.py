@@ -30,12 +30,13 @@ OPTIONS = {
     )
 } | {
     "refine": "refine.seconds", "tune": "tune.minutes", "cloud": "scan.file",
-    "cloud_placement": "scan.placement",
+    "cloud_placement": "scan.placement", "lens": "lens.kind",
 }  # fmt: skip
 METAVARS = {
     "context": "SPEC", "targets": "SPEC|FILE", "depth": "SOURCE", "max_side": "PIXELS",
     "completer": "NAME", "profile": "NAME", "protocol": "NAME", "voxel": "EDGE",
     "refine": "SECONDS", "tune": "MINUTES", "cloud": "FILE", "cloud_placement": "MATRIX",
+    "lens": "NAME",
 }  # fmt: skip
 
 
@@ -72,6 +73,7 @@ class ReconstructCommand(RunArguments):
     examples = (
         "gvtools reconstruct scan/ --context every:2 --targets every:2+1 --out runs/scan",
         "gvtools reconstruct colmap/ --targets orbit:24 --completer inpaint --out runs/orbit",
+        "gvtools reconstruct hall/ --targets interpolate:4 --lens equirectangular --out runs/hall",
         "gvtools reconstruct walk.mp4 --capture --out runs/walk",
         "gvtools reconstruct photographs/ --cloud survey.laz --out runs/survey",
     )

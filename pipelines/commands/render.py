@@ -135,11 +135,10 @@ class RenderCommand(LensArguments, LpipsArguments, SceneArguments):
                 )
         cameras = cameras[list(map(cameras.names.index, select(cameras.names, self.views)))]
         if self.lens == "perspective" and self.width:
-            shares = self.width / cameras.width
-            heights = np.maximum(1, np.rint(cameras.height * shares)).astype(int)
-            cameras = concatenate(
-                [c.resized(self.width, int(h)) for c, h in zip(cameras, heights, strict=True)]
-            )
+            width, shares = self.width, self.width / cameras.width
+            heights = [max(1, round(height)) for height in cameras.height * shares]
+            pairs = zip(cameras, heights, strict=True)
+            cameras = concatenate([camera.resized(width, height) for camera, height in pairs])
         return cameras, scene, poses
 
     def _trajectory(self, memory: SpatialMemory) -> Cameras:

@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gvtools.cameras import Cameras
+from gvtools.cameras import Cameras, concatenate
 from gvtools.completers.base import Completer
 from gvtools.errors import OptionError
+from gvtools.memory.panoramas import WIDEST_FRAME, LensOptions, Rig, picture_cameras
 from gvtools.runs.digests import array_digest, fingerprint
 from gvtools.runs.poses import RunPoses, posed, with_poses
 from gvtools.scenes.depth_contradictions import unit_findings
@@ -56,10 +57,21 @@ class Targets:
     cameras: Cameras  # V cameras
     # Per camera the view that shows the truth, None where there is none.
     truth: tuple[View | None, ...]
-    kind: str  # "hold-out", the path's name, "trajectory" or "project"
+    kind: str  # "hold-out", the path's name, "trajectory", "project", or another lens's name
     files: tuple[Path, ...] = ()  # what was read beside the project
     # What opens the other project that ``truth`` is of; None when it is the run's own.
     project: str | None = None
+    # Of another lens: the cameras are the faces of its pictures, those of each together.
+    rig: Rig | None = None
+
+    def through(self, options: LensOptions, *, captured: Cameras) -> Targets:
+        """The same of another lens: all faces of each picture, of which no view shows the truth."""
+        rig = Rig.of(options, self.cameras, widest=WIDEST_FRAME)
+        if rig is None:
+            return self
+        pictures = picture_cameras(self.cameras, options, captured=captured)
+        cameras = concatenate([rig.cameras(picture) for picture in pictures])
+        return Targets(cameras, (None,) * len(cameras), options.kind, self.files, rig=rig)
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +126,11 @@ class Plan:
 
     def at(self, poses: RunPoses) -> Plan:
         """The plan with other poses of its context and targets."""
-        targets = replace(self.targets, cameras=posed(self.targets.cameras, poses.targets))
+        cameras, rig = posed(self.targets.cameras, poses.targets), self.targets.rig
+        if rig is not None:
+            # Each face was moved by itself.
+            cameras = concatenate([rig.cameras(picture) for picture in rig.pictures(cameras)])
+        targets = replace(self.targets, cameras=cameras)
         scene = with_poses(self.scene, self.context, poses.context)
         return replace(self, scene=scene, targets=targets)
 
@@ -227,13 +243,18 @@ def _check_pictures(scene: Scene, context: tuple[str, ...], targets: Targets) ->
 
 
 def make_schedule(
-    targets: int, views_per_round: int, rounds: int | None
+    targets: int, views_per_round: int, rounds: int | None, *, faces: int = 1
 ) -> tuple[tuple[int, ...], ...]:
-    """Rows of the targets for each round, in order.
+    """Rows of the targets for each round, in order; always so many ``faces`` together.
 
     Without ``rounds``, as many as it takes. With more rounds than full rounds need, the targets
     are spread evenly over them; what does not fit into them stays out, and is reported.
     """
+    if faces > 1:
+        whole = make_schedule(targets // faces, max(1, views_per_round // faces), rounds)
+        return tuple(
+            tuple(row * faces + face for row in rows for face in range(faces)) for rows in whole
+        )
     if rounds is None:
         rounds = -(-targets // views_per_round)
     rounds = min(rounds, targets)

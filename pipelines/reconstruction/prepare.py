@@ -68,8 +68,9 @@ def make_plan(
         check_tuning(completer, context)
     targets = resolve_targets(
         scene, context, config.targets,
-        allow_overlap=config.allow_overlap, max_side=config.max_side,
-    )  # fmt: skip
+        allow_overlap=config.allow_overlap or config.lens.kind != "perspective",
+        max_side=config.max_side,
+    ).through(config.lens, captured=scene.subset(context).cameras)  # fmt: skip
     scene = _allowed_points(scene, context, config.points, say=say)
     own = config.completer_options.get("weights")
     if config.depth == "sensor-or-da3" and config.da3.weights is None and own is not None:
@@ -102,7 +103,10 @@ def make_plan(
         len(context)
     ):
         config = config.replaced(refine=config.refine.replaced(seconds=UNVALIDATED_SECONDS))
-    schedule = make_schedule(len(targets.cameras), config.views_per_round, config.rounds)
+    schedule = make_schedule(
+        len(targets.cameras), config.views_per_round, config.rounds,
+        faces=len(targets.rig.faces) if targets.rig else 1,
+    )  # fmt: skip
     config = config.replaced(rounds=len(schedule))
     weights = (*getattr(chosen.source, "files", ()), *completer.files)
     return Plan(

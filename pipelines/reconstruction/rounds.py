@@ -28,18 +28,26 @@ from gvtools.depth.source import DepthMap, disagrees, scale_to_points
 from gvtools.errors import ProjectError
 from gvtools.guidance import Guidance, concatenate
 from gvtools.kernels import parallel_kernels_may_overlap
+from gvtools.memory.panoramas import Rig
 from gvtools.memory.projection import Observed, Projection
 from gvtools.memory.spatial_memory import FuseReport, SpatialMemory
 from gvtools.memory.splat.api import ONE_PIXEL, SplatOptions
 from gvtools.prefetch import prefetch
 from gvtools.runs.context_depth import DepthCache, depth_report, disagreeing
-from gvtools.runs.layout import target_stems
-from gvtools.runs.target_files import camera_entry, write_after, write_target
+from gvtools.runs.layout import PANORAMA, target_picture, target_stems
+from gvtools.runs.target_files import (
+    camera_entry,
+    to_bytes,
+    write_after,
+    write_png,
+    write_target,
+)
 from gvtools.scenes.scene import Frame, View
 from gvtools.similarity import align_depth_scale
 from pipelines.console import Console
 from pipelines.reconstruction.plan import Plan, scan_line
 from pipelines.reconstruction.settings import RunSettings
+from pipelines.spherical_metadata import write_panorama
 
 
 class CachedProjection:
@@ -363,6 +371,9 @@ def complete_round(
     clock, begun, voxels, total = Clock(), time.perf_counter(), memory.voxels, FuseReport()
     all_stems = target_stems(plan.targets.cameras.names)
     stems, views = [all_stems[row] for row in rows], []
+    rig, faces = plan.targets.rig, list[Guidance]()
+    pictures = list(rig.pictures(plan.targets.cameras)) if rig else []
+    names = target_stems([picture.names[0] for picture in pictures])
     with clock.stage("project"):
         targets = round_targets.of(number)
         before = [target.guidance().coverage for target in targets]
@@ -390,6 +401,16 @@ def complete_round(
                     fused=result.fused,
                 )
             )
+            if rig is not None:
+                everywhere = np.ones_like(result.guidance.valid)
+                faces.append(replace(result.guidance, rgb=result.completion.rgb, valid=everywhere))
+                if len(faces) == len(rig.faces):
+                    whole = rows[at] // len(faces)
+                    path = target_picture(folder, PANORAMA, names[whole])
+                    writing.append(
+                        pool.submit(_write_whole, path, pictures[whole], rig=rig, faces=faces)
+                    )
+                    faces = []
         with clock.stage("project"):
             after = [target.guidance() for target in targets]
         for view, guidance in zip(views, after, strict=True):
@@ -409,6 +430,12 @@ def complete_round(
         "coverage_after": float(np.mean([guidance.coverage for guidance in after])),
         "views": views,
     }
+
+
+def _write_whole(path: Path, camera: Cameras, *, rig: Rig, faces: Sequence[Guidance]) -> None:
+    """Write the picture that completed targets are the faces of."""
+    picture = to_bytes(rig.joined(faces, camera).rgb[0])
+    (write_panorama if rig.lens == "equirectangular" else write_png)(path, picture)
 
 
 def _round_report(

@@ -12,6 +12,7 @@ from gvtools.appearance.fit_options import FitOptions
 from gvtools.completers.effort import EffortPolicy
 from gvtools.depth.options import FoundationOptions, StereoOptions
 from gvtools.memory.back_projection import BackProjectionOptions
+from gvtools.memory.panoramas import LensOptions
 from gvtools.memory.spatial_memory import MemoryOptions
 from gvtools.memory.splat.api import SplatOptions
 from gvtools.scenes.resized import SMALLEST
@@ -157,7 +158,7 @@ class RunSettings(Settings):
     """Which cameras to complete: a selection, a path such as ``orbit:24``, a trajectory file, or
     another project."""
     views_per_round: int = Field(6, ge=1)
-    """Targets that a round takes at most."""
+    """Targets that a round takes at most; of another lens at least one, with all of its faces."""
     rounds: int | None = Field(None, ge=0)
     """How many rounds; none takes as many as the targets need."""
     max_side: int | None = Field(1600, ge=SMALLEST)
@@ -197,3 +198,4 @@ class RunSettings(Settings):
     refine: FitOptions = FitOptions()
     tune: TuneOptions = TuneOptions()
     scan: ScanOptions = ScanOptions()
+    lens: LensOptions = LensOptions()

@@ -1,15 +1,22 @@
-"""gvtools render and film with another lens: files, and what players and viewers read in them."""
+"""gvtools render, film and reconstruct with another lens: files, and what viewers read in them."""
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
-from box_project import SIZE, fused, write_box
+from box_project import HEIGHT, SIZE, WIDTH, fused, write_box
 from command_line import refused, run_command
 from PIL import Image
+from tiny_scan import write_scan
 
 from gvtools.capture.panoramas import lens_of
 from gvtools.capture.photographs import CapturedPhotograph
+from gvtools.memory.panoramas import LensOptions
+from gvtools.scenes.project import open_project
+from pipelines.reconstruction.prepare import make_plan
+from pipelines.reconstruction.settings import RunSettings
 from pipelines.spherical_metadata import mark_mp4
 
 pytestmark = pytest.mark.usefixtures("unpainted")
@@ -57,6 +64,16 @@ def test_a_fisheye_is_black_outside_of_its_circle(box, tmp_path):
     assert (rgb[np.hypot(x, y) > 32] == 0).all()
     assert (rgb[np.hypot(x, y) < 12] > 0).any(axis=-1).all()
     assert not (tmp_path / "view_0.jpg").exists()
+
+
+def test_a_width_resizes_pictures_of_the_cameras_own_lens(box, tmp_path):
+    words = ("render", box / "run", "--cameras", box / "project", "--views", "first:1", "--out")
+    run_command(*words, tmp_path / "own", quiet=True)
+    run_command(*words, tmp_path / "half", "--width", WIDTH // 2, quiet=True)
+    own, half = (Image.open(tmp_path / name / "view_0.rgb.png") for name in ("own", "half"))
+    assert half.size == (WIDTH // 2, HEIGHT // 2)
+    apart = np.asarray(own.resize(half.size, Image.Resampling.BOX)).astype(int) - np.asarray(half)
+    assert np.abs(apart).mean() < 8
 
 
 def test_a_film_of_panoramas_says_so_and_plays(box, tmp_path):
@@ -117,3 +134,50 @@ def test_options_that_do_not_fit(box, tmp_path, capsys, words, said):
     )
     assert said in line
     assert not out.exists()
+
+
+def test_targets_of_another_lens_are_completed_face_by_face_and_written_whole(tmp_path):
+    out = tmp_path / "run"
+    run_command(
+        "reconstruct", write_scan(tmp_path / "scan"), "--context", "every:2", "--targets",
+        "first:2", "--lens", "equirectangular", "--set", "lens.width=128", "--refine", 0,
+        "--out", out, quiet=True,
+    )  # fmt: skip
+    record = json.loads((out / "run.json").read_text())
+    assert record["targets_kind"] == "equirectangular"
+    assert len(record["targets"]) == 12
+    # Views that are context may be looked around from, and a round takes whole panoramas.
+    assert record["schedule"] == [list(range(6)), list(range(6, 12))]
+    wholes = sorted(out.glob("round_*/panorama_*.png"))
+    assert [path.parent.name for path in wholes] == ["round_001", "round_002"]
+    first = record["targets"][0]
+    assert first.endswith("@front.png")
+    with Image.open(wholes[0]) as image:
+        assert image.size == (128, 64)
+        assert b"equirectangular" in image.info["xmp"]
+        middle = np.asarray(image)[28:36, 60:68].astype(int)
+    stem = first.replace(".png", "").replace("/", "__")
+    front = np.asarray(Image.open(out / "round_001" / f"generated_{stem}.png")).astype(int)
+    row, column = front.shape[0] // 2, front.shape[1] // 2
+    near = front[row - 4 : row + 4, column - 4 : column + 4]
+    assert np.abs(near - middle).mean() < 3 < near.std()
+    # The run is read back, faces and all.
+    run_command("report", out, quiet=True)
+
+
+def test_faces_move_with_their_picture_when_poses_are_refined(tmp_path):
+    from gvtools.runs.poses import RunPoses
+
+    scene = open_project(write_scan(tmp_path / "scan"))
+    settings = RunSettings().replaced(
+        context="every:2", targets="first:1", lens=LensOptions(kind="fisheye", width=64)
+    )
+    settings = settings.replaced(refine=settings.refine.replaced(steps=0, poses=False))
+    plan = make_plan(scene, settings)
+    cameras = plan.targets.cameras
+    moved = cameras.cam_from_world.copy()
+    moved[:, 0, 3] += np.linspace(0.1, 0.2, len(cameras))
+    context = scene.subset(plan.context).cameras.cam_from_world
+    at = plan.at(RunPoses(context, moved, False, 0.0)).targets.cameras
+    np.testing.assert_allclose(at.cam_from_world[0], moved[0], atol=1e-12)
+    assert np.ptp(at.centers, axis=0).max() < 1e-9 < np.ptp(moved[:, 0, 3])
