@@ -181,11 +181,12 @@ def test_silhouettes_do_not_grow_and_let_nothing_through(move, voxels):
     assert shares["growth"] < 1.0
 
 
-def _scene_with_a_far_witness(saw_through: bool, center=(0.9, 0, 0.3)):
+def _scene_with_a_far_witness(saw_through: bool, center=(0.9, 0, 0.3), scale=1.0):
     """A near view that misses an object which a far view saw; the near view may rule it out."""
-    target = camera(width=64, height=48, focal=60)
-    near = camera(width=64, height=48, focal=60, center=(0.02, 0, 0), name="near")
-    witness = camera(width=64, height=48, focal=60, center=center, name="witness")
+    size = {"width": round(64 * scale), "height": round(48 * scale), "focal": 60 * scale}
+    target = camera(**size)
+    near = camera(**size, center=(0.02, 0, 0), name="near")
+    witness = camera(**size, center=center, name="witness")
     wall = plane_view(near, 4.0, color=(0, 0, 255))
     if not saw_through:
         wall = replace(wall, free_depth=None)
@@ -242,7 +243,7 @@ def test_an_object_whose_place_a_near_view_saw_to_be_free_is_not():
 @pytest.mark.parametrize("case", OTHERS)
 @pytest.mark.parametrize("saw_through", [False, True])
 def test_the_reference_agrees_about_occluders(saw_through, case):
-    memory, target = _scene_with_a_far_witness(saw_through)
+    memory, target = _scene_with_a_far_witness(saw_through, scale=0.5)
     assert_same(project(memory, target, options=case), reference_project(memory, target, case))
 
 
@@ -348,7 +349,7 @@ def _target(seed: int):
 
 
 @pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize("seed", range(4, 8))
+@pytest.mark.parametrize("seed", [4, 7])
 def test_a_larger_image_equals_the_compiled_back_end(seed, device):
     memory = random_memory(seed, most=300)
     cameras = concatenate([_target(seed).resized(160, 120), _target(seed + 1).resized(160, 120)])

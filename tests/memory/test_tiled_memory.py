@@ -23,9 +23,14 @@ VOXEL, ORIGIN, VIEWS, BUDGET = 0.01, (1.0, 2.0, 3.0), 10, 1_000_000
 CAMERAS = [random_camera(np.random.default_rng(i), name=f"{i}") for i in range(3)]
 
 
-@pytest.fixture(autouse=True)
-def small_tiles(monkeypatch):
-    monkeypatch.setattr(tile_set, "SMALLEST", 1)
+@pytest.fixture(autouse=True, scope="module")
+def small_tiles():
+    """As if the budget, a million bytes at least, were a third."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tile_set, "SMALLEST", 1)
+        for name in ("IN_RAM", "CACHE", "LARGEST", "GATHERED"):
+            patch.setattr(tile_set, name, getattr(tile_set, name) / 3)
+        yield
 
 
 def fuse_views(memory, views=range(VIEWS)):
@@ -33,7 +38,7 @@ def fuse_views(memory, views=range(VIEWS)):
     reports = []
     for i in views:
         rng = np.random.default_rng(i)
-        points = random_points(rng, 2000, origin=ORIGIN, name=f"v{i}")
+        points = random_points(rng, 700, origin=ORIGIN, name=f"v{i}")
         generated = i >= 3 and i % 3 == 0
         reports.append(memory.fuse(points, round=i // 3, generated=generated, scanned=i == 2))
     return reports
@@ -55,9 +60,10 @@ def expected():
     return in_ram()
 
 
-@pytest.fixture
-def tiled(tmp_path, small_tiles):
-    return in_tiles(tmp_path / "scratch")
+@pytest.fixture(scope="module")
+def tiled(tmp_path_factory, small_tiles):
+    """Not to be changed."""
+    return in_tiles(tmp_path_factory.mktemp("tiles"))
 
 
 def assert_same(memory, expected, *, order=True):
@@ -148,8 +154,8 @@ def test_a_round_is_forgotten_as_in_ram(tmp_path, round):
     assert_same(memory, expected)
 
 
-def test_a_view_none_of_whose_points_is_usable_changes_nothing(tiled):
-    memory, _ = tiled
+def test_a_view_none_of_whose_points_is_usable_changes_nothing(tmp_path):
+    memory, _ = in_tiles(tmp_path)
     before = len(memory)
     none = random_points(np.random.default_rng(0), 9, origin=ORIGIN, name="none")
     none.positions[:] = np.nan
@@ -281,7 +287,7 @@ def test_the_working_folder_goes_with_the_memory(tmp_path):
     assert not scratch.exists()
 
 
-@pytest.mark.parametrize("moment", range(0, 30, 3))
+@pytest.mark.parametrize("moment", range(0, 30, 6))
 def test_a_kill_while_saving_leaves_the_state_before_or_after(tmp_path, moment):
     """A child saves a later state over an earlier one and dies at the n-th step on files."""
     memory, _ = in_tiles(tmp_path / "scratch", range(5))

@@ -65,8 +65,7 @@ def test_pcd_keeps_double_coordinates_and_colours_packed_as_float(tmp_path):
     same(path, positions + FAR, colors)
 
 
-@pytest.mark.parametrize("suffix", [".las", ".laz"])
-@pytest.mark.parametrize("bits", [8, 16])
+@pytest.mark.parametrize(("suffix", "bits"), [(".las", 8), (".laz", 16)])
 def test_las_with_colours_of_8_and_16_bits_keeps_far_coordinates(tmp_path, suffix, bits):
     positions, colors = surface(500)
     path = write_las(tmp_path / f"scan{suffix}", positions + FAR, colors, bits=bits)
@@ -408,7 +407,7 @@ def test_colours_of_every_type_range_and_name(
     assert bool(scan.color_range) != usual
 
 
-@pytest.mark.parametrize("factor", [1, 16, 256, 257])
+@pytest.mark.parametrize("factor", [16, 256])
 def test_las_with_colours_of_several_bits_and_an_outlier(tmp_path, factor):
     laspy = pytest.importorskip("laspy")
     positions, colors = surface(500)

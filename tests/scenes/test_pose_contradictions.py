@@ -22,7 +22,6 @@ from gvtools.scenes.inspection import (
     inspect,
     thumbnail,
 )
-from gvtools.scenes.project import open_project
 from gvtools.scenes.scene import Frame, Scene, SparsePoints, View
 
 WIDTH, HEIGHT, FOCAL = 96, 72, 80.0
@@ -175,18 +174,6 @@ def test_near_views_that_share_no_sparse_point_are_told() -> None:
     assert contradiction_messages(replace(scene, points=points_of(scene, shared=True))) == []
     (message,) = contradiction_messages(replace(scene, points=points_of(scene, shared=False)))
     assert "0 of 40 sparse points shared" in message
-
-
-@pytest.mark.data
-@pytest.mark.parametrize(
-    "name",
-    [
-        *("fox_colmap", "fern_colmap", "sceaux_colmap"),
-        *(pytest.param(f"sevenscenes_{part}", marks=pytest.mark.slow) for part in ("reg", "clip")),
-    ],
-)
-def test_real_scenes_raise_no_false_alarm(shared: Path, name: str) -> None:
-    assert contradiction_messages(open_project(shared / "data" / name)) == []
 
 
 @pytest.mark.data

@@ -20,6 +20,14 @@ CLIP = RgbdOptions(
 )
 
 
+def inspected(scene, **options):
+    """The report of a scene whose cameras contradict nothing."""
+    report = inspect(scene, **options)
+    assert report.ok
+    assert not any("nearly equal cameras" in finding.message for finding in report.findings)
+    return report
+
+
 def models_own_error(folder):
     """Mean over observations, through pycolmap's distorted cameras."""
     import pycolmap
@@ -43,15 +51,18 @@ def test_reprojection_stays_at_the_models_own_error(shared, name, published, for
     own = models_own_error(shared / "data" / name / form)
     assert own == pytest.approx(published, abs=0.001)
     scene = read_colmap(shared / "data" / name / form)
-    report = inspect(scene)
-    assert report.ok
+    report = inspected(scene)
     assert report.reprojection_px == pytest.approx(own, abs=0.05)
     # Back in the recorded camera, the detections of the pinhole views give the model's own figure.
     assert np.isfinite(reprojection_errors(scene)).all()
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param("fox_colmap", marks=pytest.mark.slow), "sceaux_colmap", "fern_colmap"]
+    "name",
+    [
+        "fern_colmap",
+        *(pytest.param(f"{n}_colmap", marks=pytest.mark.slow) for n in ("fox", "sceaux")),
+    ],
 )
 def test_workspace_written_undistorted_by_pycolmap_reads_alike(shared, name, tmp_path):
     import pycolmap
@@ -64,7 +75,7 @@ def test_workspace_written_undistorted_by_pycolmap_reads_alike(shared, name, tmp
     np.testing.assert_allclose(dense.cameras.K, ours.cameras.K, atol=1e-9)
     np.testing.assert_array_equal(dense.cameras.width, ours.cameras.width)
     assert not any("undistorted to" in finding.message for finding in dense.findings)
-    report = inspect(dense)
+    report = inspect(dense, probes=2)
     assert report.reprojection_px == pytest.approx(models_own_error(source / "sparse/0"), abs=0.05)
     first = ours.names[0]
     difference = np.abs(dense[first].load().rgb.astype(int) - ours[first].load().rgb.astype(int))
@@ -97,9 +108,14 @@ def test_kitchen_scan_is_read_whole(shared):
     scene = open_project(shared / "data/sevenscenes_reg")
     assert (len(scene), scene.metric, scene.kind) == (100, True, "rgbd")
     assert any("100 of 100 rotations" in finding.message for finding in scene.findings)
-    report = inspect(scene)
-    assert report.ok
+    report = inspected(scene, probes=25)
     assert report.depth.coverage == pytest.approx(0.72, abs=0.03)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("part", ["reg", "clip"])
+def test_all_of_a_scan_contradicts_nothing(shared, part):
+    inspected(open_project(shared / f"data/sevenscenes_{part}"))
 
 
 def contrast_at_depth_edges(frame):

@@ -37,6 +37,12 @@ def slanted():
     return plane_scene(slope=(0.25, -0.15))
 
 
+@pytest.fixture(scope="module")
+def stereo(slanted):
+    """All views being sources."""
+    return PlaneSweepStereo(slanted.scene, options=OPTIONS, views=slanted.scene.names)
+
+
 def swept(scene: Scene, name: str = "v2", *, options: StereoOptions = OPTIONS) -> DepthMap:
     """The depth of one view, all views being sources."""
     stereo = PlaneSweepStereo(scene, options=options, views=scene.names)
@@ -48,8 +54,8 @@ def error_and_share(found: np.ndarray, truth: np.ndarray) -> tuple[float, float]
     return float(np.median(np.abs(found[known] / truth[known] - 1))), float(known.mean())
 
 
-def test_a_slanted_plane_is_measured(slanted):
-    found = swept(slanted.scene)
+def test_a_slanted_plane_is_measured(slanted, stereo):
+    found = stereo.depth(slanted.scene, slanted.scene["v2"], slanted.scene["v2"].load())
     error, share = error_and_share(found.depth, slanted.depths[2])
     assert error < 0.005
     assert share > 0.8
@@ -58,11 +64,11 @@ def test_a_slanted_plane_is_measured(slanted):
     assert (found.confidence > 0).all() and (found.confidence <= 1).all()
 
 
-def test_the_same_twice_and_after_other_views(slanted):
+def test_the_same_twice_and_after_other_views(slanted, stereo):
     scene = slanted.scene
     second = PlaneSweepStereo(scene, options=OPTIONS, views=scene.names)
     second.depth(scene, scene["v0"], scene["v0"].load())
-    one, two = swept(scene), second.depth(scene, scene["v2"], scene["v2"].load())
+    one, two = (each.depth(scene, scene["v2"], scene["v2"].load()) for each in (stereo, second))
     np.testing.assert_array_equal(one.depth, two.depth)
     np.testing.assert_array_equal(one.confidence, two.confidence)
 
@@ -102,11 +108,10 @@ def test_a_view_outside_the_pool_gets_depth_but_gives_none(slanted):
 
 
 def test_blank_surfaces_stay_unknown():
-    made = plane_scene(blank=True)
+    made = plane_scene(blank=True, count=4)
     view = made.scene["v2"]
     found = swept(made.scene)
-    rays = view.camera.rays()
-    x = view.camera.centers[0, 0] + made.depths[2] * rays[..., 0]
+    x = view.camera.centers[0, 0] + made.depths[2] * view.camera.rays()[..., 0]
     assert (found.depth[x > 0.45] == 0).mean() > 0.98
     assert (found.depth[x < 0.15] > 0).mean() > 0.8
 
@@ -119,12 +124,11 @@ def test_reduced_pictures_give_depth_at_full_size(slanted):
     assert error < 0.01 and share > 0.7
 
 
-def test_masked_pixels_are_left_out(slanted):
+def test_masked_pixels_are_left_out(slanted, stereo):
     scene = slanted.scene
     frame = scene["v2"].load()
     mask = np.ones(frame.rgb.shape[:2], bool)
     mask[:60] = False
-    stereo = PlaneSweepStereo(scene, options=OPTIONS, views=scene.names)
     found = stereo.depth(scene, scene["v2"], replace(frame, mask=mask))
     assert (found.depth[:60] == 0).all()
     assert (found.depth[60:] > 0).mean() > 0.7
@@ -303,7 +307,7 @@ def test_shaded_walls_are_not_guessed(shading, noise):
     stereo = PlaneSweepStereo(scene, options=StereoOptions(align=False), views=scene.names)
     known = stereo.depth(scene, view, view.load()).depth
     truth, inside = niche_depth(view.camera)
-    back = ndimage.binary_erosion(inside, iterations=8)
+    back = ndimage.binary_erosion(inside, iterations=5)
     assert (known[back] > 0).mean() < 0.05
     wall = ~inside
     assert (known[wall] > 0).mean() >= 0.9
@@ -367,14 +371,14 @@ def test_half_a_pixel_of_disparity_is_needed():
 
 
 def test_views_at_one_place_are_no_sources_and_warn_of_nothing():
-    scene = plane_scene().scene
-    same = View("again", scene["v2"].camera, scene["v2"].load)
+    scene = plane_scene(count=3).scene
+    same = View("again", scene["v1"].camera, scene["v1"].load)
     scene = Scene(scene.root, scene.kind, (*scene.views, same))
     stereo = PlaneSweepStereo(scene, options=OPTIONS, views=scene.names)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        found = stereo.depth(scene, scene["v2"], scene["v2"].load())
-    assert "again" not in stereo.raw(scene["v2"]).sources
+        found = stereo.depth(scene, scene["v1"], scene["v1"].load())
+    assert "again" not in stereo.raw(scene["v1"]).sources
     assert (found.depth > 0).mean() > 0.8
 
 

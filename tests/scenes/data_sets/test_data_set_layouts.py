@@ -74,8 +74,15 @@ def same(scene: Scene, other: Scene) -> None:
 
 
 @pytest.mark.data
-@pytest.mark.parametrize("layout", ["mipnerf360", "tanks_and_temples"])
-@pytest.mark.parametrize("name", ["fern_colmap", "fox_colmap", "sceaux_colmap"])
+@pytest.mark.parametrize(
+    ("layout", "name"),
+    [
+        ("mipnerf360", "fern_colmap"),
+        ("tanks_and_temples", "sceaux_colmap"),
+        pytest.param("mipnerf360", "fox_colmap", marks=pytest.mark.slow),
+        pytest.param("tanks_and_temples", "fox_colmap", marks=pytest.mark.slow),
+    ],
+)
 def test_a_model_is_read_as_a_project_is(shared: Path, layout: str, name: str) -> None:
     root = shared / "data"
     assert name in layout_named(layout).scenes(root)
