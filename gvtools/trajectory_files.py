@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import ROTATION_ROUNDING, Cameras, invert_rigid, rigid_transform
 from gvtools.errors import ProjectError, ShapeError
+from gvtools.notebook import html_table, path_sketch
 from gvtools.untrusted import read_text
 
 Float64 = NDArray[np.float64]
@@ -53,6 +54,15 @@ class Trajectory:
 
     def __len__(self) -> int:
         return len(self.poses)
+
+    def _repr_html_(self) -> str:
+        places = self.poses[:, :3, 3]
+        length = np.linalg.norm(np.diff(places, axis=0), axis=1).sum()
+        rows = {"poses": f"{len(self):,}", "length": f"{length:.4g} scene units"}
+        if self.stamps is not None:
+            rows["time"] = f"{np.ptp(self.stamps):.4g} s" if len(self) else ""
+        rows |= {f"note {number}": note for number, note in enumerate(self.notes, 1)}
+        return html_table("Trajectory", rows, path_sketch(places))
 
 
 def read_poses(path: str | Path, *, layout: str = "auto", lost: bool = False) -> Trajectory:

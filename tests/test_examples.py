@@ -5,9 +5,11 @@ import runpy
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import gvtools
+from gvtools.notebook import WIDTH, path_sketch
 from gvtools.procedural.room_sample import write_room
 
 FOLDER = Path(gvtools.__file__).parent.parent / "examples"
@@ -51,3 +53,39 @@ def test_an_example_runs(script, room, tmp_path, monkeypatch, capsys):
     found = re.search(pattern, capsys.readouterr().out)
     assert found
     assert least is None or most is None or least <= float(found[1]) <= most
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "promises"),
+    [
+        ("colmap_project", (r"known \d\d", "<b>Run</b>", "<b>SpatialMemory</b>", "image/png")),
+        ("trajectory_errors", (r"ATE 0\.0\d+", r"scale 2\.0", "<b>Trajectory</b>", "<svg")),
+    ],
+)
+def test_a_notebook_runs(name, promises, tmp_path, monkeypatch):
+    nbformat = pytest.importorskip("nbformat")
+    client = pytest.importorskip("nbclient")
+    monkeypatch.setenv("OUT", str(tmp_path))
+    notebook = nbformat.read(FOLDER / f"{name}.ipynb", as_version=4)
+    assert not any(cell.get("outputs") for cell in notebook.cells)
+    client.NotebookClient(notebook, timeout=300).execute()
+    text = str([cell.get("outputs") for cell in notebook.cells])
+    for promise in promises:
+        assert re.search(promise, text), text[:2000]
+
+
+def test_objects_are_tables_in_a_notebook(small_run: Path) -> None:
+    run = gvtools.load_run(small_run)
+    page = run._repr_html_()
+    assert "<b>Run</b>" in page and "data:image/png;base64," in page
+    assert f"{len(run.memory):,}" in page and f"{len(run.memory):,}" in run.memory._repr_html_()
+
+
+def test_a_path_is_sketched_in_the_plane_that_it_spreads_in() -> None:
+    """A circle in a plane that is upright: as high as it is wide."""
+    turn = np.linspace(0, 2 * np.pi, 100)
+    sketch = path_sketch(np.stack([np.cos(turn), 5 + 0 * turn, np.sin(turn)], axis=1))
+    places = np.array(re.findall(r"([\d.]+),([\d.]+)", sketch), float)
+    assert np.ptp(places, axis=0) == pytest.approx(WIDTH - 8, abs=3)
+    assert path_sketch(places[:1]) == ""

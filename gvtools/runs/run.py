@@ -15,6 +15,7 @@ from pydantic import BaseModel, Field, ValidationError, model_validator
 from gvtools.cameras import Cameras, rigid_transform
 from gvtools.errors import MemoryFileError, OptionError, ProjectError, ShapeError
 from gvtools.memory.files import INDEX
+from gvtools.notebook import html_table, png_tag
 from gvtools.poses.motions import mean_near, motions_between, move_pose
 from gvtools.runs.digests import check_sums
 from gvtools.runs.folder import RunDirectory
@@ -101,6 +102,18 @@ class Run:
     def complete(self) -> bool:
         """Whether every planned round is there."""
         return len(self.rounds) == self.planned
+
+    def _repr_html_(self) -> str:
+        last = self.rounds[-1] if self.rounds else {}
+        rows = {
+            "folder": self.path,
+            "project": self.record["project"],
+            "rounds": f"{len(self.rounds)} of {self.planned}",
+            "context, targets": f"{len(self.context)}, {len(self.views)} views",
+            "observations": f"{last.get('points', 0):,}, {last.get('generated', 0):,} generated",
+        }
+        picture = self.path / "growth.png"
+        return html_table("Run", rows, png_tag(picture.read_bytes()) if picture.is_file() else "")
 
     @cached_property
     def views(self) -> tuple[RunTarget, ...]:

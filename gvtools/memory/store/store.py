@@ -17,6 +17,7 @@ from gvtools.memory.store.observations import AgreementEntry, Columns, Observati
 from gvtools.memory.store.tile_set import TileSet
 from gvtools.memory.store.views import FreeGrid, ViewTable
 from gvtools.memory.store.voxel_index import MAX_VOXEL, VoxelLevels, check_grid
+from gvtools.notebook import html_table
 from gvtools.settings import Settings
 
 if TYPE_CHECKING:
@@ -227,6 +228,18 @@ class Store:
             f"{self.voxels:,} voxels of {self.voxel:g}, {len(self.views)} views, "
             f"rounds {self.rounds!r}, {self.nbytes / 2**20:.1f} MiB{where})"
         )
+
+    def _repr_html_(self) -> str:
+        rows = {
+            "observations": f"{len(self):,}",
+            "of these generated": f"{self.generated_count / max(len(self), 1):.1%}",
+            "scanned": f"{self.scanned_count:,}",
+            "voxels": f"{self.voxels:,} of edge {self.voxel:g}",
+            "views": len(self.views),
+            "rounds": ", ".join(map(str, self.rounds)),
+            "size": f"{self.nbytes / 2**20:.1f} MiB",
+        }
+        return html_table(type(self).__name__, rows)
 
     def observed_grids(self, rows: Iterable[int]) -> list[FreeGrid]:
         """(K, cam_from_local, free_depth) of those views in ``rows`` that are not generated."""
