@@ -32,6 +32,7 @@ DOCTESTED = (
     "gvtools.evaluation.trajectories",
     "gvtools.memory.store.store",
     "gvtools.memory.spatial_memory",
+    "gvtools.notebook",
     "gvtools.optional",
     "gvtools.scans.fuse",
     "gvtools.scans.registration",
