@@ -1,5 +1,3 @@
-"""``gvtools check`` of projects and ``data`` on miniatures in the layout of 7-Scenes."""
-
 from __future__ import annotations
 
 import json
@@ -166,7 +164,16 @@ def test_each_scene_of_a_download_has_its_line(root, capsys, tmp_path):
     assert scenes[1]["depth"]["views"] == 11
 
 
-@pytest.mark.parametrize("miniature", miniatures(), ids=lambda miniature: miniature.title)
+def one_of_each_layout():
+    """The others of a layout are slow: what reads them has tests of its own."""
+    before = set()
+    for miniature in miniatures():
+        marks = [pytest.mark.slow] if miniature.layout in before else []
+        before.add(miniature.layout)
+        yield pytest.param(miniature, id=miniature.title, marks=marks)
+
+
+@pytest.mark.parametrize("miniature", list(one_of_each_layout()))
 def test_every_layout_can_be_checked_and_summed_up(miniature, tmp_path, capsys):
     name = next(x for x in spec_names() if load_spec(x).layout == miniature.layout)
     with miniature.within():

@@ -1,5 +1,3 @@
-"""Scenes of data sets as projects: ``spec:NAME:SCENE --root DIR``."""
-
 from __future__ import annotations
 
 import json

@@ -1,5 +1,3 @@
-"""gvtools film: frames, panels, rounds and files."""
-
 from __future__ import annotations
 
 from pathlib import Path

@@ -1,5 +1,3 @@
-"""``gvtools trajectory`` from the command line."""
-
 from __future__ import annotations
 
 import json

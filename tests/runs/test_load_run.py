@@ -1,5 +1,3 @@
-"""A run read back from its folder, finished or not."""
-
 from __future__ import annotations
 
 import json

@@ -1,5 +1,3 @@
-"""Ownership, resuming and identity of a run's folder."""
-
 from __future__ import annotations
 
 import json

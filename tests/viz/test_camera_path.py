@@ -1,5 +1,3 @@
-"""Camera paths that are made on the page, and the films of them."""
-
 from __future__ import annotations
 
 import json

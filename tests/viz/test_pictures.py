@@ -1,5 +1,3 @@
-"""Contact sheets of a run and of several methods: what is where, and what is outlined."""
-
 from __future__ import annotations
 
 import base64

@@ -1,5 +1,3 @@
-"""Figures: they show the data they are given, with units, in every command."""
-
 from __future__ import annotations
 
 import io

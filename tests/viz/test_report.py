@@ -74,8 +74,8 @@ def own(small_run, tmp_path):
     return Path(shutil.copytree(small_run, tmp_path / "run"))
 
 
-def written(run: Path, *more: object, painted: bool = False) -> Page:
-    with nullcontext() if painted else unpainted_figures(drawn=True):
+def written(run: Path, *more: object, painted: bool = False, drawn: bool = False) -> Page:
+    with nullcontext() if painted else unpainted_figures(drawn=drawn):
         assert main(["report", str(run), "--quiet", *map(str, more)]) == 0
     return Page(run / "report.html")
 
@@ -129,7 +129,7 @@ def test_settings_that_differ_come_first_and_all_are_there(page):
 
 def test_an_evaluation_gives_intervals_and_estimated_poses(own):
     assert main(["evaluate", str(own), "--parts", "images,poses", "--no-control", "--quiet"]) == 0
-    page = written(own)
+    page = written(own, drawn=True)
     assert "evaluation/evaluation.json" in page.said
     assert "95 % interval" in page.said
     report = collect(own)
@@ -152,7 +152,7 @@ def test_an_evaluation_gives_intervals_and_estimated_poses(own):
 def test_a_run_that_is_not_finished(own):
     shutil.rmtree(own / "round_002")
     (own / "metrics.json").unlink()
-    page = written(own)
+    page = written(own, drawn=True)
     assert "1 of 2 rounds are done" in page.said
     assert page.captions == LABELS * 2
     assert "There is no metrics.json yet" in page.said
@@ -169,7 +169,7 @@ def test_a_project_that_is_gone(own, small_scan, capsys):
     record = json.loads((own / "run.json").read_text())
     record["project"] = str(own / "nowhere")
     (own / "run.json").write_text(json.dumps(record))
-    page = written(own)
+    page = written(own, drawn=True)
     assert "no photographs" in capsys.readouterr().err
     assert page.captions == ["hint", "validity", "completion"] * 4
     assert "no error maps" in page.said
@@ -180,11 +180,11 @@ def test_a_project_that_is_gone(own, small_scan, capsys):
 
 def test_a_run_that_has_its_project_open_writes_the_same_page(own, small_scan):
     written(own)
-    refine = FitOptions(seconds=0)
+    refine = FitOptions(seconds=0, poses=False)
     config = RunSettings(context="first:3", targets="range:4-7", views_per_round=2, refine=refine)
     before = (own / "report.html").read_bytes()
     (own / "report.html").unlink()
-    with unpainted_figures(drawn=True):
+    with unpainted_figures():
         write_report(make_plan(open_project(small_scan), config), own)
     assert (own / "report.html").read_bytes() == before
 
@@ -262,7 +262,7 @@ def test_no_text_of_a_users_files_becomes_markup(own, tmp_path):
         sheets=Sheets([SheetRow(evil, tiles)], evil),
         poses=replace(report.poses, note=evil, errors=[(evil, 1.0, None)]),
     )  # fmt: skip
-    with unpainted_figures(drawn=True):
+    with unpainted_figures():
         (tmp_path / "evil.html").write_text(report_html(report), encoding="utf-8")
     page = Page(tmp_path / "evil.html")
     assert "script" not in page.tags

@@ -1,5 +1,3 @@
-"""``gvtools view``: pictures without a display, Open3D's window, and options that do not fit."""
-
 from __future__ import annotations
 
 import os

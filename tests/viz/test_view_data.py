@@ -1,5 +1,3 @@
-"""What viewers show: cameras, counts, pictures, colours and what is drawn of a large memory."""
-
 from __future__ import annotations
 
 import json

@@ -1,5 +1,3 @@
-"""Files that ``gvtools export`` writes, as ``gvtools view`` opens them."""
-
 from __future__ import annotations
 
 import gzip

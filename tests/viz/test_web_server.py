@@ -1,5 +1,3 @@
-"""What the web viewer's server lets nobody reach."""
-
 from __future__ import annotations
 
 import base64

@@ -1,5 +1,3 @@
-"""The web viewer as a person meets it, in a headless browser."""
-
 from __future__ import annotations
 
 import base64
@@ -301,7 +299,7 @@ def click(browser: Browser, x: float, y: float) -> None:
     place = {"x": box["x"] + x, "y": box["y"] + y, "button": "left", "clickCount": 1}
     for kind in ("mouseMoved", "mousePressed", "mouseReleased"):
         browser.driver.execute_cdp_cmd("Input.dispatchMouseEvent", {"type": kind, **place})
-        time.sleep(0.4)
+        time.sleep(0.2)
 
 
 def shown_picture(browser: Browser):

@@ -1,5 +1,3 @@
-"""Gaussians of blocks joined, and fitted further where blocks meet."""
-
 from __future__ import annotations
 
 from dataclasses import replace

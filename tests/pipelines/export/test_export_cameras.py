@@ -1,5 +1,3 @@
-"""Names of exported cameras, and what an export never writes over."""
-
 from __future__ import annotations
 
 import json

@@ -1,5 +1,3 @@
-"""Meshes and their textures, as other libraries read them and rays meet them."""
-
 from __future__ import annotations
 
 from dataclasses import replace

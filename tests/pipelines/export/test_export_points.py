@@ -1,5 +1,3 @@
-"""Point clouds for other tools, as their own libraries read them."""
-
 from __future__ import annotations
 
 import json

@@ -1,5 +1,3 @@
-"""Recordings of runs, as rerun's own reader has them."""
-
 from __future__ import annotations
 
 import io

@@ -1,5 +1,3 @@
-"""Splat files, as other readers and another rasteriser see them."""
-
 from __future__ import annotations
 
 from dataclasses import replace

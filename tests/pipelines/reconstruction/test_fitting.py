@@ -1,5 +1,3 @@
-"""Runs that fit Gaussians to their context before round 0."""
-
 from __future__ import annotations
 
 import json

@@ -1,5 +1,3 @@
-"""Runs whose memory is larger than its budget give the figures and pictures of others."""
-
 from __future__ import annotations
 
 import json

@@ -1,5 +1,3 @@
-"""Runs on RGB-D views whose poses err: they are refined first, kept, and taken again."""
-
 from __future__ import annotations
 
 import json

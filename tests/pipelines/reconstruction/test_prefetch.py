@@ -1,5 +1,3 @@
-"""Reading ahead keeps the order, stays one ahead, and raises an error in its place."""
-
 from __future__ import annotations
 
 import threading

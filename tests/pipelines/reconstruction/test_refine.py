@@ -1,5 +1,3 @@
-"""A run whose Gaussians are fitted further, and made again with them."""
-
 from __future__ import annotations
 
 import json
@@ -27,8 +25,7 @@ from pipelines.reconstruction.run import refine
 
 pytestmark = pytest.mark.usefixtures("unpainted")
 
-SETTINGS = ("context=first:8", "targets=range:8-8", "views_per_round=1", "completer=inpaint",
-            "refine.poses=true")  # fmt: skip
+SETTINGS = ("context=first:8", "targets=range:8-8", "views_per_round=1", "completer=inpaint")
 QUIET = Console(quiet=True)
 APPEARANCE = "round_000/appearance.npz"
 
@@ -46,6 +43,14 @@ def whole(scan, tmp_path_factory):
 @pytest.fixture
 def copy(whole, tmp_path):
     return Path(shutil.copytree(whole, tmp_path / "run"))
+
+
+def refining_poses(copy: Path) -> dict:
+    """Let the fit refine poses, too; the run's record."""
+    record = json.loads((copy / "run.json").read_text())
+    record["settings"]["refine"]["poses"] = True
+    write_json(copy / "run.json", record)
+    return record
 
 
 def run(scan: Path, out: Path, *settings: str, resume: bool = False) -> Path:
@@ -71,7 +76,7 @@ def test_the_fit_goes_on_where_it_ended(copy):
 
 def test_refined_poses_go_on_from_the_saved_ones(copy):
     saved = Fitted.load(copy / APPEARANCE)
-    scene, record = load_run(copy).scenes[0], load_run(copy).record
+    scene, record = load_run(copy).scenes[0], refining_poses(copy)
     shifted = scene.subset(record["context"]).cameras.cam_from_world.copy()
     shifted[1, :3, 3] += [0.004, 0, 0]
     target = scene.subset(record["targets"]).cameras.cam_from_world
@@ -86,7 +91,7 @@ def test_refined_poses_go_on_from_the_saved_ones(copy):
 
 def test_poses_that_predict_neighbours_better_are_kept(copy, monkeypatch):
     saved = Fitted.load(copy / APPEARANCE)
-    scene, record = load_run(copy).scenes[0], load_run(copy).record
+    scene, record = load_run(copy).scenes[0], refining_poses(copy)
     given = scene.subset(record["context"]).cameras.cam_from_world
     target = scene.subset(record["targets"]).cameras.cam_from_world
     poses = RunPoses(given, target)
@@ -153,12 +158,13 @@ def test_a_full_disk_is_one_line_and_leaves_the_run_as_it_was(copy, monkeypatch)
 
 
 def test_a_run_without_a_fit_gets_one_and_is_resumed_with_it(scan, tmp_path):
-    out = run(scan, tmp_path / "run", "refine.steps=0")
+    settings = ("refine.steps=0", "refine.poses=true")
+    out = run(scan, tmp_path / "run", *settings)
     assert not (out / APPEARANCE).exists()
     refine(out, steps=2, console=QUIET)
     refined = results(out)
     assert APPEARANCE in refined
-    run(scan, out, "refine.steps=0", resume=True)
+    run(scan, out, *settings, resume=True)
     assert results(out) == refined
 
 
@@ -192,8 +198,7 @@ def test_what_cannot_be_refined_is_one_line_with_status_2(scan, copy, tmp_path, 
 
 
 def test_a_few_photographs_with_depth_are_fitted_as_well(scan, tmp_path):
-    out = run(scan, tmp_path / "run", "refine.steps=0", "refine.poses=false",
-              "context=first:3")  # fmt: skip
+    out = run(scan, tmp_path / "run", "refine.steps=0", "context=first:3")
     assert not (out / APPEARANCE).exists()
     refine(out, steps=1, console=QUIET)
     assert len(Fitted.load(out / APPEARANCE).appearance.gaussians) > 0

@@ -1,5 +1,3 @@
-"""``gvtools reconstruct --tune``: a run completes with weights tuned to its context."""
-
 from __future__ import annotations
 
 import json

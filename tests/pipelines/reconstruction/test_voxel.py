@@ -1,5 +1,3 @@
-"""Voxels of a run: the automatic edge against exact distances, and how coarse it may be."""
-
 from __future__ import annotations
 
 from dataclasses import replace

@@ -1,5 +1,3 @@
-"""Cells of a benchmark: figures within masks, resolutions, and processes of their own."""
-
 from __future__ import annotations
 
 import json

@@ -1,5 +1,3 @@
-"""``gvtools benchmark`` on tiny recordings."""
-
 from __future__ import annotations
 
 import csv

@@ -1,5 +1,3 @@
-"""Scenes of benchmarks in the data sets' own folders."""
-
 from __future__ import annotations
 
 from pathlib import Path

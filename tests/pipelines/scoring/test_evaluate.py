@@ -1,5 +1,3 @@
-"""``gvtools evaluate`` on real runs of a tiny recording."""
-
 from __future__ import annotations
 
 import json

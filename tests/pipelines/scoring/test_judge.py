@@ -1,5 +1,3 @@
-"""``gvtools judge`` on pictures of a tiny recording."""
-
 from __future__ import annotations
 
 import json

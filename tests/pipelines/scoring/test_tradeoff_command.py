@@ -1,5 +1,3 @@
-"""``gvtools tradeoff`` on a small scan, from the command line."""
-
 from __future__ import annotations
 
 import csv

@@ -1,5 +1,3 @@
-"""``gvtools train tune``: hold-outs of the context, the judge, and what is written."""
-
 from __future__ import annotations
 
 import json
