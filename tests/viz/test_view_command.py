@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import socket
 import subprocess
@@ -8,7 +9,8 @@ import sys
 import threading
 import time
 from contextlib import contextmanager
-from typing import get_args
+from pathlib import Path
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -132,8 +134,18 @@ print("\\n".join(said))
     assert lines[2].startswith("round 2 of 2") and "round: round that" in lines[2]
 
 
-def test_the_live_viewer_is_there_as_long_as_the_run_is_at_work(small_run, tmp_path, capsys):
+def test_the_live_viewer_is_there_as_long_as_the_run_is_at_work(
+    small_run, tmp_path, capsys, monkeypatch
+):
     pytest.importorskip("viser", reason="viser is not installed")
+    begun: list[subprocess.Popen] = []
+
+    class Noted(subprocess.Popen):
+        def __init__(self, *words: Any, **options: Any) -> None:
+            super().__init__(*words, **options)
+            begun.append(self)
+
+    monkeypatch.setattr(subprocess, "Popen", Noted)
     port = free_port()
     later = tmp_path / "run"
     threading.Timer(0.3, shutil.copytree, (small_run, later)).start()
@@ -153,6 +165,11 @@ def test_the_live_viewer_is_there_as_long_as_the_run_is_at_work(small_run, tmp_p
             assert time.monotonic() < end
             time.sleep(0.02)
             said += capsys.readouterr().out
+        # It starts without what takes seconds to import.
+        maps = Path(f"/proc/{begun[0].pid}/maps")
+        loaded = maps.read_text() if maps.exists() else ""
+        assert "numba" in loaded or not loaded
+        assert not re.search(r"/(torch|matplotlib)/", loaded)
     assert not reached()
 
 

@@ -28,7 +28,7 @@ pytestmark = pytest.mark.usefixtures("unpainted")
 QUIET = Console(quiet=True)
 # The last view sees what no other does.
 CONTEXT, TARGETS = "not:every:6+3", "every:6+3"
-SETTINGS = {"profile": "fast", "memory.observations_per_voxel": 3}
+SETTINGS = {"profile": "fast", "memory.observations_per_voxel": 3, "refine.poses": False}
 
 
 def reconstruct(project: Path, out: Path, **values: object) -> Path:
@@ -52,7 +52,8 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("walk")
     scan = write_scan(folder / "scan", views=10)
     reconstruct(scan, folder / "whole", context=CONTEXT, targets=TARGETS)
-    split(open_project(scan), folder / "blocks", blocks=3, context=CONTEXT, max_side=480)
+    split(open_project(scan), folder / "blocks", blocks=3, context=CONTEXT, max_side=480,
+          refine_poses=False)  # fmt: skip
     merge(block_runs(folder / "blocks", folder / "runs")[::-1], folder / "merged", console=QUIET)
     return folder
 
