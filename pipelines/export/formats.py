@@ -26,7 +26,7 @@ from gvtools.settings import Settings
 POINTS = ("max_points", "observed")
 MESH = ("observed", "method", "voxel", "least_piece", "max_triangles", "texture")
 FormatName = Literal[
-    "ply", "splat", "spz", "mesh", "las", "usd", "rrd", "glb", "colmap", "transforms"
+    "ply", "splat", "spz", "html", "mesh", "las", "usd", "rrd", "glb", "colmap", "transforms"
 ]
 
 
@@ -34,8 +34,8 @@ class ExportOptions(Settings):
     """What a user asks of an export, beside its format and place."""
 
     max_points: int | None = Field(None, ge=1)
-    """Thin to at most N points, one a voxel (ply: all; colmap: 200000; rrd: 1 million; glb, usd: 2
-    million; otherwise the memory's voxels). [N]"""
+    """Thin to at most N points, one a voxel (ply: all; colmap: 200000; html: 400000; rrd: 1
+    million; glb, usd: 2 million; otherwise the memory's voxels). [N]"""
     observed: bool = False
     """Leave out what a completer made."""
     method: Literal["tsdf", "poisson"] = "tsdf"
@@ -95,7 +95,7 @@ class ExportFormat:
         with path.open("rb") as file:
             alike = file.read(len(start)) == start
         if not alike or (source.is_file() and path.samefile(source)):
-            what = "the input" if alike else f"no {path.suffix[1:].upper()} file"
+            what = "the input" if alike else f"no {path.suffix[1:].upper()} file of this format"
             raise OptionError(f"{path}: is there already and is {what}; give another --out")
 
 
@@ -111,6 +111,8 @@ _ALL = (
                  {".ply": b"ply"}, POINTS),
     ExportFormat("spz", "splats.write_spz", "3D Gaussians, compressed",
                  {".spz": b"\x1f\x8b"}, POINTS),
+    ExportFormat("html", "html.write_html", "one page to share, which draws the 3D Gaussians",
+                 {".html": b"<!DOCTYPE html>\n<!-- gvtools export -->"}, POINTS),
     ExportFormat("mesh", "mesh.write_mesh", "triangles with vertex colours or a texture",
                  {".ply": b"ply", ".glb": b"glTF", ".obj": b"# gvtools"}, MESH, ("trimesh",)),
     ExportFormat("las", "points.write_las", "point cloud for GIS",

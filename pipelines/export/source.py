@@ -69,6 +69,7 @@ class Splats:
     fitted: int  # number of fitted ones, which come first; the others are points of the memory
     further: int  # number of the run's other fits, which are left out
     rounds: NDArray[np.int32]  # (N,) in which each was added
+    generated: NDArray[np.bool_]  # (N,) which are points that nobody observed
 
     def __len__(self) -> int:
         return len(self.values)
@@ -168,21 +169,21 @@ class ExportSource:
             f"{points.edge:.4g})"
         )
 
-    def splats(self, options: ExportOptions) -> Splats:
-        """The Gaussians that show the run or the memory."""
+    def splats(self, options: ExportOptions, *, exposed: bool = True) -> Splats:
+        """The Gaussians that show the run or the memory; ``exposed`` bakes in exposures."""
         appearance, memory = self.appearance, self.memory
         if appearance is None:
-            values, rounds = self._point_gaussians(options)
+            values, rounds, generated = self._point_gaussians(options)
             values, origin = _relative_to_middle(values, memory.frame.origin)
-            return Splats(values, origin, 0, 0, rounds)
+            return Splats(values, origin, 0, 0, rounds, generated)
         first = appearance.gaussians
-        if appearance.exposures is not None:
+        if exposed and appearance.exposures is not None:
             from gvtools.appearance.harmonics import expose
 
             photographs = concatenate([view.camera for view in memory.views.photographed])
             first = expose(first, appearance.exposures, photographs)
         fitted, rest = turn_gaussians(first.values, first.frame.axes), None
-        parts = [(fitted, np.zeros(len(fitted), np.int32))]
+        parts = [(fitted, np.zeros(len(fitted), np.int32), np.zeros(len(fitted), np.bool_))]
         if options.max_points is not None:
             rest = options.max_points - len(fitted)
             if rest < 0:
@@ -195,17 +196,17 @@ class ExportSource:
             # Of round 0, that is the fit's own depth, which its Gaussians show already.
             further |= memory.generated & (memory.columns.round > 0)
         if further.any() and rest != 0:
-            points, rounds = self._point_gaussians(ExportOptions(max_points=rest), among=further)
-            points[:, :LOG_SCALE] += (memory.frame.origin - first.frame.origin).astype(np.float32)
-            parts.append((points, rounds))
-        values, rounds = (np.concatenate(each) for each in zip(*parts, strict=True))
+            more = self._point_gaussians(ExportOptions(max_points=rest), among=further)
+            more[0][:, :LOG_SCALE] += (memory.frame.origin - first.frame.origin).astype(np.float32)
+            parts.append(more)
+        values, rounds, generated = (np.concatenate(each) for each in zip(*parts, strict=True))
         values, origin = _relative_to_middle(values, first.frame.origin)
-        return Splats(values, origin, len(fitted), len(appearance.others), rounds)
+        return Splats(values, origin, len(fitted), len(appearance.others), rounds, generated)
 
     def _point_gaussians(
         self, options: ExportOptions, *, among: NDArray[np.bool_] | None = None
-    ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-        """Spherical Gaussians of the memory's points, one a voxel, and the round of each.
+    ) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.bool_]]:
+        """Spherical Gaussians of the memory's points, one a voxel, with round and ``generated``.
 
         Their size follows from the distance between points, their opacity from confidence. Axes
         are the world's, positions relative to the memory's origin.
@@ -225,7 +226,8 @@ class ExportSource:
         share = confidence / (confidence + HALFWAY)
         opacity = LEAST_OPACITY + (MOST_OPACITY - LEAST_OPACITY) * share
         gaussians.values[:, LOGIT] = np.log(opacity / (1 - opacity))
-        return gaussians.values, columns.round[points.rows].astype(np.int32)
+        rounds = columns.round[points.rows].astype(np.int32)
+        return gaussians.values, rounds, memory.generated[points.rows]
 
     def cameras(self) -> DistinctCameras:
         """Each camera once, as formats of other tools need it, each with a unique name.

@@ -122,7 +122,13 @@ def read_splat_ply(path: Path) -> Splats:
         kept = kept.reshape(len(rows), -1)[:, : VALUES - SH - 3]
         values[:, SH + 3 : SH + 3 + kept.shape[1]] = kept
     values = values[np.isfinite(values).all(axis=1) & values[:, QUATERNION:LOGIT].any(axis=1)]
-    return Splats(values, _origin(path), len(values), 0, np.zeros(len(values), np.int32))
+    return splats_of(values, _origin(path))
+
+
+def splats_of(values: NDArray[np.float32], origin: NDArray[np.float64]) -> Splats:
+    """Gaussians of a file, which says nothing of rounds and sources."""
+    count = len(values)
+    return Splats(values, origin, count, 0, np.zeros(count, np.int32), np.zeros(count, np.bool_))
 
 
 def _origin(path: Path) -> NDArray[np.float64]:
@@ -224,8 +230,7 @@ def read_spz(path: Path) -> Splats:
     kept = (rest.astype(np.float32) - 128) / 128
     kept = kept[:, : VALUES - SH - 3]
     values[:, SH + 3 : SH + 3 + kept.shape[1]] = kept
-    rounds = np.zeros(count, np.int32)
-    return Splats(turn_gaussians(values, TO_RUB), np.zeros(3), count, 0, rounds)
+    return splats_of(turn_gaussians(values, TO_RUB), np.zeros(3))
 
 
 def _first_three(turns: NDArray[np.uint8]) -> NDArray[np.float64]:

@@ -150,6 +150,11 @@ def data_uri(data: bytes, kind: str) -> str:
     return f"data:{kind};base64,{base64.b64encode(data).decode('ascii')}"
 
 
+def thumbnail(label: str, picture: Rgb, *, side: int = SIDE) -> Thumbnail:
+    """A small picture, its longer side of at most ``side`` pixels."""
+    return Thumbnail(label, label, *_encoded(picture, side, flat=False))
+
+
 def _encoded(picture: Rgb, side: int, *, flat: bool) -> tuple[str, int, int]:
     """A thumbnail as a data URI, and its width and height.
 

@@ -1,0 +1,94 @@
+"""One page to share: the run's Gaussians, drawn by the browser as the run draws them.
+
+Gaussians come in groups, one for each round and source, which the page shows or hides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from gvtools.errors import GvError
+from gvtools.files import replaced_when_written
+from gvtools.runs.layout import RECORD
+from gvtools.runs.run import load_run
+from pipelines.export.formats import ExportOptions
+from pipelines.export.source import ExportSource, Splats
+from viz.page.page import PageCamera, PageGroup, SharedPage, page_html
+from viz.page.words import pack_gaussians
+from viz.report.pictures import thumbnail
+from viz.viewer.run_view import RunView, cameras_of
+from viz.viewer.standpoint import camera_outside
+
+# Of the memory, beside fitted Gaussians, where the user gives no number.
+MAX_POINTS = 400_000
+# Pictures beside the scene, and the longer side of each [px].
+MOST_PICTURES, SIDE = 200, 160
+# Nearest that points are drawn, where there is no fit, in typical depths.
+NEAR = 0.01
+
+
+def write_html(source: ExportSource, path: Path, options: ExportOptions) -> str:
+    """Write the page."""
+    memory, fit = source.memory, source.appearance
+    most = options.max_points
+    if most is None:
+        most = MAX_POINTS + (0 if fit is None else len(fit.gaussians))
+    splats = source.splats(options.model_copy(update={"max_points": most}), exposed=False)
+    run = RunView(source.path, memory, cameras=cameras_of(memory, ()))
+    cameras = list(_cameras(source))
+    depth = run.typical_depth
+    page = SharedPage(
+        title=run.title,
+        summary=f"{len(splats):,} Gaussians",
+        groups=list(_groups(splats)),
+        cameras=cameras,
+        start=cameras[0] if cameras else PageCamera(camera_outside(run)),
+        origin=splats.origin,
+        up=run.up(),
+        depth=depth,
+        near=NEAR * depth if fit is None else fit.near,
+        exposures=None if fit is None else fit.exposures,
+        exposed_in=None if fit is None else fit.gaussians.frame,
+    )
+    with replaced_when_written(path) as temporary:
+        temporary.write_text(page_html(page), encoding="utf-8")
+        size = temporary.stat().st_size / 1e6
+    pictures = sum(camera.picture is not None for camera in cameras)
+    return f"{splats.summary()} and {pictures} pictures in {path}, {size:.1f} MB"
+
+
+def _groups(splats: Splats) -> Iterator[PageGroup]:
+    fitted = np.arange(len(splats)) < splats.fitted
+    keys = np.stack([splats.rounds, splats.generated, fitted], axis=1)
+    for number, generated, whole in np.unique(keys, axis=0):
+        chosen = (keys == (number, generated, whole)).all(axis=1)
+        part = replace(
+            splats, values=splats.values[chosen], rounds=splats.rounds[chosen],
+            generated=splats.generated[chosen], fitted=int(chosen.sum()) if whole else 0,
+        )  # fmt: skip
+        words = pack_gaussians(
+            part.positions, log_scales=part.log_scales, quaternions=part.quaternions,
+            logits=part.logits, harmonics=part.harmonics,
+        )  # fmt: skip
+        yield PageGroup(int(number), bool(generated), bool(whole), words)
+
+
+def _cameras(source: ExportSource) -> Iterator[PageCamera]:
+    """Cameras of the photographs, with their pictures where they can be read."""
+    views = [view.camera for view in source.memory.views.photographed if view.camera.width[0] > 1]
+    chosen = np.unique(np.linspace(0, len(views) - 1, min(len(views), MOST_PICTURES)).round())
+    scene = None
+    if (source.path / RECORD).is_file():
+        with suppress(GvError):  # A project that cannot be read any more has no pictures.
+            scene = load_run(source.path).scenes[0]
+    for camera in (views[int(row)] for row in chosen):
+        name, picture = camera.names[0], None
+        if scene is not None and name in scene.names:
+            with suppress(GvError):
+                picture = thumbnail(name, scene[name].load().rgb, side=SIDE)
+        yield PageCamera(camera, picture)

@@ -1,0 +1,1 @@
+"""One page to share: a run's Gaussians in one HTML file that asks the network for nothing."""
