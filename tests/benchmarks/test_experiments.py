@@ -1,11 +1,14 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
+import geoverse_models as micro
 import numpy as np
 import pytest
 import torch
+from training_runs import sets
 
 from benchmarks.experiments.cases import held_out_cases
 from benchmarks.experiments.classical import CLASSICAL, classical
@@ -106,11 +109,12 @@ def test_the_truth_wins_every_figure(cases):
 def weights(tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("training")
     torch.set_num_threads(1)
-    steps = [f"{name}.optimizer.steps=2" for name in ("encoder", "denoiser", "reflow")]
-    pool = ("data.pool=8", f"data.cache={out / 'pool'}")
-    settings = [
-        part for text in (*steps, "encoder.statistics=1", *pool) for part in ("--set", text)
-    ]
+    settings = sets(
+        *(f"{name}.optimizer.steps=2" for name in ("encoder", "denoiser", "reflow")),
+        "encoder.statistics=1",
+        "data.pool=8",
+        f"data.cache={out / 'pool'}",
+    )
     options = ["--out", str(out), "--sheets", "0", "--quiet", "--device", "cpu"]
     assert run_command(["train", "micro", *options, *settings]) == 0
     return out
@@ -179,21 +183,23 @@ def test_an_experiment_without_what_it_needs_is_one_line(tmp_path, capsys):
     assert absent in capsys.readouterr().err
 
 
-def test_a_teacher_is_judged_with_the_students_heads(weights):
+def test_a_teacher_is_judged_with_the_students_heads(tmp_path):
     """Its own denoisers, so that heads that were trained later are not taken for distillation."""
-    last, before = weights / "reflow" / "weights", weights / "encoder" / "weights"
-    student, teacher = from_pretrained(last), from_pretrained(before)
+    config = replace(micro.CONFIG, trained=False)
+    student, teacher = micro.model(replace(config, trained=True)), micro.model(config)
+    before = tmp_path / "teacher"
+    save_pretrained(teacher, before)
     with torch.no_grad():
-        student.rgb_head.decoder_pred.bias.add_(1)
-    folder = last.parent / "changed"
-    save_pretrained(student, folder)
-    with with_heads_of(before, folder) as merged:
+        for parameter in student.parameters():
+            parameter.add_(1)
+    save_pretrained(student, tmp_path / "student")
+    with with_heads_of(before, tmp_path / "student") as merged:
         found = from_pretrained(merged)
         assert found.config.trained
+        states = student.state_dict(), teacher.state_dict()
         for name, tensor in found.state_dict().items():
-            heads = name.startswith(("rgb_head.", "geometry.head."))
-            other = student if heads else teacher
-            assert torch.equal(tensor, other.state_dict()[name]), name
+            other = states[0 if name.startswith(("rgb_head.", "geometry.head.")) else 1]
+            assert torch.equal(tensor, other[name]), name
     assert not merged.exists()
 
 

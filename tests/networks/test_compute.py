@@ -87,8 +87,10 @@ def test_training_in_float16_is_refused():
         OptimizerOptions(precision="float16")
 
 
-@pytest.mark.parametrize("dtype", HALF)
-@pytest.mark.parametrize("injection", ["none", "control", "shared"])
+@pytest.mark.parametrize(
+    ("injection", "dtype"),
+    [("none", HALF[0]), ("control", HALF[0]), ("shared", HALF[0]), ("control", HALF[1])],
+)
 def test_weights_held_in_half_precision_give_the_same_bits(dtype, injection):
     model = micro.model(micro.config(injection=injection))
     batch = micro.batch()
@@ -121,17 +123,17 @@ def test_weights_held_in_half_precision_give_the_same_bits(dtype, injection):
     assert kept < 0.1 * sum(held[name].numel() for name in outside)
 
 
-@pytest.mark.parametrize("name", ["bfloat16", "float16"])
-def test_a_completer_holds_its_weights_in_what_it_computes_in(tmp_path, name):
+def test_a_completer_holds_its_weights_in_what_it_computes_in(tmp_path):
     folder = micro.weights_folder(tmp_path / "weights")
-    context, known = micro.context_views(2), micro.guidance(1)
-    full = GeoVerseCompleter(weights=str(folder))
-    half = GeoVerseCompleter(weights=str(folder), precision=name)
+    views = micro.context_views(2), micro.guidance(1)
     weight = "level1.blocks.0.attn.qkv.weight"
-    assert half.model.get_parameter(weight).dtype == getattr(torch, name)
-    assert full.model.get_parameter(weight).dtype == torch.float32
-    error = np.abs(half.complete(context, known).rgb - full.complete(context, known).rgb)
-    assert 0 < error.max() < 0.05
+    pictures = []
+    for dtype in (torch.float32, *HALF):
+        precision = str(dtype).removeprefix("torch.")
+        completer = GeoVerseCompleter(weights=str(folder), precision=precision)
+        assert completer.model.get_parameter(weight).dtype == dtype
+        pictures.append(completer.complete(*views).rgb)
+        assert len(pictures) == 1 or 0 < np.abs(pictures[-1] - pictures[0]).max() < 0.05
 
 
 def batch() -> TrainingBatch:
@@ -171,12 +173,12 @@ def test_the_same_loss_and_gradients_to_the_last_bit(stage, options, parts, dtyp
 
     monkeypatch.setattr(Recomputing, "layer", counted)
     counts = []
+    model = micro.model(micro.config(injection="control"))
+    prior = SimpleNamespace(features=lambda *_, **__: micro.video_features(2, 4))
+    model.attach_video(prior)  # type: ignore[arg-type]
     for recompute in (False, True):
         ran.clear()
-        torch.manual_seed(1)
-        model = micro.model(micro.config(injection="control"))
-        prior = SimpleNamespace(features=lambda *_, **__: micro.video_features(2, 4))
-        model.attach_video(prior)  # type: ignore[arg-type]
+        model.zero_grad(set_to_none=True)
         made = stage(model, options(optimizer=OptimizerOptions(recompute=recompute)))
         found.append(gradients(made, dtype))
         counts.append(dict(ran))
@@ -243,19 +245,14 @@ def test_the_denoiser_with_video_keys_and_with_the_control_branch():
     for recompute in (False, True):
         model.level1.recompute = branch.recompute = recompute
         with Largest() as largest:
+            known = prepared.level1
             keys = video_keys(
-                model.shared,
-                micro.DENOISER,
-                prepared.level1.camera,
-                features=features,
-                grid=GRID,
+                model.shared, micro.DENOISER, known.camera, features=features, grid=GRID
             )
             adapted = branch.adapted(features.tensors, GRID)
-            residuals = branch(
-                model.level1, state, t, prepared.level1, adapted=adapted, positions=positions
-            )
+            residuals = branch(model.level1, state, t, known, adapted=adapted, positions=positions)
             out = model.level1(
-                state, t, prepared.level1, residuals=residuals, video=keys, positions=positions
+                state, t, known, residuals=residuals, video=keys, positions=positions
             )
             out.square().sum().backward()
         assert 0 < largest.count < scores / 4
@@ -263,14 +260,14 @@ def test_the_denoiser_with_video_keys_and_with_the_control_branch():
 
 def test_the_encoder_and_the_rgb_head():
     network = DepthAnything3(micro.CONFIG.geometry)
-    images = torch.rand(1, VIEWS, 3, *SIZE)
+    images = torch.rand(1, VIEWS, 3, 12 * micro.PATCH, 16 * micro.PATCH)
     with Largest() as largest:
         levels = network.encode(images)
         levels[-1].sum().backward()
-    assert 0 < largest.count < 2 * TOKENS * TOKENS / 4
+    assert 0 < largest.count < 2 * (VIEWS * 12 * 16) ** 2 / 4
 
     head = RGBHead(micro.CONFIG.rgb)
-    grid = (64, 64)
+    grid = (32, 32)
     features = torch.randn(1, grid[0] * grid[1], micro.CONFIG.rgb.in_channels)
     with Largest() as largest:
         head(features, grid).sum().backward()

@@ -23,7 +23,7 @@ from gvtools.scenes.scene import Scene
 from gvtools.similarity import align_poses
 from pipelines.cli import main
 
-SIZE = {"views": 10, "width": 240, "height": 180}
+SIZE = {"views": 6, "width": 200, "height": 150}
 CONTEXT = 4
 
 

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from reference_rays import is_free
 
+from gvtools.cameras import Cameras
+from gvtools.procedural.builder import ProceduralScene
 from gvtools.procedural.layouts import scene
 from gvtools.procedural.paths import camera_path
 from gvtools.procedural.ray_cast import cast
@@ -14,15 +16,18 @@ from gvtools.training.views import ContextChoice, choose_context
 SIZE = (48, 64)
 
 
-def _paths(count: int):
-    for seed in range(count):
+@pytest.fixture(scope="module")
+def paths() -> list[tuple[ProceduralScene, Cameras]]:
+    found = []
+    for seed in range(24):
         rng = np.random.default_rng([seed, 9])
         place = scene(rng, ("train", "held-out")[seed % 2])
-        yield place, camera_path(rng, place.geometry, views=8, size=SIZE)
+        found.append((place, camera_path(rng, place.geometry, views=8, size=SIZE)))
+    return found
 
 
-def test_cameras_stand_in_free_space_and_see_something() -> None:
-    for place, cameras in _paths(40):
+def test_cameras_stand_in_free_space_and_see_something(paths) -> None:
+    for place, cameras in paths:
         assert is_free(place.geometry, cameras.centers).all()
         # Not inside a hull either: nobody stands under a table.
         bare = place.geometry._replace(first_cutter=0 * place.geometry.first_cutter)
@@ -39,9 +44,9 @@ def test_cameras_stand_in_free_space_and_see_something() -> None:
         assert (rotation[:, 1, 2] < 0).all()
 
 
-def test_paths_move_and_turn() -> None:
+def test_paths_move_and_turn(paths) -> None:
     travel, turn = [], []
-    for _, cameras in _paths(40):
+    for _, cameras in paths:
         centers = cameras.centers
         depth = np.linalg.norm(np.ptp(centers, axis=0))
         travel.append(depth)

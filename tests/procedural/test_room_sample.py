@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pycolmap
 import pytest
@@ -8,14 +10,15 @@ from reference_rays import first_surface, is_free
 from scipy.ndimage import map_coordinates
 
 from gvtools.cameras import Cameras
-from gvtools.procedural.furnished_room import furnished_room
+from gvtools.procedural import furnished_room as room_module
 from gvtools.procedural.ray_cast import clearance
 from gvtools.procedural.room_sample import write_room
 from gvtools.procedural.sample_workspace import WrittenSample
 from gvtools.scenes.colmap import read_colmap
 from gvtools.scenes.scene import Frame, Scene
 
-SIZE = {"views": 6, "width": 240, "height": 180}
+furnished_room = cache(room_module.furnished_room)
+SIZE = {"views": 6, "width": 160, "height": 120}
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +66,7 @@ def test_depth_is_where_rays_leave_free_space(scene: Scene, frames: list[Frame])
     rng = np.random.default_rng(2)
     for view, frame in enumerate(frames):
         assert frame.depth is not None
-        y, x = (rng.integers(0, side, 40) for side in frame.depth.shape)
+        y, x = (rng.integers(0, side, 16) for side in frame.depth.shape)
         pose = scene.cameras.cam_from_world[view, :3, :3]
         rays = scene.cameras.rays(view)[y, x] @ pose
         expected = first_surface(geometry, scene.cameras.centers[view], rays)

@@ -30,7 +30,8 @@ SAMPLES: list[str] = []
 def samples(tmp_path_factory):
     """The same few samples for every training, made once; a record every few steps."""
     pool = f"data.cache={tmp_path_factory.mktemp('pool')}"
-    SAMPLES[:] = sets("data.pool=24", pool, "encoder.statistics=1")
+    SAMPLES[:] = sets("data.pool=8", "data.size=[24,24]", pool, "encoder.statistics=1")
+    SAMPLES.extend(sets(*(f"{stage}.optimizer.batch=2" for stage in COUNTS)))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(loop, "LOG_EVERY", 4)
         yield
@@ -50,7 +51,7 @@ def weights_of(folder: Path) -> dict[str, torch.Tensor]:
 
 
 # Steps of each stage.
-COUNTS = {"encoder": 10, "denoiser": 6, "reflow": 3, "heads": 4, "refiner": 3}
+COUNTS = {"encoder": 8, "denoiser": 4, "reflow": 3, "heads": 3, "refiner": 3}
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +65,7 @@ def trained(tmp_path_factory) -> Path:
 
 def test_the_loss_falls_and_every_stage_leaves_weights_that_load(trained):
     records = read_log(trained / "encoder")
-    assert records[-1]["step"] == 10
+    assert records[-1]["step"] == 8
     assert records[-1]["loss"] < records[0]["loss"]
     encoder = from_pretrained(trained / "encoder" / "weights")
     assert not encoder.config.trained
@@ -125,7 +126,7 @@ def test_an_earlier_stage_leaves_the_refiner_of_its_start_out(trained, tmp_path)
 
 def test_a_head_of_weight_0_stays_as_it_is(trained, tmp_path):
     shutil.copytree(trained / "reflow", tmp_path / "reflow")
-    rays = ["--set", "heads.rgb=0", "--set", "heads.depth=0", *steps("heads", 2)]
+    rays = [*sets("heads.rgb=0", "heads.depth=0"), *steps("heads", 1)]
     assert train(tmp_path, "heads", *rays) == 0
     names = moved(trained / "reflow", tmp_path / "heads")
     assert names and all(of_rays(name) for name in names)
@@ -135,8 +136,7 @@ def test_a_head_of_weight_0_stays_as_it_is(trained, tmp_path):
 @pytest.mark.slow
 def test_heads_lower_the_error_of_what_inference_composes(trained, tmp_path):
     shutil.copytree(trained / "reflow", tmp_path / "reflow")
-    more = ["--set", "heads.ray=0", "--set", "data.pool=8", *steps("heads", 30)]
-    more += ["--set", "heads.optimizer.batch=8"]
+    more = sets("heads.ray=0", "heads.optimizer.batch=8", "heads.optimizer.steps=30")
     assert train(tmp_path, "heads", *more) == 0
     records = read_log(tmp_path / "heads")
     first, last = records[0], records[-1]
@@ -144,17 +144,16 @@ def test_heads_lower_the_error_of_what_inference_composes(trained, tmp_path):
 
 
 def test_a_training_without_that_stage_says_so(tmp_path, capsys):
-    assert (
-        main(["train", "base", "--rooms", "--stage", "heads", "--out", str(tmp_path / "base")]) == 2
-    )
+    out = str(tmp_path / "base")
+    assert main(["train", "base", "--rooms", "--stage", "heads", "--out", out]) == 2
     assert "this training has no stage heads" in capsys.readouterr().err
 
 
 def test_a_resumed_training_is_the_uninterrupted_one(trained, tmp_path):
     again = tmp_path / "again"
-    assert train(again, "encoder", *steps("encoder", 10), "--until", "3") == 0
+    assert train(again, "encoder", *steps("encoder", 8), "--until", "3") == 0
     assert not (again / "encoder" / "weights").exists()
-    assert train(again, "encoder", *steps("encoder", 10), "--resume") == 0
+    assert train(again, "encoder", *steps("encoder", 8), "--resume") == 0
     assert not moved(trained / "encoder", again / "encoder")
 
 
@@ -239,10 +238,8 @@ def test_an_unfinished_stage_is_not_passed_over(trained, tmp_path, capsys):
 
 def test_every_stage_draws_what_it_makes(trained, tmp_path):
     shutil.copytree(trained / "encoder", tmp_path / "encoder")
-    sheets = [word for word in SHORT if word not in ("--sheets", "0")] + ["--sheets", "1", *SAMPLES]
     for stage, out in (("encoder", tmp_path / "own"), ("denoiser", tmp_path)):
-        command = ["train", "micro", "--stage", stage, "--out", str(out), *sheets]
-        assert main([*command, *steps(stage, 2), "--until", "1"]) == 0
+        assert train(out, stage, "--sheets", "1", *steps(stage, 2), "--until", "1") == 0
         with Image.open(out / stage / "sheets" / "step_000001.png") as sheet:
             picture = np.asarray(sheet)
         assert picture.shape[2] == 3 and picture.std() > 10
@@ -271,10 +268,10 @@ def test_batches_across_different_context_counts_are_refused_at_once(tmp_path, c
 
 
 def test_a_training_is_not_mixed_with_another(trained, tmp_path, capsys):
-    assert train(trained, "encoder", *steps("encoder", 10)) == 2
+    assert train(trained, "encoder", *steps("encoder", 8)) == 2
     assert "--resume" in capsys.readouterr().err
     assert train(trained, "encoder", *steps("encoder", 25), "--resume") == 2
-    assert "options.optimizer.steps = 10, now 25" in capsys.readouterr().err
+    assert "options.optimizer.steps = 8, now 25" in capsys.readouterr().err
     assert train(tmp_path / "new", "denoiser") == 2
     assert "run --stage encoder first" in capsys.readouterr().err
     assert train(tmp_path / "new", "encoder", "--set", "encoder.optimizer.stepz=3") == 2
@@ -322,7 +319,7 @@ def test_a_trained_model_is_packed_with_its_record(trained, tmp_path, capsys):
     whole = (trained / "refiner" / "weights" / "geoverse.safetensors").stat().st_size
     assert (out / "geoverse.safetensors").stat().st_size < 0.6 * whole
     settings = json.loads((out / "training_encoder.json").read_text())
-    assert settings["encoder"]["optimizer"]["steps"] == 10 and settings["data"]["cache"] is None
+    assert settings["encoder"]["optimizer"]["steps"] == 8 and settings["data"]["cache"] is None
     last = json.loads((out / "log_reflow.jsonl").read_text().splitlines()[-1])
     assert last["step"] == 3
     shutil.copytree(trained, tmp_path / "again")
@@ -342,20 +339,21 @@ def test_a_trained_model_is_packed_with_its_record(trained, tmp_path, capsys):
 def test_auto_is_settled_once_said_and_kept(tmp_path, capsys, monkeypatch):
     from gvtools.networks import compute
 
-    auto = ("--set", "encoder.optimizer.precision=auto", "--set", "encoder.optimizer.steps=2")
+    auto = sets("encoder.optimizer.precision=auto", "encoder.optimizer.steps=2")
     start = ["train", "micro", "--stage", "encoder", "--out", str(tmp_path), "--device", "cpu"]
+    start += ["--sheets", "0", *SAMPLES, *auto]
     faster = [True]
     monkeypatch.setattr(compute, "bfloat16_is_faster", lambda: faster[0])
-    assert main([*start, "--sheets", "0", *SAMPLES, *auto, "--until", "1"]) == 0
+    assert main([*start, "--until", "1"]) == 0
     assert "encoder: products in bfloat16" in capsys.readouterr().out
     state = torch.load(tmp_path / "encoder" / "state.pt", weights_only=True)
     assert state["identity"]["options"]["optimizer"]["precision"] == "bfloat16"
     # The next start measures otherwise; the training stays what it was.
     faster[0] = False
     more = ("--set", "encoder.optimizer.recompute=true", "--resume")
-    assert main([*start, "--sheets", "0", *SAMPLES, *auto, *more]) == 0
+    assert main([*start, *more]) == 0
     said = capsys.readouterr().out
     assert "encoder: products in bfloat16" in said and "goes on after step 1" in said
     assert (tmp_path / "encoder" / "weights").is_dir()
-    assert main([*start, "--sheets", "0", *SAMPLES, *auto, "--out", str(tmp_path / "new")]) == 0
+    assert main([*start, "--out", str(tmp_path / "new"), "--until", "1"]) == 0
     assert "encoder: products in float32" in capsys.readouterr().out
