@@ -23,7 +23,7 @@ from gvtools.scenes.scene import Scene
 from gvtools.similarity import align_poses
 from pipelines.cli import main
 
-SIZE = {"views": 6, "width": 200, "height": 150}
+SIZE = {"views": 10, "width": 160, "height": 120}
 CONTEXT = 4
 
 

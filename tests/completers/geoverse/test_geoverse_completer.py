@@ -227,12 +227,18 @@ WORLDS: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize("alignment", ["hint", "field"])
-@pytest.mark.parametrize("world", list(WORLDS))
+@cache
+def two_views(weights: Path, alignment: str) -> Completion:
+    return complete(weights, micro.context_views(2), micro.guidance(2), alignment=alignment)
+
+
+@pytest.mark.parametrize(
+    ("world", "alignment"),
+    [*((world, "hint") for world in WORLDS), ("far, turned, in millimetres", "field")],
+)
 def test_neither_the_worlds_unit_nor_its_frame_matter(weights, alignment, world):
-    context, known = micro.context_views(2), micro.guidance(2)
-    expected = complete(weights, context, known, alignment=alignment)
-    found = complete(weights, *micro.moved(context, known, **WORLDS[world]), alignment=alignment)
+    moved = micro.moved(micro.context_views(2), micro.guidance(2), **WORLDS[world])
+    expected, found = two_views(weights, alignment), complete(weights, *moved, alignment=alignment)
     scale = WORLDS[world].get("scale", 1.0)
     assert (expected.depth > 0).all()
     np.testing.assert_allclose(found.rgb, expected.rgb, atol=2e-4)
@@ -474,31 +480,38 @@ def reconstruct(scan: Path, weights: Path, out: Path, *words: str) -> int:
     )
 
 
-def test_a_run_names_its_weights_and_resumes_to_the_same_bytes(scan, weights, tmp_path):
-    whole, out = tmp_path / "whole", tmp_path / "run"
-    assert reconstruct(scan, weights, whole) == 0
+@pytest.fixture(scope="module")
+def whole(scan, tmp_path_factory) -> Path:
+    """A run, the weights that it was made with beside it."""
+    folder = tmp_path_factory.mktemp("whole")
+    weights = micro.weights_folder(folder / "weights")
+    assert reconstruct(scan, weights, folder / "run") == 0
+    return folder / "run"
+
+
+def test_a_run_names_its_weights_and_resumes_to_the_same_bytes(scan, whole, tmp_path):
+    out = tmp_path / "run"
     rounds = untimed(whole)
     assert [entry["round"] for entry in rounds] == [0, 1, 2]
     assert len(SpatialMemory.load(whole / "memory.npz")) == rounds[-1]["points"] > 0
     assert len(json.loads((whole / "run.json").read_text(encoding="utf-8"))["weights"]) == 64
     shutil.copytree(whole, out)
     shutil.rmtree(out / "round_002")
-    assert reconstruct(scan, weights, out, "--resume") == 0
+    assert reconstruct(scan, whole.parent / "weights", out, "--resume") == 0
     assert results(out) == results(whole) and untimed(out) == rounds
 
 
-def test_changed_weights_refuse_to_resume(scan, tmp_path, capsys):
-    folder, out = micro.weights_folder(tmp_path / "weights"), tmp_path / "run"
-    assert reconstruct(scan, folder, out) == 0
-    before = results(out)
-    micro.weights_folder(tmp_path / "other", seed=1)
-    for path in (tmp_path / "other").iterdir():
-        shutil.copyfile(path, folder / path.name)
-    capsys.readouterr()
-    assert reconstruct(scan, folder, out, "--resume") == 2
+def test_changed_weights_refuse_to_resume(scan, whole, tmp_path, capsys):
+    weights, before = whole.parent / "weights", results(whole)
+    shutil.copytree(weights, tmp_path / "own")
+    try:
+        micro.weights_folder(weights, seed=1)
+        assert reconstruct(scan, weights, whole, "--resume") == 2
+    finally:
+        shutil.copytree(tmp_path / "own", weights, dirs_exist_ok=True)
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and "another run (weights differ)" in said
-    assert results(out) == before
+    assert results(whole) == before
 
 
 def test_it_is_small_and_brings_its_record():
