@@ -73,9 +73,9 @@ def test_a_shape_that_the_bytes_cannot_hold_takes_no_memory(tmp_path):
 
 
 def test_an_archive_that_unpacks_to_gigabytes_is_refused(tmp_path):
-    with zipfile.ZipFile(tmp_path / "x.npz", "w", zipfile.ZIP_DEFLATED) as archive:
+    with zipfile.ZipFile(tmp_path / "x.npz", "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
         archive.writestr("a.npy", bytes(300 << 20))
-    assert (tmp_path / "x.npz").stat().st_size < 1 << 20
+    assert (tmp_path / "x.npz").stat().st_size < 2 << 20
     with pytest.raises(ValueError, match="claim 314572800 bytes"):
         load_arrays(tmp_path / "x.npz")
 

@@ -114,17 +114,13 @@ def test_an_unknown_name_meets_the_nearest_known():
         create("none", strength=1)
 
 
+@pytest.mark.usefixtures("unpainted")
 def test_a_completer_of_ones_own_serves_a_run_and_is_made_once(painter, tmp_path):
-    scan, out = write_scan(tmp_path / "scan"), tmp_path / "run"
+    scan, out = write_scan(tmp_path / "scan", views=4), tmp_path / "run"
     _Painter.made = 0
-    words = ["--context", "first:2", "--targets", "range:2-5", "--views-per-round", "2"]
-    own = ["--completer", "painter", "--set", "completer.strength=0.3"]
-    assert (
-        main(
-            ["reconstruct", str(scan), "--refine", "0", "--out", str(out), "--quiet", *words, *own]
-        )
-        == 0
-    )
+    words = ["--context", "first:2", "--targets", "range:2-3", "--views-per-round", "1"]
+    words += ["--completer", "painter", "--set", "completer.strength=0.3", "--refine", "0"]
+    assert main(["reconstruct", str(scan), "--out", str(out), "--quiet", *words]) == 0
     assert _Painter.made == 1
     for number in (1, 2):
         folder = RunDirectory(out).round_path(number)

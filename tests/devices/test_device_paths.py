@@ -14,8 +14,9 @@ pytestmark = pytest.mark.usefixtures("one_thread", "unpainted")
 ROOT = Path(__file__).parents[2]
 
 
-# These take up to 22 seconds each, or repeat others in bfloat16: too long for every run.
-SLOW = {"depth plane-sweep, torch", "reconstruct", "bench complete"}
+# These take up to 22 seconds each, are part of a longer path or repeat others in bfloat16: too long
+# for every run.
+SLOW = {"depth plane-sweep, torch", "reconstruct", "bench complete", "generate"}
 SLOW |= {name for name in PATHS if name[:5] == "train" or "bfloat16" in name}
 NAMES = [pytest.param(n, marks=pytest.mark.slow) if n in SLOW else n for n in PATHS]
 

@@ -41,7 +41,7 @@ def completers(folders: dict[str, Path]) -> dict[str, Completer]:
     made = {"none": create("none"), "inpaint": create("inpaint", min_support=1)}
     for name in GENERATIVE:
         weights = str(folders[name])
-        made[name] = create("geoverse", weights=weights, device="cpu", alignment="hint")
+        made[name] = create("geoverse", weights=weights, steps=1, alignment="hint")
     return made
 
 

@@ -75,7 +75,7 @@ def test_the_confidence_of_a_source_is_kept_or_counted(trust):
         assert len(lifted) == depth.size
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(powers=st.lists(st.floats(-44.8, 38.5), min_size=2, max_size=30), seed=st.integers(0, 999))
 def test_mixed_confidences_average_as_in_float64(powers, seed):
     """Weights over eighty decades in one voxel."""
@@ -169,11 +169,11 @@ def test_a_million_points_of_one_view_in_one_voxel():
 @pytest.mark.parametrize("own", [1e-30, 0.3, LARGEST])
 def test_hundreds_of_equal_fusions_drift_nowhere(own):
     memory, place = SpatialMemory(1.0), np.array((0.1, 0.7, 2.3), np.float32)
-    for _ in range(400):
+    for _ in range(200):
         memory.fuse(points(place, colors=COLOR, confidence=own), round=0)
     np.testing.assert_array_equal(memory.columns.positions, [place])
     np.testing.assert_array_equal(memory.columns.colors, [COLOR])
-    assert memory.confidence[0] == pytest.approx(min(400 * own, 100.0), rel=0.01)
+    assert memory.confidence[0] == pytest.approx(min(200 * own, 100.0), rel=0.01)
 
 
 def test_hundreds_of_noisy_fusions_stay_with_the_mean():
@@ -264,7 +264,7 @@ def test_what_is_too_far_is_counted_and_wide_voxels_go_farther():
     np.testing.assert_allclose(seen.depth[0, 2:-2, -60:-4], 5e4, rtol=1e-5)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), decades=st.floats(0, 3))
 def test_random_depths_look_as_float64_says(seed, decades):
     rng = np.random.default_rng(seed)
@@ -323,7 +323,7 @@ def test_the_cosine_of_a_slant_holds_to_float32_depth(degrees, off):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), scale=st.sampled_from([1e-6, 1.0, 1e6]))
 def test_points_at_and_behind_the_camera_plane_leave_the_wall_as_it_is(seed, scale, backend):
     rng = np.random.default_rng(seed)
@@ -387,7 +387,7 @@ def test_points_on_borders_belong_to_one_voxel_and_stay_there(edge, corner, step
     np.testing.assert_array_equal(np.unique(_cells(memory), axis=0), expected)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(edge=st.sampled_from(EDGES), seed=st.integers(0, 2**32 - 1))
 def test_averages_of_points_at_a_border_do_not_cross_it(edge, seed, tmp_path_factory):
     """The mean of two points just inside rounds onto the border; the index would lose it."""
@@ -427,7 +427,7 @@ def test_the_order_of_points_of_one_depth_is_no_matter(seed, backend):
     np.testing.assert_allclose(one.confidence, two.confidence, rtol=1e-4)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), count=st.integers(2, 4000))
 def test_of_equal_depths_the_lower_index_wins_whatever_stands_between(seed, count):
     rng = np.random.default_rng(seed)
