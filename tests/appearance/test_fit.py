@@ -73,7 +73,7 @@ def test_the_same_number_of_steps_gives_the_same_bytes(fitted, views):
     again = Fit(rough_gaussians(), views, options=FitOptions(steps=STEPS))
     again.run()
     assert again.gaussians.values.tobytes() == fitted.gaussians.values.tobytes()
-    other = Fit(rough_gaussians(), views, options=FitOptions(steps=STEPS), seed=1)
+    other = Fit(rough_gaussians(), views, options=FitOptions(steps=20), seed=1)
     other.run()
     assert other.gaussians.values.tobytes() != fitted.gaussians.values.tobytes()
 
@@ -215,7 +215,7 @@ def test_photographs_of_different_brightness_are_explained_by_gains(views):
     fits = {}
     for exposure in (True, False):
         fits[exposure] = Fit(
-            rough_gaussians(), uneven, options=FitOptions(steps=300, exposure=exposure)
+            rough_gaussians(), uneven, options=FitOptions(steps=180, exposure=exposure)
         )
         fits[exposure].run()
     found = np.log([fits[True].cameras.gain(number) for number in range(5)])

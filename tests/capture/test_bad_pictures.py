@@ -130,35 +130,26 @@ def test_a_failure_says_what_was_met(texture: Image.Image, tmp_path: Path) -> No
 
 
 def test_a_camera_that_only_turned_is_told(texture: Image.Image, tmp_path: Path) -> None:
-    images, K = tmp_path / "images", np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
-    images.mkdir()
-    for index in range(4):
-        angle = np.radians(4.0 * index - 6)
-        cos, sin = np.cos(angle), np.sin(angle)
-        turn = np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]])
-        # What a camera at the wall's centre of projection sees after a turn.
-        wall = np.array([[300.0, 0, 480], [0, 300, 240], [0, 0, 1]])
-        seen = cv2.warpPerspective(
-            np.asarray(texture), K @ turn @ np.linalg.inv(wall), (320, 240), flags=cv2.INTER_LINEAR
-        )
-        Image.fromarray(seen).save(images / f"{index}.png")
+    images, names = tmp_path / "images", [f"{index}.png" for index in range(4)]
+    walls(texture, images, [(0, np.radians(4.0 * index - 6)) for index in range(4)], lift=0)
     (tmp_path / "work").mkdir()
     with pytest.raises(ProjectError, match=r"away: .*the camera only turned.* while walking"):
-        names = [f"{index}.png" for index in range(4)]
         find_cameras(MappingTask(images, [names], tmp_path / "work", source=Path("away")))
 
 
-def walls(texture: Image.Image, folder: Path, poses: list[tuple[float, float]]) -> None:
+def walls(
+    texture: Image.Image, folder: Path, poses: list[tuple[float, float]], *, lift: float = 0.1
+) -> None:
     """Pictures of a wall at distance 1, from places and turns about the vertical axis."""
     folder.mkdir()
     K, wall = (np.array([[f, 0, w], [0, f, h], [0, 0, 1.0]]) for f, w, h in
-               ((320, 160, 120), (480, 480, 240)))  # fmt: skip
+               ((240, 120, 90), (480, 480, 240)))  # fmt: skip
     for index, (x, angle) in enumerate(poses):
         cos, sin = np.cos(angle), np.sin(angle)
         turn = np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]])
-        moved = np.eye(3) - np.outer([x, 0.1 * (index % 2), 0], [0, 0, 1])
+        moved = np.eye(3) - np.outer([x, lift * (index % 2), 0], [0, 0, 1])
         seen = cv2.warpPerspective(
-            np.asarray(texture), K @ turn @ moved @ np.linalg.inv(wall), (320, 240)
+            np.asarray(texture), K @ turn @ moved @ np.linalg.inv(wall), (240, 180)
         )
         Image.fromarray(seen).save(folder / f"{index}.png")
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import tiny_scan
 from command_line import refused
-from phone_exports import stray_scanner
+from phone_exports import polycam
 from rgbd_walk import FOCAL, HEIGHT, WIDTH, pictures, walk, write_redwood, write_sevenscenes
 from rgbd_walk import write_tum as write_tum_walk
 
@@ -152,7 +152,7 @@ def test_frames_that_cannot_be_read_are_left_out_and_named(walked, tmp_path, cap
 
 
 def test_a_phone_export_with_poses_is_no_capture(tmp_path, capsys) -> None:
-    stray_scanner(tmp_path / "walk")
+    polycam(tmp_path / "walk")
     line = refused(capsys, "capture", tmp_path / "walk", "--out", tmp_path / "out")
     assert "has poses and depth already; give it to gvtools reconstruct" in line
 

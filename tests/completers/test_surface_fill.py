@@ -106,7 +106,7 @@ def test_depth_is_filled_in_its_logarithm():
     assert not found[2].any()
 
 
-SCALE = 0.5
+SCALE = 0.8
 
 
 @pytest.fixture(scope="module")

@@ -33,7 +33,7 @@ def _cloud(rng: np.random.Generator, count: int, source):
     )
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),
     views=st.integers(1, 12),
@@ -69,7 +69,7 @@ def test_fusion_does_what_a_plain_dictionary_does(seed, views, capacity, degrees
             assert one.agreement == pytest.approx(two.agreement, rel=1e-5)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), voxel=st.floats(0.003, 3), far=st.floats(0, 1000))
 def test_voxels_are_the_distinct_floors_of_position_over_edge(seed, voxel, far):
     rng = np.random.default_rng(seed)

@@ -76,17 +76,17 @@ def _flipped(data: bytes, positions, rng):
 def _altered(kind: str, data: bytes, rng):
     if kind == "bits":
         # The directory at the end holds most of what is not covered by a checksum.
-        directory = range(len(data) - 1500, len(data), 7)
-        yield from _flipped(data, [*rng.choice(len(data), 250, replace=False), *directory], rng)
+        directory = range(len(data) - 1500, len(data), 15)
+        yield from _flipped(data, [*rng.choice(len(data), 120, replace=False), *directory], rng)
     elif kind == "every bit":
         yield from _flipped(data, range(len(data)), rng)
     elif kind == "blocks":
-        for _ in range(200):
+        for _ in range(80):
             at, length = int(rng.integers(len(data))), int(rng.integers(1, 64))
             block = rng.bytes(length) if rng.random() < 0.7 else bytes(length)
             yield (data[:at] + block + data[at + length :])[: len(data)]
     elif kind == "cut":
-        for n in (*range(0, len(data), 97), *range(len(data) - 60, len(data))):
+        for n in (*range(0, len(data), 197), *range(len(data) - 60, len(data))):
             yield data[:n]
     else:
         for more in (b"\0", b"\0" * 100, b"PK\5\6", rng.bytes(1000), data, data[-22:]):

@@ -273,7 +273,7 @@ def test_voxels_are_found_again_and_stay_within_the_reserve(seed, blocks):
     numbers = index.block_numbers(np.arange(blocks, dtype=np.int64))
     known: dict[tuple[int, int], int] = {}
     for _ in range(4):
-        count = int(rng.integers(1, 3000))
+        count = int(rng.integers(1, 1500))
         block = rng.integers(0, blocks, count)
         place = rng.integers(0, 4096, count)
         index.reserve_voxels(count, np.unique(numbers[block]))
@@ -365,7 +365,7 @@ def test_points_beyond_all_cells_have_a_tile():
 def test_each_segment_keeps_one_observation_a_cube(doublings):
     memory = SpatialMemory(0.02)
     for i in range(3):
-        memory.fuse(random_points(np.random.default_rng(i), 800, name=f"{i}"), round=0)
+        memory.fuse(random_points(np.random.default_rng(i), 250, name=f"{i}"), round=0)
     copy = thinned_copy(memory.whole, doublings)
     columns, segments = memory.columns, memory.segments
     assert copy.start[-1] == len(copy.rows.positions) < len(memory)

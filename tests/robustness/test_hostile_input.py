@@ -26,7 +26,7 @@ from gvtools.errors import ProjectError
 
 ROOT = Path(__file__).parents[2]
 # Beside the corpus a few mutations of every reader, so that the table itself is known to work.
-A_FEW = 2
+A_FEW = 1
 
 
 def replayed(reader: Reader, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

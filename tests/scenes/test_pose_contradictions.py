@@ -16,6 +16,7 @@ from gvtools.cameras import Cameras
 from gvtools.scenes.colmap import read_colmap
 from gvtools.scenes.inspection import (
     DISAGREEING,
+    contradiction_findings,
     contradictions,
     disagreement,
     homography,
@@ -69,8 +70,12 @@ def walk(views: int = 12, *, spread: float = 0.02, wrong: tuple[int, ...] = ()) 
 
 
 def contradiction_messages(scene: Scene) -> list[str]:
-    findings = inspect(scene).findings
-    return [item.message for item in findings if "nearly equal cameras" in item.message]
+    frames = dict(enumerate(view.load() for view in scene))
+    depths = {
+        i: float(np.median(frame.depth)) for i, frame in frames.items() if frame.depth is not None
+    }
+    thumbnails = {i: thumbnail(frame) for i, frame in frames.items()}
+    return [item.message for item in contradiction_findings(scene, thumbnails, depths)]
 
 
 def without_depth(scene: Scene) -> Scene:
@@ -90,6 +95,7 @@ def test_half_of_the_views_with_poses_of_the_other_side_are_told() -> None:
     report = inspect(scene)
     assert report.ok
     (message,) = contradiction_messages(scene)
+    assert message in {finding.message for finding in report.findings}
     assert "show different things" in message and "solve the poses again" in message
     thumbnails = {i: thumbnail(view.load()) for i, view in enumerate(scene)}
     found = contradictions(scene, thumbnails, dict.fromkeys(thumbnails, FAR))

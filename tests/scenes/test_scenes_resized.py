@@ -94,7 +94,7 @@ def test_points_that_held_out_views_saw_are_left_out():
 
 @pytest.fixture
 def walls(textures) -> Scene:
-    picture = photograph(camera_at((0, 0, 0), name="a.png"), textures)
+    picture = photograph(camera_at((0, 0, 0), scale=1.6, name="a.png"), textures)
     small = camera_at((0.1, 0, 0), name="b.png").resized(80, 60)
     mask = np.ones(picture.rgb.shape[:2], bool)
     mask[:, :100] = False
