@@ -57,15 +57,42 @@ def render_view(
         rig: of another lens than the camera's.
         fill: completes a pinhole camera's projection.
     """
-    start = time.perf_counter()
-    views = []
-    for face in [camera] if rig is None else rig.cameras(camera):
+
+    def view(face: Cameras) -> Guidance:
         guidance = memory.project(face, options=options)
         if appearance is not None:
             guidance = recolor(guidance, appearance.picture(face), blend=appearance.blend)
-        views.append(guidance if fill is None else fill(guidance))
-    guidance = views[0] if rig is None else rig.joined(views, camera)
+        return guidance if fill is None else fill(guidance)
+
+    start = time.perf_counter()
+    guidance = view(camera) if rig is None else rig.joined(map(view, rig.cameras(camera)), camera)
     return guidance, time.perf_counter() - start
+
+
+def complete_views(
+    memory: SpatialMemory, cameras: Iterable[Cameras], *, appearance: Appearance | None
+) -> None:
+    """Complete the views of pinhole cameras by ``inpaint`` in turn, and fuse what it filled.
+
+    So what was filled looks the same from all of them, and from those between.
+    """
+    targets = [CachedProjection(memory, camera, appearance=appearance) for camera in cameras]
+    for _ in complete_targets(
+        targets, memory.rounds[-1] + 1, memory=memory, completer=create("inpaint"), context=(),
+        config=RunSettings(), clock=Clock(),
+    ):  # fmt: skip
+        pass
+
+
+def filled(guidance: Guidance) -> Guidance:
+    """A projection, a batch of one, with its holes filled by ``inpaint``, as generated."""
+    if guidance.valid.all() or not guidance.valid.any():
+        return guidance
+    completion = run_completer(create("inpaint"), (), guidance)
+    return replace(
+        guidance, rgb=completion.rgb, depth=completion.depth, valid=completion.depth > 0,
+        generated=guidance.generated | ~guidance.valid,
+    )  # fmt: skip
 
 
 def measure(
@@ -285,7 +312,7 @@ class FilmRenderer:
         if panel == "observed":
             return self._shown(self._projected(self._observed, camera))
         if panel == "completed":
-            return self._shown(self._projected(self._completed, camera, fill=self._filled))
+            return self._shown(self._projected(self._completed, camera, fill=filled))
         guidance = self._projected(self.memory, camera)
         return self._depth(guidance) if panel == "depth" else self._shown(guidance)
 
@@ -298,12 +325,6 @@ class FilmRenderer:
         )
         self.projecting += seconds
         return guidance
-
-    def _filled(self, guidance: Guidance) -> Guidance:
-        if guidance.valid.all() or not guidance.valid.any():
-            return guidance
-        completion = run_completer(self._inpaint, (), guidance)
-        return replace(guidance, rgb=completion.rgb, valid=completion.depth > 0)
 
     def _shown(self, guidance: Guidance) -> Picture:
         return self._outside_black(picture_of(guidance))
@@ -325,10 +346,6 @@ class FilmRenderer:
         return self._outside_black(picture)
 
     @cached_property
-    def _inpaint(self):
-        return create("inpaint")
-
-    @cached_property
     def _observed(self) -> SpatialMemory:
         """The memory after its first round, which holds observations only."""
         return load_memory(self.path, up_to=self.memory.rounds[0])
@@ -337,15 +354,7 @@ class FilmRenderer:
     def _completed(self) -> SpatialMemory:
         """The memory with key frames of the path completed and fused."""
         memory = load_memory(self.path, up_to=self.up_to)
-        targets = [
-            CachedProjection(memory, camera, appearance=self.appearance)
-            for camera in self._spread_cameras(KEY_FRAMES)
-        ]
-        for _ in complete_targets(
-            targets, memory.rounds[-1] + 1, memory=memory, completer=self._inpaint, context=(),
-            config=RunSettings(), clock=Clock(),
-        ):  # fmt: skip
-            pass
+        complete_views(memory, self._spread_cameras(KEY_FRAMES), appearance=self.appearance)
         return memory
 
     @cached_property

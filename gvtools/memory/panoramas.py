@@ -12,16 +12,16 @@ field of view; the camera's own axes, black outside. Depth is the distance along
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
 from gvtools.cameras import Cameras, concatenate, invert_rigid
-from gvtools.guidance import Guidance
+from gvtools.guidance import IMAGES, Guidance
 from gvtools.scenes.faces import PANORAMA, Face, face_name, panorama_faces, picture_of
 from gvtools.settings import Settings
 from gvtools.trajectories import level_up, look_at
@@ -29,10 +29,12 @@ from gvtools.trajectories import level_up, look_at
 Float64 = NDArray[np.float64]
 Float32 = NDArray[np.float32]
 
+# What a guidance holds that is no yes or no, beside colours.
+AMOUNTS = ("depth", "confidence")
 # Field of view of a face, so that neighbours share a margin. [degrees]
 FACE_DEGREES = 100.0
 # Width of a picture unless told otherwise: as fine as the cameras, at most so much. [px]
-WIDEST_STILL, WIDEST_FRAME = 8192, 2048
+WIDEST_STILL, WIDEST_FRAME = 4096, 2048
 
 
 class LensOptions(Settings):
@@ -43,7 +45,7 @@ class LensOptions(Settings):
     kind: Literal["perspective", "equirectangular", "fisheye"] = "perspective"
     """Perspective as the cameras are, equirectangular (a panorama of all directions, level), or
     fisheye (equidistant)."""
-    width: int | None = Field(None, ge=16, le=32768)
+    width: int | None = Field(None, ge=16, le=16384)
     """Of a panorama or fisheye picture; none: as fine as the cameras, within limits. [px]"""
     field_of_view: float = Field(180.0, ge=10, le=360)
     """Across a fisheye's circle. [degrees]"""
@@ -113,7 +115,7 @@ class Rig:
             name = picture_of(cameras.names[first])
             yield replace(cameras[first], cam_from_world=turned[None], names=(name,))
 
-    def joined(self, faces: Sequence[Guidance], picture: Cameras) -> Guidance:
+    def joined(self, faces: Iterable[Guidance], picture: Cameras) -> Guidance:
         """The picture of the faces, batches of one; colours are blended, all else the nearest's.
 
         Depth is the distance along the ray. ``picture`` gives centre, axes and name.
@@ -122,9 +124,9 @@ class Rig:
 
         columns, rows = self.size
         rgb = np.zeros((rows, columns, 4), np.float32)
-        flat = {
-            name: np.zeros((rows, columns), getattr(faces[0], name).dtype)
-            for name in ("depth", "valid", "confidence", "generated", "scanned")
+        flat: dict[str, NDArray[Any]] = {
+            name: np.zeros((rows, columns), np.float32 if name in AMOUNTS else np.bool_)
+            for name in IMAGES[1:]
         }
         for guidance, at in zip(faces, self.samples, strict=True):
             known = guidance.valid[0].astype(np.float32)[..., None]

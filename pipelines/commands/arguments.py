@@ -116,9 +116,9 @@ class LensArguments(Arguments):
     """Equirectangular is a level panorama of all directions, fisheye an equidistant circle."""
     field_of_view: float | None = Field(None, ge=10, le=360)
     """Across a fisheye's circle (180). [degrees]"""
-    width: int | None = Field(None, ge=16, le=32768)
+    width: int | None = Field(None, ge=16, le=16384)
     """Of a picture; the height follows (the cameras'; of another lens as fine as they are, at most
-    8192, in a film 2048). [pixels]"""
+    4096, in a film 2048). [pixels]"""
 
     def rig(
         self, cameras: Cameras, memory: SpatialMemory, *, widest: int

@@ -49,6 +49,8 @@ class RenderCommand(LensArguments, LpipsArguments, SceneArguments):
     """Which. [SPEC]"""
     out: Path | None = None
     """For the pictures; with --against-images it may be left out, for the figures alone. [DIR]"""
+    complete: bool = False
+    """Fill what the memory leaves open (inpaint)."""
     against_images: bool = False
     """Compare with the project's own pictures."""
     set: tuple[str, ...] = ()
@@ -65,7 +67,14 @@ class RenderCommand(LensArguments, LpipsArguments, SceneArguments):
         from gvtools.memory.panoramas import WIDEST_STILL
         from gvtools.runs.layout import file_stems
         from gvtools.runs.run import load_appearance, load_memory
-        from pipelines.rendering import measure, render_view, summary, write_view
+        from pipelines.rendering import (
+            complete_views,
+            filled,
+            measure,
+            render_view,
+            summary,
+            write_view,
+        )
 
         if self.out is None and not self.against_images:
             raise OptionError("--out: nothing would be left; give a folder, or --against-images")
@@ -80,13 +89,21 @@ class RenderCommand(LensArguments, LpipsArguments, SceneArguments):
             console.line(poses)
         rig, cameras = self.rig(cameras, memory, widest=WIDEST_STILL)
         stems = file_stems(cameras.names)
+        if self.complete:
+            faces = [
+                face for camera in cameras for face in (rig.cameras(camera) if rig else camera)
+            ]
+            complete_views(memory, faces, appearance=appearance)
         lpips, no_lpips = self.open_lpips() if self.against_images else (None, None)
         # The first projection compiles or loads the kernels and is not timed.
         memory.project(cameras[0], options=options)
         views = []
         for camera in console.track(list(cameras), "rendering"):
             (name,) = camera.names
-            guidance, seconds = render_view(memory, camera, options, appearance=appearance, rig=rig)
+            guidance, seconds = render_view(
+                memory, camera, options, appearance=appearance, rig=rig,
+                fill=filled if self.complete else None,
+            )  # fmt: skip
             frame = scene[name].load() if scene is not None and self.against_images else None
             if self.out is not None:
                 panorama = self.lens == "equirectangular"

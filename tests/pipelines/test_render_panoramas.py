@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 
+import cv2
 import numpy as np
 import pytest
 from box_project import HEIGHT, SIZE, WIDTH, fused, write_box
@@ -51,6 +52,22 @@ def test_a_panorama_is_a_picture_that_viewers_know(box, tmp_path):
     # Along the rays inside a box: never farther than its diagonal.
     assert (depth[valid] > 0).all()
     assert depth.max() < np.linalg.norm(SIZE)
+
+
+def test_a_completed_panorama_has_no_holes_and_keeps_what_is_known(box, tmp_path):
+    words = ("render", box / "run", "--cameras", box / "project", "--views", "first:1",
+             "--lens", "equirectangular", "--width", 128, "--out")  # fmt: skip
+    run_command(*words, tmp_path / "known", quiet=True)
+    run_command(*words, tmp_path / "whole", "--complete", quiet=True)
+    known, whole = (
+        {kind: np.asarray(Image.open(tmp_path / name / f"view_0.{kind}.png")).astype(int)
+         for kind in ("rgb", "valid")} for name in ("known", "whole")
+    )  # fmt: skip
+    assert (whole["valid"] == 255).all()
+    assert (np.load(tmp_path / "whole" / "view_0.depth.npz")["depth"] > 0).all()
+    inner = cv2.erode((known["valid"] > 0).astype(np.uint8), np.ones((3, 3))) > 0
+    assert 0.02 < inner.mean() < 0.9
+    assert np.abs(known["rgb"] - whole["rgb"])[inner].mean() < 2
 
 
 def test_a_fisheye_is_black_outside_of_its_circle(box, tmp_path):
