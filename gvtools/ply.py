@@ -47,6 +47,7 @@ class Header:
     order: str
     elements: tuple[Element, ...]
     offset: int
+    comments: tuple[str, ...] = ()
 
     def holds(self, name: str) -> bool:
         """Whether there are elements of a name."""
@@ -76,9 +77,13 @@ def read_header(path: Path) -> Header:
     if not begin or not mark:
         raise MemoryFileError(f"{path}: no PLY header; expected a PLY file")
     order, elements, size = None, list[Element](), path.stat().st_size
+    comments: list[str] = []
     for line in head[: mark.start()].decode("ascii", "replace").splitlines()[1:]:
         match line.split():
-            case [] | ["comment" | "obj_info", *_]:
+            case []:
+                continue
+            case ["comment" | "obj_info", *words]:
+                comments.append(" ".join(words))
                 continue
             case ["format", name, "1.0"] if name in ORDERS and order is None:
                 order = ORDERS[name]
@@ -110,7 +115,7 @@ def read_header(path: Path) -> Header:
             names
         ):
             item.columns[:] = [(name.lower(), kind) for name, kind in item.columns]
-    return Header(order, tuple(elements), mark.end())
+    return Header(order, tuple(elements), mark.end(), tuple(comments))
 
 
 def point_vertices(path: Path, header: Header) -> Element:
@@ -121,7 +126,7 @@ def point_vertices(path: Path, header: Header) -> Element:
         if any("packed_position" in dict(item.columns) for item in header.elements):
             raise MemoryFileError(
                 f"{path}: Gaussians compressed as SuperSplat does; expected points; save it again "
-                "as uncompressed PLY, or as SPZ"
+                "as uncompressed PLY"
             )
         raise MemoryFileError(
             f"{path}: PLY header whose first element has no distinct vertex properties x, y, z; "

@@ -81,7 +81,10 @@ def main() -> None:
     """Send what the reader of the command line makes of its file."""
     name, path, options = sys.argv[1:]
     module, function = name.split(":")
-    read, out = getattr(importlib.import_module(module), function), sys.stdout.buffer
+    # What libraries print is no answer.
+    out = os.fdopen(os.dup(1), "wb")
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    read = getattr(importlib.import_module(module), function)
     size = Path(path).stat().st_size
     try:
         for facts, arrays in _limited(read(Path(path), **json.loads(options)), size):
@@ -94,11 +97,15 @@ def main() -> None:
     except GvError as error:
         data = json.dumps({"kind": type(error).__name__, "message": str(error)}).encode()
         out.write(HEAD.pack(False, len(data)) + data)
+    out.flush()
 
 
 def _limited(items: Iterator[Item], size: int) -> Iterator[Item]:
-    """The items of a reader that has loaded its packages before the first, under limits."""
-    next(items)
+    """The items of a reader that has loaded its packages before the first, under limits.
+
+    The first item's facts may name more ``bytes_per_byte`` than BYTES_PER_BYTE.
+    """
+    ratio = int(next(items)[0].get("bytes_per_byte", BYTES_PER_BYTE))
     try:
         import resource
     except ImportError:  # Windows: nothing is limited
@@ -110,7 +117,7 @@ def _limited(items: Iterator[Item], size: int) -> Iterator[Item]:
     mapped = Path("/proc/self/statm")
     if mapped.is_file():  # elsewhere memory is not limited
         pages = int(mapped.read_text().split()[0])
-        most = pages * resource.getpagesize() + BYTES_PER_BYTE * size + SPARE_BYTES
+        most = pages * resource.getpagesize() + ratio * size + SPARE_BYTES
         resource.setrlimit(resource.RLIMIT_AS, (most, most))
     return items
 

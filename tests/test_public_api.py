@@ -22,7 +22,7 @@ DOCTESTED = (
     "gvtools.appearance.fit_options",
     "gvtools.appearance.gaussians",
     "gvtools.appearance.splat.splat",
-    "gvtools.appearance.harmonics",
+    "gvtools.splats",
     "gvtools.cameras",
     "gvtools.capture.matching",
     "gvtools.completers.base",

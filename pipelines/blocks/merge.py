@@ -30,8 +30,6 @@ from gvtools.appearance.appearance import Appearance, Blend
 from gvtools.appearance.camera_corrections import Exposures
 from gvtools.appearance.fit_options import FitOptions
 from gvtools.appearance.gaussians import Gaussians
-from gvtools.appearance.harmonics import turn_gaussians
-from gvtools.appearance.splat.project_kernels import HARMONICS, LOG_SCALE, SH
 from gvtools.cameras import concatenate
 from gvtools.completers.base import Completer, Completion, ContextView, ScaleAlignment, ScaleStatus
 from gvtools.errors import OptionError, ProjectError
@@ -45,6 +43,7 @@ from gvtools.runs.poses import RunPoses, refined_poses_of
 from gvtools.runs.run import Run, RunTarget, load_run
 from gvtools.scenes.project import open_recorded
 from gvtools.settings import dotted, with_values
+from gvtools.splats import HARMONICS, LOG_SCALE, SH, turn_gaussians
 from gvtools.view_selection import evenly_spread
 from pipelines.blocks.split import FILE, SceneBlock, by_name, read_blocks
 from pipelines.reconstruction.fitting import Fitted, fit_appearance

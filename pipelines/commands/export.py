@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 from pydantic import Field
 
 from gvtools.errors import OptionError
+from gvtools.splat_files import holds_splats, read_splats
 from pipelines.commands.arguments import EMPTY
-from pipelines.export.formats import FORMATS, ExportOptions, FormatName
+from pipelines.export.formats import FORMATS, ExportFormat, ExportOptions, FormatName
 from pipelines.options import Arguments
 
 if TYPE_CHECKING:
@@ -26,14 +27,17 @@ class ExportCommand(Arguments, ExportOptions):
 
     examples = (
         "gvtools export runs/kitchen --format splat --out kitchen.ply",
+        "gvtools export runs/kitchen --out kitchen.sog",
         "gvtools export runs/kitchen --format mesh --out kitchen.glb --max-triangles 200000",
         "gvtools export runs/kitchen --format las --out kitchen.laz --observed",
     )
     positional = ("memory",)
 
     memory: Path
-    """A run or a memory.npz. [RUN_OR_MEMORY]"""
-    format: FormatName = Field(description=_FORMATS)
+    """A run, a memory.npz, or splats of any of their formats to convert. [RUN_OR_FILE]"""
+    format: FormatName | None = Field(
+        None, description=f"Default by the end of --out where one alone has it. {_FORMATS}"
+    )
     out: Path
     """A file of the format; colmap: a folder, the model goes to its sparse/0; transforms: a folder
     or a .json file. [PATH]"""
@@ -44,7 +48,8 @@ class ExportCommand(Arguments, ExportOptions):
         from gvtools.runs.run import load_memory
         from pipelines.export.source import ExportSource
 
-        form = FORMATS[self.format]
+        splats = holds_splats(self.memory) and not self.memory.is_dir()
+        form = FORMATS["splat"] if splats and self.format is None else self._form()
         for name in (name for name in ExportOptions.model_fields if name in self.model_fields_set):
             if name not in form.options:
                 takers = ", ".join(each.name for each in FORMATS.values() if name in each.options)
@@ -52,17 +57,20 @@ class ExportCommand(Arguments, ExportOptions):
                     f"{self.key(name)}: --format {form.name} does not take it ({takers} do); leave "
                     "it out"
                 )
-        if self.format in ("colmap", "transforms", "mesh") and self.memory.suffix.lower() == ".ply":
+        form.check_path(self.out, self.memory)
+        if splats and form.name in ("splat", "spz"):
+            self._convert(console)
+            return
+        if form.name in ("colmap", "transforms", "mesh") and self.memory.suffix.lower() == ".ply":
             raise OptionError(
-                f"--format {self.format}: {self.memory} is a PLY, which holds no cameras; give the "
+                f"--format {form.name}: {self.memory} is a PLY, which holds no cameras; give the "
                 "run's folder or its memory.npz"
             )
-        form.check_path(self.out, self.memory)
         write = form.load()
         memory = load_memory(self.memory, up_to=self.round)
         if not len(memory):
             raise OptionError(f"{self.memory}: {EMPTY}")
-        if self.format != "ply" or self.max_points is not None:
+        if form.name != "ply" or self.max_points is not None:
             shown = memory.overview()
             if len(shown) < len(memory):
                 console.line(
@@ -77,3 +85,27 @@ class ExportCommand(Arguments, ExportOptions):
                 f"{made:.0%} of the observations are generated: a completer's, or depth that only "
                 "fitted Gaussians tell; --observed leaves them out"
             )
+
+    def _form(self) -> ExportFormat:
+        """The format that is named, or that alone has the suffix."""
+        if self.format is not None:
+            return FORMATS[self.format]
+        suffix = self.out.suffix.lower()
+        fits = [each for each in FORMATS.values() if suffix in each.suffixes and each.name != "spz"]
+        if self.out.name.lower().endswith(".compressed.ply"):
+            fits = [FORMATS["splat"]]
+        if len(fits) != 1:
+            names = ", ".join(each.name for each in fits or FORMATS.values())
+            raise OptionError(f"--out {self.out}: give --format, one of {names}")
+        return fits[0]
+
+    def _convert(self, console: Console) -> None:
+        """Splats of a file in another format."""
+        from pipelines.export.splats import write_file
+
+        for name in ("max_points", "observed", "round"):
+            if name in self.model_fields_set:
+                raise OptionError(
+                    f"{self.key(name)}: {self.memory} is a file of splats; leave it out"
+                )
+        console.line(write_file(read_splats(self.memory), self.out, self))

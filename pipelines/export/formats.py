@@ -22,8 +22,11 @@ from gvtools.errors import OptionError
 from gvtools.optional import require
 from gvtools.settings import Settings
 
+# How files of SPZ begin, of version 4 and older, and what is read of a file to know its format.
+SPZ, HEAD_BYTES = (b"NGSP", b"\x1f\x8b"), 16
 # What every point format takes, and what a mesh takes beside it.
 POINTS = ("max_points", "observed")
+SPLATS = (*POINTS, "spz_version")
 MESH = ("observed", "method", "voxel", "least_piece", "max_triangles", "texture")
 FormatName = Literal[
     "ply", "splat", "spz", "html", "mesh", "las", "usd", "rrd", "glb", "colmap", "transforms"
@@ -50,6 +53,8 @@ class ExportOptions(Settings):
     texture: int | None = Field(None, ge=64, le=4096)
     """Mesh (.glb, .obj): colours from the run's photographs, in a picture of SIDE x SIDE; one
     triangle for 80 of its pixels, unless --max-triangles says otherwise. [SIDE]"""
+    spz_version: int = Field(4, ge=2, le=4)
+    """Splat, SPZ: version of the file, for programs that do not read the newest. [VERSION]"""
     images: str = "images"
     """Transforms: where the observed views' pictures are, beside the file; undistorted ones, if the
     project's were distorted. [DIR]"""
@@ -63,7 +68,7 @@ class ExportFormat:
     writer: str
     holds: str  # what the files are, for ``--help``
     # That a file may have, and how such a file begins; none of what fills a folder.
-    suffixes: Mapping[str, bytes] = field(default_factory=dict)
+    suffixes: Mapping[str, bytes | tuple[bytes, ...]] = field(default_factory=dict)
     options: tuple[str, ...] = ()  # of ``ExportOptions`` that it heeds
     needs: tuple[str, ...] = ()  # packages, as they are imported
     # Of a format without suffixes: what is at a path already and was not written by an export.
@@ -93,7 +98,7 @@ class ExportFormat:
         if not path.is_file():
             return
         with path.open("rb") as file:
-            alike = file.read(len(start)) == start
+            alike = file.read(HEAD_BYTES).startswith(start)
         if not alike or (source.is_file() and path.samefile(source)):
             what = "the input" if alike else f"no {path.suffix[1:].upper()} file of this format"
             raise OptionError(f"{path}: is there already and is {what}; give another --out")
@@ -107,10 +112,10 @@ def _function(name: str) -> Any:
 _ALL = (
     ExportFormat("ply", "points.write_ply", "point cloud with all attributes",
                  {".ply": b"ply"}, POINTS),
-    ExportFormat("splat", "splats.write_splat_ply", "3D Gaussians, INRIA's PLY",
-                 {".ply": b"ply"}, POINTS),
-    ExportFormat("spz", "splats.write_spz", "3D Gaussians, compressed",
-                 {".spz": b"\x1f\x8b"}, POINTS),
+    ExportFormat("splat", "splats.write_splats", "3D Gaussians, in the format of the suffix",
+                 {".ply": b"ply", ".spz": SPZ, ".sog": b"PK", ".splat": b"", ".ksplat": b"\0",
+                  ".glb": b"glTF", ".usdc": b"PXR-USDC", ".usda": b"#usda"}, SPLATS),
+    ExportFormat("spz", "splats.write_splats", "the same as splat", {".spz": SPZ}, SPLATS),
     ExportFormat("html", "html.write_html", "one page to share, which draws the 3D Gaussians",
                  {".html": b"<!DOCTYPE html>\n<!-- gvtools export -->"}, POINTS),
     ExportFormat("mesh", "mesh.write_mesh", "triangles with vertex colours or a texture",

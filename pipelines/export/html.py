@@ -16,8 +16,9 @@ from gvtools.errors import GvError
 from gvtools.files import replaced_when_written
 from gvtools.runs.layout import RECORD
 from gvtools.runs.run import load_run
+from gvtools.splats import SH, Splats
 from pipelines.export.formats import ExportOptions
-from pipelines.export.source import ExportSource, Splats
+from pipelines.export.source import ExportSource
 from viz.page.page import PageCamera, PageGroup, SharedPage, page_html
 from viz.page.words import pack_gaussians
 from viz.report.pictures import thumbnail
@@ -63,12 +64,14 @@ def write_html(source: ExportSource, path: Path, options: ExportOptions) -> str:
 
 
 def _groups(splats: Splats) -> Iterator[PageGroup]:
-    fitted = np.arange(len(splats)) < splats.fitted
+    fitted = np.arange(len(splats)) < (splats.fitted or 0)
     keys = np.stack([splats.rounds, splats.generated, fitted], axis=1)
     for number, generated, whole in np.unique(keys, axis=0):
         chosen = (keys == (number, generated, whole)).all(axis=1)
         part = replace(
-            splats, values=splats.values[chosen], rounds=splats.rounds[chosen],
+            # Points have one colour each.
+            splats, values=splats.values[chosen, : None if whole else SH + 3],
+            rounds=splats.rounds[chosen],
             generated=splats.generated[chosen], fitted=int(chosen.sum()) if whole else 0,
         )  # fmt: skip
         words = pack_gaussians(

@@ -21,8 +21,9 @@ from gvtools.errors import GvError
 from gvtools.files import replaced_when_written
 from gvtools.memory.ply import export_memory_ply
 from gvtools.runs.run import load_run
+from gvtools.splats import box_middle
 from pipelines.export.formats import ExportOptions
-from pipelines.export.source import ExportSource, box_middle
+from pipelines.export.source import ExportSource
 
 # LAS: point format 7 has colours of 16 bits.
 POINT_FORMAT, VERSION = 7, "1.4"
@@ -115,24 +116,13 @@ def _crs(source: ExportSource) -> tuple[str, str]:
 
 def write_usd(source: ExportSource, path: Path, options: ExportOptions) -> str:
     """Write one point a voxel as ``UsdGeom.Points``; a scene unit is a metre, as glTF has it."""
-    from pxr import Gf, Sdf, Usd, UsdGeom, Vt
+    from pxr import Sdf, UsdGeom, Vt
 
     memory = source.memory
     points = source.points(options, most=MAX_POINTS)
     columns, rows = memory.columns, points.rows
     center = points.middle
-    stage = Usd.Stage.CreateInMemory()
-    # Where a stage does not say, its unit is a centimetre: rooms would open far too small.
-    UsdGeom.SetStageMetersPerUnit(stage, UsdGeom.LinearUnits.meters)
-    # USD knows these two; the nearer one to the cameras' up.
-    up = -sum(
-        (view.camera.cam_from_world[0, 1, :3] for view in memory.views.photographed), np.zeros(3)
-    )
-    UsdGeom.SetStageUpAxis(stage, "Y" if abs(up[1]) > abs(up[2]) else "Z")
-    root = UsdGeom.Xform.Define(stage, ROOT)
-    root.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*center.tolist()))
-    stage.SetDefaultPrim(root.GetPrim())
-    stage.SetMetadata("comment", "gvtools memory, input world frame and axes, scene units")
+    stage = usd_stage(center, source.up)
     cloud = UsdGeom.Points.Define(stage, CLOUD)
     local = (points.positions - center).astype(np.float32)
     widths = np.maximum(columns.spacing[rows], np.float32(points.edge))
@@ -156,9 +146,33 @@ def write_usd(source: ExportSource, path: Path, options: ExportOptions) -> str:
     ):  # fmt: skip
         primvars.CreatePrimvar(name, kind, UsdGeom.Tokens.vertex).Set(values)
     with replaced_when_written(path, suffix=path.suffix.lower()) as temporary:
-        if not stage.GetRootLayer().Export(str(temporary)):
-            raise OSError("USD wrote no file")
+        save_usd(stage, temporary)
     return f"{source.points_summary(points)} in {path}, in the input's axes"
+
+
+def usd_stage(center: NDArray[np.float64], up: NDArray[np.float64] | None) -> Any:
+    """A stage with the input's axes, and a root that moves what it holds to ``center``."""
+    from pxr import Gf, Usd, UsdGeom
+
+    stage = Usd.Stage.CreateInMemory()
+    # Where a stage does not say, its unit is a centimetre: rooms would open far too small.
+    UsdGeom.SetStageMetersPerUnit(stage, UsdGeom.LinearUnits.meters)
+    # USD knows these two; the nearer one to the cameras' up, which stands beside it.
+    upright = up is not None and abs(up[1]) > abs(up[2])
+    UsdGeom.SetStageUpAxis(stage, "Y" if upright else "Z")
+    if up is not None:
+        stage.GetRootLayer().customLayerData = {"up": Gf.Vec3d(*up.tolist())}
+    root = UsdGeom.Xform.Define(stage, ROOT)
+    root.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*center.tolist()))
+    stage.SetDefaultPrim(root.GetPrim())
+    stage.SetMetadata("comment", "gvtools, input world frame and axes, scene units")
+    return stage
+
+
+def save_usd(stage: Any, path: Path) -> None:
+    """Write a stage's own layer."""
+    if not stage.GetRootLayer().Export(str(path)):
+        raise OSError("USD wrote no file")
 
 
 def _as_photographed(items: MutableMapping[Any, bytes], tree: dict[str, Any]) -> None:

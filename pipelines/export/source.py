@@ -18,8 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.appearance.gaussians import Gaussians
-from gvtools.appearance.harmonics import turn_gaussians
-from gvtools.appearance.splat.project_kernels import LOG_SCALE, LOGIT, QUATERNION, SH
 from gvtools.cameras import Cameras, concatenate
 from gvtools.errors import OptionError, ProjectError
 from gvtools.memory.store.local_frame import LocalFrame
@@ -27,6 +25,7 @@ from gvtools.memory.store.voxel_index import levels_above
 from gvtools.memory.thinning import thin
 from gvtools.runs.run import load_appearance
 from gvtools.runs.target_files import completed_picture
+from gvtools.splats import LOG_SCALE, LOGIT, SH, Splats, box_middle, near_origin, turn_gaussians
 from pipelines.export.formats import ExportOptions
 
 if TYPE_CHECKING:
@@ -39,9 +38,8 @@ SPREAD = 0.6
 LEAST_OPACITY, MOST_OPACITY = 0.7, 0.99
 # Confidence at which the opacity is half-way between them.
 HALFWAY = 0.5
-# Files hold float32. Where its rounding is more than the share ROUNDING of the size of small
-# Gaussians (the quantile SMALLEST), positions are relative to the middle of the scene.
-ROUNDING, SMALLEST = 0.1, 0.01
+# Share of the cameras that agree on what is up, at least.
+LEAST_UP = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,62 +55,6 @@ class ExportPoints:
     def middle(self) -> NDArray[np.float64]:
         """(3,) the middle of the box around them."""
         return box_middle(self.positions)
-
-
-@dataclass(frozen=True, eq=False)
-class Splats:
-    """N Gaussians with the axes of the world frame."""
-
-    # (N, VALUES), see appearance.splat.project_kernels; positions are relative to ``origin``.
-    values: NDArray[np.float32]
-    origin: NDArray[np.float64]  # (3,) world frame; zero if float32 is precise enough
-    fitted: int  # number of fitted ones, which come first; the others are points of the memory
-    further: int  # number of the run's other fits, which are left out
-    rounds: NDArray[np.int32]  # (N,) in which each was added
-    generated: NDArray[np.bool_]  # (N,) which are points that nobody observed
-
-    def __len__(self) -> int:
-        return len(self.values)
-
-    @property
-    def positions(self) -> NDArray[np.float32]:
-        """(N, 3) relative to ``origin``, scene units."""
-        return self.values[:, :LOG_SCALE]
-
-    @property
-    def log_scales(self) -> NDArray[np.float32]:
-        """(N, 3) natural logarithms of the standard deviations, scene units."""
-        return self.values[:, LOG_SCALE:QUATERNION]
-
-    @property
-    def quaternions(self) -> NDArray[np.float32]:
-        """(N, 4) w, x, y, z of length 1."""
-        q = self.values[:, QUATERNION:LOGIT]
-        return q / np.linalg.norm(q, axis=1, keepdims=True)
-
-    @property
-    def logits(self) -> NDArray[np.float32]:
-        """(N,) opacities before the sigmoid."""
-        return self.values[:, LOGIT]
-
-    @property
-    def harmonics(self) -> NDArray[np.float32]:
-        """(N, H, 3) coefficients; H = 9 (degree 2) with a fit, else 1 (one colour each)."""
-        sh = self.values[:, SH:].reshape(len(self), -1, 3)
-        return sh if self.fitted else sh[:, :1]
-
-    def summary(self) -> str:
-        """A line of text for the user."""
-        points = len(self) - self.fitted
-        parts = [f"{self.fitted} fitted"] if self.fitted else []
-        if points or not parts:
-            parts.append(f"{points} from {'further ' if self.fitted else ''}points")
-        text = f"{len(self)} Gaussians ({', '.join(parts)})"
-        if self.further:
-            text += f", the first of {self.further + 1} fits"
-        if self.origin.any():
-            text += f", counted from {' '.join(f'{x:.10g}' for x in self.origin)}"
-        return text
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,6 +80,14 @@ class ExportSource:
     def appearance(self) -> Appearance | None:
         """The Gaussians that the run fitted; None where it has none."""
         return load_appearance(self.path)
+
+    @property
+    def up(self) -> NDArray[np.float64] | None:
+        """(3,) unit vector, world frame: the photographs' mean; None where they tell none."""
+        seen = [view.camera.cam_from_world[0, 1, :3] for view in self.memory.views.photographed]
+        total = -np.sum(seen, axis=0) if seen else np.zeros(3)
+        length = float(np.linalg.norm(total))
+        return total / length if length > LEAST_UP * len(seen) else None
 
     def points(
         self,
@@ -174,8 +124,9 @@ class ExportSource:
         appearance, memory = self.appearance, self.memory
         if appearance is None:
             values, rounds, generated = self._point_gaussians(options)
-            values, origin = _relative_to_middle(values, memory.frame.origin)
-            return Splats(values, origin, 0, 0, rounds, generated)
+            values, origin = near_origin(values, memory.frame.origin)
+            # One colour each.
+            return Splats(values[:, : SH + 3], origin, 0, 0, rounds, generated, self.up)
         first = appearance.gaussians
         if exposed and appearance.exposures is not None:
             from gvtools.appearance.harmonics import expose
@@ -200,8 +151,9 @@ class ExportSource:
             more[0][:, :LOG_SCALE] += (memory.frame.origin - first.frame.origin).astype(np.float32)
             parts.append(more)
         values, rounds, generated = (np.concatenate(each) for each in zip(*parts, strict=True))
-        values, origin = _relative_to_middle(values, first.frame.origin)
-        return Splats(values, origin, len(fitted), len(appearance.others), rounds, generated)
+        values, origin = near_origin(values, first.frame.origin)
+        others = len(appearance.others)
+        return Splats(values, origin, len(fitted), others, rounds, generated, self.up)
 
     def _point_gaussians(
         self, options: ExportOptions, *, among: NDArray[np.bool_] | None = None
@@ -273,30 +225,6 @@ class ExportSource:
                 picture = completed_picture(self.path, view.round, view.camera.names[0])
                 pictures[names[row]] = picture or pictures.get(names[row])
         return DistinctCameras(kept, row_of_view, pictures)
-
-
-def box_middle(positions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(3,) the middle of the box around positions (N, 3)."""
-    return (positions.min(axis=0) + positions.max(axis=0)) / 2
-
-
-def _relative_to_middle(
-    values: NDArray[np.float32], origin: NDArray[np.float64]
-) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-    """Gaussians with positions relative to the world's origin, or to their middle, see ROUNDING.
-
-    ``values`` count from ``origin`` and are changed; the origin that they count from now is
-    returned beside them.
-    """
-    positions = values[:, :LOG_SCALE].astype(np.float64) + origin
-    sizes = np.exp(values[:, LOG_SCALE:QUATERNION].max(axis=1))
-    reach = float(np.abs(positions).max())
-    if reach * 2.0**-24 > ROUNDING * float(np.quantile(sizes, SMALLEST)):
-        origin = np.round(box_middle(positions))
-    else:
-        origin = np.zeros(3)
-    values[:, :LOG_SCALE] = positions - origin
-    return values, origin
 
 
 def unphotographed(memory: SpatialMemory) -> NDArray[np.bool_]:

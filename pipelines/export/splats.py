@@ -1,76 +1,78 @@
-"""3D Gaussians as INRIA's PLY and as SPZ, version 3, written and read.
+"""3D Gaussians in the formats that viewers take; the suffix tells which.
 
-The PLY is as "3D Gaussian Splatting" writes it: natural logarithms of standard deviations, opacity
-before the sigmoid, quaternions w, x, y, z, and coefficients of spherical harmonics channel by
-channel.
-
-SPZ is Niantic's format, a tenth of the PLY's size: a gzip stream of a header and one array after
-the other: positions (24-bit fixed point), opacities, colours and logarithms of sizes (8 bits each),
-rotations (32 bits: the three smallest components and which one is missing), and harmonics (8 bits,
-of which 5 count at degree 1 and 4 above). https://github.com/nianticlabs/spz describes it. Its axes
-are right, up, back: Gaussians are turned half around x, and its readers turn them back where theirs
-are right, down, forward, as a PLY's.
+PLY is as "3D Gaussian Splatting" writes it. SPZ's axes are right, up, back: Gaussians are turned
+half around x, and its readers turn them back where theirs are right, down, forward, as a PLY's. All
+other files have the input's axes. SPZ of version 4 and ``.splat`` are written by Open3D, other
+versions, SOG, ``.ksplat`` and compressed PLY by gaussforge, USD by OpenUSD.
 """
 
 from __future__ import annotations
 
 import gzip
 import struct
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.appearance.harmonics import turn_gaussians
-from gvtools.appearance.splat.project_kernels import (
-    LOG_SCALE,
-    LOGIT,
-    QUATERNION,
-    SH,
-    VALUES,
-)
-from gvtools.errors import MemoryFileError
 from gvtools.files import replaced_when_written
-from gvtools.ply import read_ply, write_ply
-from gvtools.untrusted import other_version, read_bytes, unpack_gzip
+from gvtools.glb import join_glb
+from gvtools.optional import require
+from gvtools.ply import write_ply
+from gvtools.splat_files import KHR, RESTS, numbered
+from gvtools.splats import SH, TERMS, TO_RUB, Splats, box_middle, turn_gaussians
 from pipelines.export.formats import ExportOptions
-from pipelines.export.source import ExportSource, Splats
+from pipelines.export.points import FRAME, save_usd, usd_stage
+from pipelines.export.source import ExportSource
 
-MAGIC, VERSION = 0x5053474E, 3
-# What may be unpacked: so many bytes for each of the file's, which harmonics of zeros need, and so
-# many more. In RAM a Gaussian takes several times what it does there.
-MOST_RATIO, MOST_BYTES = 16, 1 << 22
-# Header: magic, version, count, degree of the harmonics, fractional bits, flags, reserved.
-HEADER = struct.Struct("<IIIBBBB")
-# From right, down, forward to right, up, back.
-TO_RUB = np.diag([1.0, -1.0, -1.0])
-# Bits of a coordinate with its sign, and the most of them behind the point that readers take.
-BITS, MOST_FRACTIONAL = 24, 23
+# Of SPZ's positions: bits with their sign, the most behind the point, and those that its writers
+# take whatever the scene; where the header has them, and its flags.
+BITS, MOST_FRACTIONAL, USUAL_FRACTIONAL = 24, 23, 12
+FRACTIONAL_AT, FLAGS_AT = 13, 14
 # Steps of positions in a small Gaussian's least standard deviation; smaller ones are this share.
 STEPS_PER_SIZE, SMALLEST = 8, 0.05
-# Colours are stored as 0.15 f_dc + 0.5, logarithms of sizes as 16 (log + 10).
-COLOR, SCALE, SHIFT = 0.15, 16, 10
-# Coefficients of a channel above degree 0, in a PLY.
-REST = 15
-# Bits of harmonics that are kept, by degree.
-HARMONIC_BITS = (5, 4)
-# A component's 9 bits of magnitude; the three smallest are at most this.
-COMPONENT, LARGEST = 511, np.sqrt(0.5)
-# From 0 and from 1, of opacities that are read: their logits are finite.
-LEAST = 1e-4
+# Coefficients of a channel above degree 0, in a PLY; the degree that ksplat's own reader takes.
+REST, KSPLAT_DEGREE = 15, 2
+# glTF's numbers of float and byte, and how wide an item of a type is.
+FLOAT, BYTE, TYPES = 5126, 5121, {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+FIELD = "/gvtools/splats"
 
 
-def write_splat_ply(source: ExportSource, path: Path, options: ExportOptions) -> str:
-    """Write the Gaussians."""
-    splats = source.splats(options)
-    comments = ["3D Gaussians by gvtools, axes of the input's world frame, scene units"]
-    if splats.origin.any():
-        comments.append("origin " + " ".join(repr(float(x)) for x in splats.origin))
-    write_ply(path, ply_rows(splats), comments=tuple(comments))
-    return f"{splats.summary()} in {path}"
+def write_splats(source: ExportSource, path: Path, options: ExportOptions) -> str:
+    """Write the Gaussians in the format that the name's end tells."""
+    return write_file(source.splats(options), path, options)
+
+
+def write_file(splats: Splats, path: Path, options: ExportOptions) -> str:
+    """Write Gaussians, and say how many and how."""
+    with replaced_when_written(path, suffix="".join(path.suffixes[-2:]).lower()) as temporary:
+        note = writer_of(path)(splats, temporary, options)
+    return f"{splats.summary()} in {path}{note}"
+
+
+def writer_of(path: Path) -> Callable[[Splats, Path, ExportOptions], str]:
+    """The function that writes a file of a name."""
+    name = path.name.lower()
+    return next(writer for end, writer in WRITERS.items() if name.endswith(end))
+
+
+def _write_ply(splats: Splats, path: Path, options: ExportOptions) -> str:
+    write_ply(path, ply_rows(splats), comments=_comments(splats))
+    return ""
+
+
+def _comments(splats: Splats) -> tuple[str, ...]:
+    lines = ["3D Gaussians by gvtools, axes of the input's world frame, scene units"]
+    for name, vector in (("origin", splats.origin), ("up", splats.up)):
+        if vector is not None and vector.any():
+            lines.append(f"{name} " + " ".join(repr(float(x)) for x in vector))
+    if splats.mode:
+        lines.append(f"SplatRenderMode: {splats.mode}")
+    return tuple(lines)
 
 
 def ply_rows(splats: Splats) -> NDArray[np.void]:
@@ -81,11 +83,11 @@ def ply_rows(splats: Splats) -> NDArray[np.void]:
     columns: dict[tuple[str, ...], NDArray[Any]] = {
         ("x", "y", "z"): splats.positions,
         ("nx", "ny", "nz"): np.zeros((len(splats), 3)),
-        _numbered("f_dc", 3): splats.harmonics[:, 0],
-        _numbered("f_rest", 3 * REST): rest.reshape(len(splats), -1),
+        numbered("f_dc", 3): splats.harmonics[:, 0],
+        numbered("f_rest", 3 * REST): rest.reshape(len(splats), -1),
         ("opacity",): splats.logits[:, None],
-        _numbered("scale", 3): splats.log_scales,
-        _numbered("rot", 4): splats.quaternions,
+        numbered("scale", 3): splats.log_scales,
+        numbered("rot", 4): splats.quaternions,
     }
     rows = np.empty(len(splats), [(name, "<f4") for names in columns for name in names])
     for names, values in columns.items():
@@ -94,186 +96,189 @@ def ply_rows(splats: Splats) -> NDArray[np.void]:
     return rows
 
 
-def is_splat(names: Collection[str]) -> bool:
-    """Whether a PLY with properties of these names holds Gaussians."""
-    needed = {*"xyz", *_numbered("f_dc", 3), "opacity", *_numbered("scale", 3)}
-    return needed.union(_numbered("rot", 4)) <= set(names)
+def _write_spz(splats: Splats, path: Path, options: ExportOptions) -> str:
+    """Positions as fine as the smallest Gaussians ask for and the farthest one allows.
 
-
-def read_splat_ply(path: Path) -> Splats:
-    """The Gaussians of a file; harmonics above degree 2 and values that are none are left out."""
-    rows = read_ply(path)
-    names = rows.dtype.names or ()
-    if not is_splat(names):
-        raise MemoryFileError(f"{path}: a PLY without Gaussians; expected f_dc_0, scale_0, rot_0")
-
-    def columns(of: Sequence[str]) -> NDArray[np.float32]:
-        return np.stack([rows[name].astype(np.float32) for name in of], axis=1)
-
-    values = np.zeros((len(rows), VALUES), np.float32)
-    values[:, :LOG_SCALE] = columns("xyz")
-    values[:, LOG_SCALE:QUATERNION] = columns(_numbered("scale", 3))
-    values[:, QUATERNION:LOGIT] = columns(_numbered("rot", 4))
-    values[:, LOGIT] = rows["opacity"]
-    values[:, SH : SH + 3] = columns(_numbered("f_dc", 3))
-    rest = [name for name in _numbered("f_rest", len(names)) if name in names]
-    if rest and len(rest) % 3 == 0:
-        kept = columns(rest).reshape(len(rows), 3, -1).transpose(0, 2, 1)
-        kept = kept.reshape(len(rows), -1)[:, : VALUES - SH - 3]
-        values[:, SH + 3 : SH + 3 + kept.shape[1]] = kept
-    values = values[np.isfinite(values).all(axis=1) & values[:, QUATERNION:LOGIT].any(axis=1)]
-    return splats_of(values, _origin(path))
-
-
-def splats_of(values: NDArray[np.float32], origin: NDArray[np.float64]) -> Splats:
-    """Gaussians of a file, which says nothing of rounds and sources."""
-    count = len(values)
-    return Splats(values, origin, count, 0, np.zeros(count, np.int32), np.zeros(count, np.bool_))
-
-
-def _origin(path: Path) -> NDArray[np.float64]:
-    """(3,) that positions count from, as a comment says it; zero without one."""
-    with path.open("rb") as file:
-        for line in file:
-            words = line.split()
-            if words[:2] == [b"comment", b"origin"] and len(words) == 5:
-                try:
-                    return np.array([float(word) for word in words[2:]])
-                except ValueError:
-                    break
-            if words[:1] == [b"end_header"]:
-                break
-    return np.zeros(3)
-
-
-def _numbered(name: str, count: int) -> tuple[str, ...]:
-    return tuple(f"{name}_{number}" for number in range(count))
-
-
-def write_spz(source: ExportSource, path: Path, options: ExportOptions) -> str:
-    """Write the Gaussians."""
-    splats = source.splats(options)
-    data, fractional = spz_stream(splats)
-    with replaced_when_written(path) as temporary:
-        # Without a time, so that equal scenes give equal files.
-        temporary.write_bytes(gzip.compress(data, mtime=0))
-    return f"{splats.summary()} in {path}, positions in steps of {2.0**-fractional:.3g}"
-
-
-def spz_stream(splats: Splats) -> tuple[bytes, int]:
-    """The stream before gzip, and how many bits of a position lie behind the point."""
+    Libraries have a fixed step. A power of two between it and ours is taken into the positions, and
+    out of them in the header.
+    """
     values = turn_gaussians(splats.values, TO_RUB)
-    one = replace(splats, values=values)
-    reach = float(np.abs(values[:, :LOG_SCALE]).max())
-    # As fine as the smallest Gaussians ask for and the farthest position allows.
-    size = float(np.exp(np.quantile(one.log_scales.min(axis=1), SMALLEST)))
+    size = float(np.exp(np.quantile(splats.log_scales.min(axis=1), SMALLEST)))
     wanted = int(np.ceil(np.log2(STEPS_PER_SIZE / size)))
+    reach = float(np.abs(splats.positions).max())
     whole = int(np.floor(np.log2(max(reach, 1e-30)))) + 1
     fractional = int(np.clip(min(wanted, BITS - 2 - whole), 0, MOST_FRACTIONAL))
-    degree = {1: 0, 4: 1, 9: 2}[one.harmonics.shape[1]]
-    header = HEADER.pack(MAGIC, VERSION, len(one), degree, fractional, 0, 0)
-    fixed = np.rint(one.positions.astype(np.float64) * 2**fractional).astype("<i4")
-    parts = [
-        fixed.view(np.uint8).reshape(len(one), 3, 4)[:, :, :3],
-        _byte(255 / (1 + np.exp(-one.logits.astype(np.float64)))),
-        _byte(255 * (COLOR * one.harmonics[:, 0] + 0.5)),
-        _byte(SCALE * (one.log_scales + SHIFT)),
-        _smallest_three(one.quaternions),
-        _harmonics(one.harmonics[:, 1:]),
-    ]
-    return header + b"".join(np.ascontiguousarray(part).tobytes() for part in parts), fractional
+    values[:, :3] *= 2.0 ** (fractional - USUAL_FRACTIONAL)
+    turned, antialiased = replace(splats, values=values), int(splats.mode == "mip")
+    if options.spz_version == 4:
+        _write_by_open3d(turned, path, options)
+        data = bytearray(path.read_bytes())
+    else:
+        packed = _by_gaussforge(turned, "spz", spz_version=options.spz_version)
+        data = bytearray(gzip.decompress(packed))
+    data[FRACTIONAL_AT], data[FLAGS_AT] = fractional, data[FLAGS_AT] | antialiased
+    # Without a time, so that equal scenes give equal files.
+    path.write_bytes(data if options.spz_version == 4 else gzip.compress(data, mtime=0))
+    return f", positions in steps of {2.0**-fractional:.3g}"
 
 
-def read_spz(path: Path) -> Splats:
-    """The Gaussians of a file, with the axes of a PLY; harmonics above degree 2 are left out."""
-    try:
-        packed = read_bytes(path)
-        if packed[:4] == HEADER.pack(MAGIC, *[0] * 6)[:4] and len(packed) >= 8:
-            version = int.from_bytes(packed[4:8], "little")
-            raise MemoryFileError(
-                f"{path}: SPZ version {version}; expected version 2 or 3; "
-                f"{other_version(version, VERSION, 'save it again')}"
-            )
-        data = unpack_gzip(packed, MOST_RATIO * len(packed) + MOST_BYTES)
-        magic, version, count, degree, fractional, _, _ = HEADER.unpack_from(data)
-    except (OSError, ValueError, struct.error) as error:
-        raise MemoryFileError(
-            f"{path}: no SPZ of version 2 or 3 ({error}); expected a gzip stream"
-        ) from None
-    if magic != MAGIC or version not in (2, 3) or degree > 3:
-        raise MemoryFileError(
-            f"{path}: SPZ version {version}, harmonics of degree {degree}; expected version 2 or "
-            f"3, degree 3 at most; {other_version(version, VERSION, 'save it again')}"
-        )
-    if not count:
-        raise MemoryFileError(f"{path}: no Gaussians; expected some")
-    terms = (degree + 1) ** 2 - 1
-    lengths = [9, 1, 3, 3, 3 if version == 2 else 4, 3 * terms]
-    bytes_ = np.frombuffer(data, np.uint8, offset=HEADER.size)
-    if len(bytes_) != count * sum(lengths):
-        raise MemoryFileError(
-            f"{path}: {len(bytes_)} bytes of Gaussians; its header says {count} of {sum(lengths)}"
-        )
-    parts = np.split(bytes_, np.cumsum(lengths)[:-1] * count)
-    places, opacity, color, size, turns, rest = (part.reshape(count, -1) for part in parts)
-    values = np.zeros((count, VALUES), np.float32)
-    padded = np.zeros((count, 3, 4), np.uint8)
-    # Above the byte that is not there, so that the sign is kept.
-    padded[:, :, 1:] = places.reshape(count, 3, 3)
-    fixed = padded.reshape(count, -1).view("<i4") >> 8
-    values[:, :LOG_SCALE] = fixed / 2.0**fractional
-    values[:, LOG_SCALE:QUATERNION] = size / SCALE - SHIFT
-    values[:, QUATERNION:LOGIT] = _first_three(turns) if version == 2 else _from_smallest(turns)
-    share = np.clip(opacity[:, 0] / 255, LEAST, 1 - LEAST)
-    values[:, LOGIT] = np.log(share / (1 - share))
-    values[:, SH : SH + 3] = (color / 255 - 0.5) / COLOR
-    kept = (rest.astype(np.float32) - 128) / 128
-    kept = kept[:, : VALUES - SH - 3]
-    values[:, SH + 3 : SH + 3 + kept.shape[1]] = kept
-    return splats_of(turn_gaussians(values, TO_RUB), np.zeros(3))
+def _write_by_open3d(splats: Splats, path: Path, options: ExportOptions) -> str:
+    import open3d as o3d
+
+    parts = {
+        "positions": splats.positions,
+        "scale": np.exp(splats.log_scales),
+        "rot": splats.quaternions,
+        "opacity": splats.logits[:, None],
+        "f_dc": splats.harmonics[:, 0],
+        "f_rest": splats.harmonics[:, 1:],
+    }
+    cloud = o3d.t.geometry.PointCloud()
+    for name, part in parts.items():
+        if part.size:
+            cloud.point[name] = o3d.core.Tensor(np.ascontiguousarray(part, np.float32))
+    if not o3d.t.io.write_point_cloud(str(path), cloud):
+        raise OSError("Open3D wrote no file")
+    return ""
 
 
-def _first_three(turns: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """(N, 4) w, x, y, z of version 2's (N, 3) bytes: x, y and z of quaternions with w >= 0."""
-    xyz = turns / 127.5 - 1
-    w = np.sqrt(np.maximum(1 - np.square(xyz).sum(axis=1, keepdims=True), 0))
-    return np.concatenate([w, xyz], axis=1)
+def _write_sog(splats: Splats, path: Path, options: ExportOptions) -> str:
+    path.write_bytes(_by_gaussforge(splats, "sog"))
+    return ""
 
 
-def _from_smallest(turns: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """(N, 4) w, x, y, z: the inverse of ``_smallest_three``."""
-    word = np.ascontiguousarray(turns).view("<u4")[:, 0]
-    largest = word >> 30
-    q = np.zeros((len(word), 4))
-    for axis in (3, 2, 1, 0):
-        stored = largest != axis
-        size = (word & COMPONENT) * (LARGEST / COMPONENT)
-        q[:, axis] = np.where(stored, np.where(word >> 9 & 1, -size, size), 0)
-        word = np.where(stored, word >> 10, word)
-    rest = np.sqrt(np.maximum(1 - np.square(q).sum(axis=1), 0))
-    np.put_along_axis(q, largest[:, None].astype(np.int64), rest[:, None], axis=1)
-    return np.roll(q, 1, axis=1)
+def _write_compressed(splats: Splats, path: Path, options: ExportOptions) -> str:
+    """SuperSplat's PLY; gaussforge 0.6 writes harmonics as they come, which are to be by colour."""
+    by_color = splats.harmonics[:, 1:].transpose(0, 2, 1)
+    data = _by_gaussforge(splats, "compressed.ply", rest=by_color)
+    head, mark, body = data.partition(b"end_header\n")
+    comments = "".join(f"comment {line}\n" for line in _comments(splats)).encode()
+    path.write_bytes(head + comments + mark + body)
+    return ""
 
 
-def _byte(values: NDArray[np.floating]) -> NDArray[np.uint8]:
-    return np.clip(np.rint(values), 0, 255).astype(np.uint8)
+def _write_ksplat(splats: Splats, path: Path, options: ExportOptions) -> str:
+    """Degree by degree and in these by colour, which gaussforge 0.6 writes by colour alone."""
+    degree = min(splats.degree, KSPLAT_DEGREE)
+    rest = splats.harmonics[:, 1 : TERMS[degree]]
+    by_degree = [rest[:, first:last].transpose(0, 2, 1).reshape(len(splats), -1)
+                 for first, last in pairwise(RESTS[: degree + 1])]  # fmt: skip
+    if by_degree:
+        ordered = np.concatenate(by_degree, axis=1)
+        rest = ordered.reshape(len(splats), 3, -1).transpose(0, 2, 1)
+    kept = replace(splats, values=splats.values[:, : SH + 3 * TERMS[degree]])
+    data = bytearray(_by_gaussforge(kept, "ksplat", rest=rest))
+    # Sections, those that are loaded, Gaussians at most and there.
+    struct.pack_into("<4I", data, 4, 1, 1, len(splats), len(splats))
+    path.write_bytes(data)
+    return "" if degree == splats.degree else f", harmonics up to degree {degree}"
 
 
-def _smallest_three(quaternions: NDArray[np.float32]) -> NDArray[np.uint32]:
-    """(N,) from w, x, y, z: two bits say which of x, y, z, w is largest, ten each the others."""
-    q = np.roll(quaternions.astype(np.float64), -1, axis=1)
-    largest = np.abs(q).argmax(axis=1)
-    q = q * np.where(np.take_along_axis(q, largest[:, None], axis=1) < 0, -1, 1)
-    size = np.clip(np.rint(COMPONENT * np.abs(q) / LARGEST), 0, COMPONENT).astype(np.uint32)
-    ten_bits = size | (q < 0).astype(np.uint32) << 9
-    word = largest.astype(np.uint32)
-    for axis in range(4):
-        word = np.where(largest == axis, word, word << 10 | ten_bits[:, axis])
-    return word.astype("<u4")
+def _by_gaussforge(
+    splats: Splats, form: str, *, rest: NDArray[np.float32] | None = None, spz_version: int = 3
+) -> bytes:
+    """A file's bytes; ``rest`` are harmonics above degree 0 in another order."""
+    package = require("gaussforge", extra="export", purpose=f"Gaussians as {form}")
+    parts = {
+        "positions": splats.positions,
+        "scales": splats.log_scales,
+        "rotations": splats.quaternions,
+        "alphas": splats.logits,
+        "colors": splats.harmonics[:, 0],
+        "sh": splats.harmonics[:, 1:] if rest is None else rest,
+    }
+    told = package.GaussForge().write(
+        {"numPoints": len(splats), "meta": {"shDegree": splats.degree}, "extras": {}}
+        | {name: np.ascontiguousarray(part, np.float32).tobytes() for name, part in parts.items()},
+        form,
+        spz_version=spz_version,
+    )
+    if "error" in told:
+        raise OSError(f"gaussforge: {told['error']}")
+    return bytes(told["data"])
 
 
-def _harmonics(coefficients: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """(N, H, 3) bytes; low bits that do not count are zero for gzip's sake."""
-    degree_one, above = (2.0 ** (8 - bits) for bits in HARMONIC_BITS)
-    steps = np.where(np.arange(coefficients.shape[1]) < 3, degree_one, above)[None, :, None]
-    return _byte(np.rint((128 * coefficients + 128) / steps) * steps)
+def _write_glb(splats: Splats, path: Path, options: ExportOptions) -> str:
+    """GlTF with KHR_gaussian_splatting: sizes and opacities as they are drawn, quaternions x to w.
+
+    Viewers without the extension draw points of the colours.
+    """
+    center = box_middle(splats.positions.astype(np.float64))
+    positions = (splats.positions - center).astype(np.float32)
+    colors = np.concatenate([splats.colors, splats.opacities[:, None]], axis=1)
+    parts: dict[str, NDArray[Any]] = {
+        "POSITION": positions,
+        "COLOR_0": np.rint(255 * colors).astype(np.uint8),
+        f"{KHR}:ROTATION": np.roll(splats.quaternions, -1, axis=1),
+        f"{KHR}:SCALE": np.exp(splats.log_scales),
+        f"{KHR}:OPACITY": splats.opacities[:, None],
+    }
+    for degree in range(splats.degree + 1):
+        for term in range(2 * degree + 1):
+            name = f"{KHR}:SH_DEGREE_{degree}_COEF_{term}"
+            parts[name] = splats.harmonics[:, degree**2 + term]
+    views, accessors, body = list[Any](), list[Any](), bytearray()
+    for part in parts.values():
+        whole = part.dtype == np.uint8
+        data = np.ascontiguousarray(part, np.uint8 if whole else "<f4").tobytes()
+        views.append({"buffer": 0, "byteOffset": len(body), "byteLength": len(data)})
+        accessors.append(
+            {"bufferView": len(accessors), "componentType": BYTE if whole else FLOAT,
+             "count": len(part), "type": TYPES[part.shape[1]], "normalized": whole}
+        )  # fmt: skip
+        body += data
+    accessors[0] |= {"min": positions.min(axis=0).tolist(), "max": positions.max(axis=0).tolist()}
+    extension = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    extras: dict[str, Any] = {"frame": FRAME}
+    if splats.up is not None:
+        extras["up"] = splats.up.tolist()
+    node = {"mesh": 0, "name": "gvtools_splats", "extras": extras,
+            "translation": (center + splats.origin).tolist()}  # fmt: skip
+    tree = {
+        "asset": {"version": "2.0", "generator": "gvtools"},
+        "extensionsUsed": [KHR], "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [node],
+        "meshes": [{"primitives": [{
+            "mode": 0, "attributes": {name: place for place, name in enumerate(parts)},
+            "extensions": {KHR: extension}}]}],
+        "accessors": accessors, "bufferViews": views, "buffers": [{"byteLength": len(body)}],
+    }  # fmt: skip
+    path.write_bytes(join_glb(tree, bytes(body)))
+    return ", in the input's axes"
+
+
+def _write_usd(splats: Splats, path: Path, options: ExportOptions) -> str:
+    """One ParticleField3DGaussianSplat; a scene unit is a metre."""
+    require("pxr.UsdVol", extra="export", purpose=f"--out {path}")
+    from pxr import UsdVol, Vt
+
+    center = box_middle(splats.positions.astype(np.float64))
+    local = (splats.positions - center).astype(np.float32)
+    stage = usd_stage(center + splats.origin, splats.up)
+    field = UsdVol.ParticleField3DGaussianSplat.Define(stage, FIELD)
+    sh = np.ascontiguousarray(splats.harmonics.reshape(-1, 3))
+    reach = 3 * np.exp(splats.log_scales.max(axis=1, keepdims=True))
+    corners = np.stack([(local - reach).min(axis=0), (local + reach).max(axis=0)])
+    field.CreatePositionsAttr(Vt.Vec3fArray.FromNumpy(local))
+    field.CreateScalesAttr(Vt.Vec3fArray.FromNumpy(np.exp(splats.log_scales)))
+    turns = np.ascontiguousarray(np.roll(splats.quaternions, -1, axis=1))
+    field.CreateOrientationsAttr(Vt.QuatfArray.FromNumpy(turns))
+    field.CreateOpacitiesAttr(Vt.FloatArray.FromNumpy(splats.opacities))
+    field.CreateRadianceSphericalHarmonicsDegreeAttr(splats.degree)
+    field.CreateRadianceSphericalHarmonicsCoefficientsAttr(Vt.Vec3fArray.FromNumpy(sh))
+    field.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(corners.astype(np.float32)))
+    save_usd(stage, path)
+    return ", in the input's axes"
+
+
+# By the end of a name, longer ones first.
+WRITERS: Mapping[str, Callable[[Splats, Path, ExportOptions], str]] = {
+    ".compressed.ply": _write_compressed,
+    ".ply": _write_ply,
+    ".spz": _write_spz,
+    ".sog": _write_sog,
+    ".ksplat": _write_ksplat,
+    ".splat": _write_by_open3d,
+    ".glb": _write_glb,
+    ".usdc": _write_usd,
+    ".usda": _write_usd,
+}

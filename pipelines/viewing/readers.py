@@ -8,8 +8,6 @@ reads in a child process.
 from __future__ import annotations
 
 import io
-import json
-import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,21 +17,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.errors import MemoryFileError
+from gvtools.glb import GLB, glb_array, join_glb, split_glb
 from gvtools.optional import require
 from gvtools.ply import read_header
 from gvtools.sandbox import Item, ReaderError, read_apart
-from gvtools.untrusted import PIXEL_BYTES, PIXEL_RATIO, other_version, parse_json, read_bytes
+from gvtools.untrusted import PIXEL_BYTES, PIXEL_RATIO, read_bytes
 
 if TYPE_CHECKING:
     import trimesh
 
-GLB, JSON, GLB_VERSION = b"glTF", b"JSON", 2
 # What a vertex of a GLB takes in RAM, and how much there may be beside twice the file.
 VERTEX_BYTES, SPARE_BYTES = 128, 96 << 20
 # Of points without a colour.
 GREY = 160
-# By their number in glTF.
-COLOR_TYPES: dict[int, np.dtype[Any]] = {5123: np.dtype("<u2"), 5126: np.dtype("<f4")}
+# Of colours that are linear, by their number in glTF: 16 bits and float.
+COLOR_TYPES = (5123, 5126)
 
 
 def load_mesh(path: Path) -> trimesh.Trimesh | trimesh.PointCloud:
@@ -103,17 +101,8 @@ def _checked_glb(path: Path, data: bytes) -> bytes:
 
     Arrays that are not in the file are refused, and more copies of meshes than it explains.
     """
-    version = int.from_bytes(data[4:8], "little")
-    if version > GLB_VERSION:
-        raise MemoryFileError(
-            f"{path}: glTF version {version}; expected {GLB_VERSION}; "
-            f"{other_version(version, GLB_VERSION, '')}"
-        )
     try:
-        length, kind = struct.unpack_from("<I4s", data, 12)
-        if kind != JSON or 20 + length > len(data):
-            raise ValueError("no JSON in front")
-        tree = parse_json(data[20 : 20 + length])
+        tree, body = split_glb(data)
         counts = []
         for accessor in tree.get("accessors", ()):
             count = accessor["count"]
@@ -131,8 +120,10 @@ def _checked_glb(path: Path, data: bytes) -> bytes:
         # Vertices that are drawn once take at least 6 bytes of the file; copies take none.
         if (vertices - len(data) // 6) * VERTEX_BYTES > SPARE_BYTES:
             raise ValueError(f"nodes draw {vertices} vertices")
-        return _with_plain_colors(tree, data[28 + length :]) or data
-    except (AttributeError, IndexError, KeyError, TypeError, ValueError, struct.error) as error:
+        return _with_plain_colors(tree, body) or data
+    except MemoryFileError as error:
+        raise MemoryFileError(f"{path}: {error}") from None
+    except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
         raise MemoryFileError(
             f"{path}: no GLB of meshes or points ({error}); the file is damaged; save it again"
         ) from None
@@ -155,14 +146,10 @@ def _with_plain_colors(tree: dict[str, Any], body: bytes) -> bytes | None:
     changed = False
     for place in sorted(places):
         accessor = tree["accessors"][place]
-        kind = COLOR_TYPES.get(accessor["componentType"])
-        if kind is None:
+        if accessor["componentType"] not in COLOR_TYPES:
             continue
-        view = tree["bufferViews"][accessor["bufferView"]]
-        shape = accessor["count"], {"VEC3": 3, "VEC4": 4}[accessor["type"]]
-        start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
-        step = view.get("byteStride") or shape[1] * kind.itemsize
-        stored = np.ndarray(shape, kind, body, start, (step, kind.itemsize))
+        stored = glb_array(tree, body, place)
+        kind = stored.dtype
         linear = np.nan_to_num(stored.astype(np.float64) / (65535 if kind.kind == "u" else 1))
         colors = np.full((len(linear), 4), 255, np.uint8)
         colors[:, :3] = _srgb(linear[:, :3])
@@ -178,12 +165,7 @@ def _with_plain_colors(tree: dict[str, Any], body: bytes) -> bytes | None:
     if not changed:
         return None
     tree["buffers"][0]["byteLength"] = len(body)
-    head = json.dumps(tree).encode()
-    head = head.ljust(-(-len(head) // 4) * 4)
-    size = 28 + len(head) + len(body)
-    parts = (struct.pack("<4sII", GLB, 2, size), struct.pack("<I4s", len(head), JSON), head,
-             struct.pack("<I4s", len(body), b"BIN\0"), body)  # fmt: skip
-    return b"".join(parts)
+    return join_glb(tree, body)
 
 
 def read_usd(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:

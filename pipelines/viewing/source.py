@@ -21,9 +21,10 @@ from gvtools.optional import require
 from gvtools.ply import read_header
 from gvtools.runs.layout import RECORD
 from gvtools.runs.run import Run, count_rounds, load_growing_run, load_memory
+from gvtools.splat_files import READERS, holds_splats, read_splats
+from gvtools.splats import Splats
 from pipelines.export.formats import ExportOptions
-from pipelines.export.source import ExportSource, Splats
-from pipelines.export.splats import is_splat, read_splat_ply, read_spz
+from pipelines.export.source import ExportSource
 from pipelines.viewing.readers import GREY, load_mesh, read_usd
 from viz.viewer.run_view import (
     MESH,
@@ -170,11 +171,9 @@ def open_file(path: Path) -> RunView | None:
 
 
 def _open_ply(path: Path) -> RunView | None:
-    header = read_header(path)
-    if header.holds("face"):
+    if read_header(path).holds("face"):
         return _open_mesh(path)
-    names = {name for element in header.elements for name, _ in element.columns}
-    return _splat_view(path, read_splat_ply(path)) if is_splat(names) else None
+    return _open_splats(path) if holds_splats(path) else None
 
 
 def _open_mesh(path: Path) -> RunView:
@@ -208,16 +207,24 @@ def _open_las(path: Path) -> RunView:
     return _points_view(path, scan.positions + scan.origin, scan.colors)
 
 
+def _open_usd(path: Path) -> RunView:
+    try:
+        return _open_splats(path)
+    except MemoryFileError:
+        return _points_view(path, *read_usd(path))
+
+
 def _points_view(path: Path, positions: NDArray[Any], colors: NDArray[Any] | None) -> RunView:
     return RunView(path, _memory(path, positions, colors))
 
 
-def _splat_view(path: Path, splats: Splats) -> RunView:
-    if not len(splats):
-        raise MemoryFileError(f"{path}: no Gaussians; expected some")
+def _open_splats(path: Path) -> RunView:
+    splats = read_splats(path)
     gaussians = _shown(splats)
     memory = _memory(path, gaussians.centers, gaussians.colors)
-    return RunView(path, memory, looks=(SPLATS, POINTS), gaussians_of=lambda most: gaussians)
+    return RunView(
+        path, memory, looks=(SPLATS, POINTS), gaussians_of=lambda most: gaussians, told_up=splats.up
+    )
 
 
 def _shown(splats: Splats) -> ShownGaussians:
@@ -239,9 +246,10 @@ def _memory(path: Path, positions: NDArray[Any], colors: NDArray[Any] | None) ->
 
 
 OPENERS: Mapping[str, Callable[[Path], RunView | None]] = {
+    **dict.fromkeys(READERS, _open_splats),
     ".ply": _open_ply,
-    ".spz": lambda path: _splat_view(path, read_spz(path)),
-    **dict.fromkeys((".glb", ".obj"), _open_mesh),
+    ".glb": lambda path: _open_splats(path) if holds_splats(path) else _open_mesh(path),
+    ".obj": _open_mesh,
     **dict.fromkeys((".las", ".laz"), _open_las),
-    **dict.fromkeys((".usd", ".usda", ".usdc"), lambda path: _points_view(path, *read_usd(path))),
+    **dict.fromkeys((".usd", ".usda", ".usdc"), _open_usd),
 }

@@ -9,7 +9,7 @@ import pytest
 from command_line import refused
 
 NEWER = {
-    "a.spz": b"NGSP" + struct.pack("<II4B", 4, 10, 3, 12, 0, 0) + bytes(99),
+    "a.spz": b"NGSP" + struct.pack("<II4B", 5, 10, 3, 12, 0, 0) + bytes(99),
     "a.glb": b"glTF" + struct.pack("<II", 3, 99) + bytes(99),
     "a.las": b"LASF" + bytes(20) + bytes([1, 5]) + bytes(400),
 }
@@ -32,14 +32,14 @@ def test_a_newer_memory_asks_for_a_newer_program(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("words", "opened"),
     [
-        (("view", "{}", "--screenshot", "{}.png"), ".npz, .ply, .spz"),
+        (("view", "{}", "--screenshot", "{}.png"), ".npz, .ply"),
         (("export", "{}", "--format", "ply", "--out", "{}.ply"), ".npz, .ply"),
         (("check", "{}"), "transforms.json"),
         (("reconstruct", "{}", "--out", "{}.out"), "transforms.json"),
     ],
 )
 def test_unknown_suffixes_list_what_opens(tmp_path, capsys, words, opened):
-    file = tmp_path / "a.sog"
+    file = tmp_path / "a.zip"
     file.write_bytes(b"PK\x03\x04" + bytes(99))
     assert opened in refused(capsys, *(word.format(file) for word in words))
     assert list(tmp_path.iterdir()) == [file]

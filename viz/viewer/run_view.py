@@ -142,6 +142,7 @@ class RunView:
     # The Gaussians to draw for SPLATS, so many of the memory's points at most.
     gaussians_of: Callable[[int], ShownGaussians] | None = None
     surface: ColoredMesh | None = None  # to draw for MESH
+    told_up: NDArray[np.float64] | None = None  # (3,) by a file, where there are no cameras
 
     @property
     def title(self) -> str:
@@ -215,10 +216,10 @@ class RunView:
         return None if frame is None else frame.depth
 
     def up(self) -> NDArray[np.float64]:
-        """(3,) unit vector, world frame: the context's cameras' mean; without cameras a guess."""
+        """(3,) unit vector, world frame: the cameras' mean, or what the file says, or a guess."""
         chosen = [c for c in self.cameras if c.kind == CONTEXT] or list(self.cameras)
         if not chosen:
-            return self._guessed_up
+            return self._guessed_up if self.told_up is None else self.told_up
         # Image rows run downwards.
         total = -np.sum([c.camera.cam_from_world[0, 1, :3] for c in chosen], axis=0)
         length = float(np.linalg.norm(total))

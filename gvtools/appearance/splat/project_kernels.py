@@ -16,6 +16,10 @@ import math
 import numpy as np
 
 from gvtools.kernels import FAST, compiled
+from gvtools.splats import HARMONICS, LOGIT, SH
+from gvtools.splats import LOG_SCALE as LOG_SCALE
+from gvtools.splats import POSITION as POSITION
+from gvtools.splats import QUATERNION as QUATERNION
 
 # Columns of a projected Gaussian: its centre and the inverse of its 2D covariance in pixels,
 # opacity, colour, depth, half the squared distance (in standard deviations) at which it ends, and
@@ -23,10 +27,7 @@ from gvtools.kernels import FAST, compiled
 (X, Y, CONIC_XX, CONIC_XY, CONIC_YY, OPACITY, RED, GREEN, BLUE, DEPTH, END,
  RADIUS_X, RADIUS_Y) = range(13)  # fmt: skip
 COLUMNS = 13
-# A Gaussian's parameters, one row of VALUES numbers: position, logarithms of its three standard
-# deviations, quaternion w, x, y, z of any length, logit of its opacity, and nine coefficients of
-# spherical harmonics for each of red, green and blue (harmonic by harmonic).
-POSITION, LOG_SCALE, QUATERNION, LOGIT, SH = 0, 3, 6, 10, 11
+# Of a row (see gvtools.splats) whose harmonics have degree 2.
 VALUES = 38
 # Gradients of one Gaussian in one tile: of colour, depth, and the sums over its pixels of
 # dL/d(log alpha), alone and times dx, dy, dx dx, dx dy, dy dy (pixel minus centre).
@@ -37,12 +38,6 @@ LEAST_ALPHA = 1 / 255
 BLUR = 0.3
 # The linearisation is taken at most this far outside the picture, in shares of its size.
 MARGIN = 0.15
-
-# Constants of real spherical harmonics of degree 0, 1 and, three of them, 2.
-HARMONICS = (
-    0.28209479177387814, 0.4886025119029199,
-    1.0925484305920792, 0.31539156525252005, 0.5462742152960396,
-)  # fmt: skip
 
 
 @compiled(inline="always")

@@ -11,7 +11,6 @@ from tiny_scan import write_scan
 from gvtools.appearance.appearance import Appearance
 from gvtools.appearance.camera_corrections import Exposures
 from gvtools.appearance.gaussians import Gaussians
-from gvtools.appearance.harmonics import turn_gaussians
 from gvtools.appearance.splat.project_kernels import HARMONICS, LOG_SCALE, SH
 from gvtools.cameras import Cameras
 from gvtools.memory.spatial_memory import SpatialMemory
@@ -21,6 +20,7 @@ from gvtools.runs.poses import RunPoses
 from gvtools.runs.run import load_run
 from gvtools.scenes.project import open_project
 from gvtools.settings import with_values
+from gvtools.splats import turn_gaussians
 from pipelines.blocks import merge as merging
 from pipelines.blocks.merge import BlockAppearance, fit_across, join_appearances, merge, rows_across
 from pipelines.blocks.split import BlockCell, SceneBlock, read_blocks, split

@@ -1,0 +1,173 @@
+"""Splats written in every format, as other packages and the one reader see them."""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from command_line import refused, run_command
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from gvtools.errors import MemoryFileError
+from gvtools.glb import join_glb, split_glb
+from gvtools.splat_files import READERS, read_splats
+from gvtools.splats import SH, TERMS, TO_RUB, Splats, place_gaussians, turn_gaussians
+from pipelines.export.formats import ExportOptions
+from pipelines.export.splats import WRITERS, write_file
+
+COUNT = 300
+# How far positions, logarithms of sizes, opacities and colours may be from what was written, and
+# harmonics above degree 0; None where the format has none.
+ERRORS = {
+    ".ply": (0, 0, 1e-6, 0, 0),
+    ".compressed.ply": (0.01, 0.01, 0.003, 0.01, 0.02),
+    ".spz": (1e-3, 0.04, 0.003, 0.007, 0.07),
+    ".sog": (2e-3, 0.05, 0.005, 0.007, 0.02),
+    ".splat": (0, 1e-6, 0.005, 0.005, None),
+    ".ksplat": (0, 1e-6, 0.005, 0.005, 1e-6),
+    ".glb": (1e-6, 1e-6, 1e-6, 0, 0),
+    ".usdc": (1e-6, 1e-6, 1e-6, 0, 0),
+    ".usda": (1e-5, 1e-5, 1e-5, 1e-5, 1e-5),
+}
+NEEDS = {".compressed.ply": "gaussforge", ".spz": "gaussforge", ".sog": "gaussforge",
+         ".ksplat": "gaussforge", ".usdc": "pxr.UsdVol", ".usda": "pxr.UsdVol"}  # fmt: skip
+
+
+def some(degree=3):
+    rng = np.random.default_rng(degree)
+    values = rng.normal(size=(COUNT, SH + 3 * TERMS[degree]))
+    values[:, 3:6] = values[:, 3:6] * 0.5 - 4
+    # Colours from 0 to 1, which 8 bits hold.
+    values[:, SH : SH + 3] = rng.uniform(-1.7, 1.7, (COUNT, 3))
+    values[:, SH + 3 :] *= 0.2
+    rounds, up = np.zeros(COUNT, np.int32), np.array([0.0, -0.6, 0.8])
+    return Splats(values.astype(np.float32), np.zeros(3), COUNT, 0, rounds, rounds > 0, up)
+
+
+def written(folder, end, splats, **options):
+    if end in NEEDS:
+        pytest.importorskip(NEEDS[end])
+    write_file(splats, folder / f"a{end}", ExportOptions(**options))
+    return folder / f"a{end}"
+
+
+def check_alike(found, given, errors):
+    assert len(found) == len(given)
+    world = found.positions + found.origin
+    place = cKDTree(world).query(given.positions + given.origin)[1]
+    assert len({*place}) == len(given)
+    rows = found.values[place]
+    near, size, opacity, color, rest = errors
+    np.testing.assert_allclose(world[place], given.positions + given.origin, atol=near)
+    np.testing.assert_allclose(rows[:, 3:6], given.log_scales, atol=size)
+    same = np.abs((found.quaternions[place] * given.quaternions).sum(axis=1))
+    np.testing.assert_allclose(same, 1, atol=1e-4)
+    np.testing.assert_allclose(found.opacities[place], given.opacities, atol=opacity)
+    np.testing.assert_allclose(found.colors[place], given.colors, atol=color)
+    if rest is None:
+        assert found.degree == 0
+    else:
+        ours = given.harmonics[:, : found.harmonics.shape[1]]
+        np.testing.assert_allclose(found.harmonics[place][:, 1:], ours[:, 1:], atol=rest)
+
+
+def test_every_format_is_read_and_written():
+    assert {*ERRORS} == {*WRITERS}
+    assert {f".{end.split('.')[-1]}" for end in WRITERS} | {".usd"} == {*READERS}
+
+
+@pytest.mark.parametrize("end", ERRORS)
+def test_what_is_written_is_read(tmp_path, end):
+    given = some()
+    found = read_splats(written(tmp_path, end, given))
+    check_alike(found, given, ERRORS[end])
+    assert found.degree == {".splat": 0, ".ksplat": 2}.get(end, 3)
+    if end in (".ply", ".compressed.ply", ".glb", ".usdc", ".usda"):
+        assert found.up == pytest.approx(given.up, abs=1e-6)
+
+
+@pytest.mark.parametrize("degree", [0, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("end", [".spz", ".sog", ".ksplat", ".glb", ".compressed.ply"])
+def test_lower_degrees_stay_what_they_are(tmp_path, end, degree):
+    found = read_splats(written(tmp_path, end, some(degree)))
+    check_alike(found, some(degree), ERRORS[end])
+    assert found.degree == degree
+
+
+@pytest.mark.parametrize(("end", "version"), [(".spz", 4), (".spz", 3), (".compressed.ply", 4)])
+def test_gsply_reads_the_same(tmp_path, end, version):
+    gsply, given = pytest.importorskip("gsply"), some()
+    file = written(tmp_path, end, given, spz_version=version)
+    read = gsply.read_spz(file) if end == ".spz" else gsply.plyread(file)
+    parts = (read.means, read.scales, read.quats, np.reshape(read.opacities, (COUNT, 1)), read.sh0)
+    values = np.concatenate([*parts, np.reshape(read.shN, (COUNT, -1))], axis=1)
+    values = turn_gaussians(values, TO_RUB) if end == ".spz" else values
+    check_alike(replace(given, values=values), given, ERRORS[end])
+
+
+def test_open3d_reads_the_splat_file(tmp_path):
+    o3d, given = importlib.import_module("open3d"), some()
+    cloud = o3d.t.io.read_point_cloud(str(written(tmp_path, ".splat", given)))
+    found = cloud.point.positions.numpy()
+    np.testing.assert_allclose(cKDTree(given.positions).query(found)[0], 0, atol=1e-7)
+
+
+@pytest.mark.slow
+def test_spz_is_read_without_gaussforge(tmp_path, monkeypatch):
+    file = written(tmp_path, ".spz", some())
+    one = read_splats(file)
+    monkeypatch.setattr("gvtools.splat_files.installed", lambda name: False)
+    np.testing.assert_allclose(read_splats(file).values, one.values, atol=1e-5)
+
+
+def test_a_node_of_a_glb_moves_turns_and_scales_its_gaussians(tmp_path):
+    file, given = written(tmp_path, ".glb", some()), some()
+    turn = Rotation.from_rotvec([0.3, -1.0, 0.5])
+    tree, body = split_glb(file.read_bytes())
+    tree["nodes"][0] |= {"rotation": turn.as_quat().tolist(), "scale": [2, 2, 2]}
+    moved = np.array(tree["nodes"][0]["translation"])
+    file.write_bytes(join_glb(tree, body))
+    matrix = np.eye(4)
+    matrix[:3, :3] = 2 * turn.as_matrix()
+    values = given.values.copy()
+    values[:, :3] -= moved
+    values, _ = place_gaussians(values, matrix)
+    found = read_splats(file)
+    check_alike(found, replace(given, values=values, origin=moved), (1e-5, 1e-5, 1e-5, 1e-5, 1e-4))
+
+
+@pytest.mark.parametrize(("end", "mode"), [(".ply", "mip"), (".ply", "2dgs"), (".spz", "mip"),
+                                           (".compressed.ply", "mip")])  # fmt: skip
+def test_how_to_draw_them_is_kept(tmp_path, end, mode):
+    assert read_splats(written(tmp_path, end, replace(some(1), mode=mode))).mode == mode
+
+
+def test_a_file_is_converted_and_the_suffix_tells_the_format(tmp_path, capsys):
+    file = written(tmp_path, ".ply", some())
+    run_command("export", file, "--out", tmp_path / "b.glb", quiet=True)
+    np.testing.assert_allclose(read_splats(tmp_path / "b.glb").values[:, 3:6],
+                               some().log_scales, atol=1e-6)  # fmt: skip
+    said = refused(capsys, "export", file, "--out", tmp_path / "c.ply", "--observed")
+    assert "--observed" in said and "leave it out" in said
+    assert "give --format" in refused(capsys, "export", tmp_path, "--out", tmp_path / "c.usdc")
+
+
+def test_harmonics_of_no_whole_degree_are_refused(tmp_path):
+    file = written(tmp_path, ".ply", some())
+    data = file.read_bytes().replace(b"property float f_rest_44\n", b"property float other\n")
+    file.write_bytes(data)
+    with pytest.raises(MemoryFileError, match="44 properties f_rest; expected 0, 9, 24 or 45"):
+        read_splats(file)
+
+
+@pytest.mark.parametrize("end", [*ERRORS][:-2])
+def test_half_a_file_is_refused(tmp_path, end):
+    file = written(tmp_path, end, some(0))
+    data = file.read_bytes()
+    file.write_bytes(data[: len(data) // 2 - 1])
+    with pytest.raises(MemoryFileError, match=f"a{end}: ") as error:
+        read_splats(file)
+    assert "\n" not in str(error.value)
