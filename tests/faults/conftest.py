@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -13,10 +12,9 @@ from tiny_scan import write_scan
 from pipelines.cli import main
 
 
-@pytest.fixture(scope="package", autouse=True)
-def _unpainted() -> Iterator[None]:
-    with unpainted_figures():
-        yield
+@pytest.fixture(scope="module", autouse=True)
+def _unpainted(unpainted: None) -> None:
+    pass
 
 
 @pytest.fixture(scope="session")
@@ -29,5 +27,6 @@ def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def run(scan: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two rounds of one view, without a fit."""
     out = tmp_path_factory.mktemp("runs") / "run"
-    assert main(["reconstruct", str(scan), "--out", str(out), *PLAIN, "--quiet"]) == 0
+    with unpainted_figures():
+        assert main(["reconstruct", str(scan), "--out", str(out), *PLAIN, "--quiet"]) == 0
     return out

@@ -14,7 +14,6 @@ from run_files import Killed, results
 
 from gvtools.capture.project import replaced_folder
 from gvtools.errors import ProjectError
-from gvtools.prefetch import prefetch
 from gvtools.runs.folder import folder_lock
 from gvtools.scenes.colmap_model import CAMERAS
 from pipelines.cli import main
@@ -79,19 +78,6 @@ def test_a_clock_that_jumps_by_a_day_changes_nothing(scan, run, tmp_path, monkey
     for line in (out / "rounds.jsonl").read_text().splitlines():
         seconds = json.loads(line)["seconds"]
         assert all(0 <= value < 600 for value in seconds.values()), seconds
-
-
-def test_an_error_in_the_thread_that_reads_ahead_ends_the_reading():
-    def load(item: int) -> int:
-        if item == 2:
-            raise ProjectError("frame 2: gone")
-        return item
-
-    found = []
-    with pytest.raises(ProjectError, match="frame 2: gone"):
-        for item in prefetch(load, range(4)):
-            found.append(item)
-    assert found == [0, 1]
 
 
 @pytest.fixture(scope="module")

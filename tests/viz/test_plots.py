@@ -9,7 +9,6 @@ import matplotlib
 import numpy as np
 import pytest
 from command_line import refused
-from growth_rounds import rounds
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -21,6 +20,26 @@ from viz.plots.rounds import draw_growth, draw_quality, draw_timing, growth_text
 from viz.plots.trajectories import Trajectories, draw_trajectories, principal_axes
 
 RNG = np.random.default_rng(0)
+
+
+def rounds(count: int = 3) -> list[dict]:
+    return [
+        {
+            "round": k,
+            "points": 1000 + 200 * k,
+            "voxels": 600 + 150 * k,
+            "added": 1000 if k == 0 else 200,
+            "merged": 300 if k == 0 else 40,
+            "rejected": 0 if k == 0 else 25,
+            "observed": 1000,
+            "generated": 200 * k,
+            "coverage_before": None if k == 0 else 0.5 + 0.1 * k,
+            "coverage_after": None if k == 0 else 0.7 + 0.1 * k,
+            "seconds": {"depth": 0.1, "fuse": 0.5, "project": 0.2, "complete": 1.0, "align": 0.0},
+            "bytes": 50_000,
+        }
+        for k in range(count)
+    ]
 
 
 def points(axes: Any, label: str) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from run_files import report_of
-from tiny_scan import render, world_from_cam, write_colmap_scan, write_scan
+from tiny_scan import ExactDepth, render, world_from_cam, write_colmap_scan, write_scan
 
 from gvtools.depth import choice
 from gvtools.depth.source import DepthMap
@@ -28,30 +28,14 @@ RUN = ("--targets", "range:3-4", "--views-per-round", "1", "--context", "first:3
 ALL = ("--set", "savings.depth_from_memory=none")
 
 
-class Exact:
-    """The recording's true depth, as if it had been computed; counts how often it was asked."""
-
-    name = "exact"
-    asked = 0
-
-    def covers(self, view: View) -> bool:
-        return True
-
-    def depth(self, scene: Scene, view: View, frame: Frame) -> DepthMap:
-        Exact.asked += 1
-        index = int(view.name.split("-")[1].split(".")[0])
-        depth = render(world_from_cam(index))[1].astype(np.float32)
-        return DepthMap(depth, np.full_like(depth, 0.5), self.name)
-
-
 @pytest.fixture
 def scan(tmp_path, monkeypatch):
     """A recording whose context views have lost their depth maps; the source knows the depth."""
     folder = write_scan(tmp_path / "scan")
     for index in (0, 2):
         Image.fromarray(np.zeros((72, 96), np.uint16)).save(folder / f"frame-{index:06d}.depth.png")
-    monkeypatch.setattr(choice, "_stereo", lambda *_: Exact())
-    Exact.asked = 0
+    monkeypatch.setattr(choice, "_stereo", lambda *_: ExactDepth())
+    ExactDepth.asked = 0
     return folder
 
 
@@ -61,7 +45,7 @@ def reconstruct(scan, out, *more: object) -> int:
 
 
 def test_depth_that_nothing_confirms_is_fused_as_generated(scan, tmp_path, monkeypatch, capsys):
-    exact = Exact.depth
+    exact = ExactDepth.depth
 
     def half_guessed(self, scene, view, frame):
         found = exact(self, scene, view, frame)
@@ -72,7 +56,7 @@ def test_depth_that_nothing_confirms_is_fused_as_generated(scan, tmp_path, monke
     counts = []
     for name in ("sure", "guessed"):
         if name == "guessed":
-            monkeypatch.setattr(Exact, "depth", half_guessed)
+            monkeypatch.setattr(ExactDepth, "depth", half_guessed)
         assert reconstruct(scan, tmp_path / name, "--voxel", "0.03", *ALL) == 0
         report = report_of(tmp_path / name)
         counts.append((report["observed"], report["generated"], report["dropped"]["masked"]))
@@ -90,7 +74,7 @@ def test_computed_depth_is_kept_and_asked_for_once(scan, tmp_path):
     out = tmp_path / "run"
     assert reconstruct(scan, out, "--voxel", "0.03", *ALL) == 0
     # Once a view, although round 0 lifts it and the completer looks at it in every round.
-    assert Exact.asked == 3
+    assert ExactDepth.asked == 3
     kept = sorted((out / "round_000").glob("context_depth_*.npz"))
     assert len(kept) == 3
     with np.load(kept[0]) as stored:
@@ -110,7 +94,7 @@ def test_a_view_that_memory_explains_needs_none_computed(scan, tmp_path):
     assert reconstruct(scan, out, "--voxel", "0.03", "--set", "savings.depth_from_memory=0.8") == 0
     report = report_of(out)
     sources = [entry["source"] for entry in report["depth"]]
-    assert sources[0] == "exact" and sources.count("memory") == 3 - Exact.asked > 0
+    assert sources[0] == "exact" and sources.count("memory") == 3 - ExactDepth.asked > 0
     row = sources.index("memory")
     assert report["depth"][row]["known"] >= 0.8
     kept = sorted((out / "round_000").glob("context_depth_*.npz"))
@@ -125,9 +109,9 @@ def test_a_resumed_run_reads_it_again(scan, tmp_path):
     assert reconstruct(scan, out, "--voxel", "0.03") == 0
     whole = (out / "memory.npz").read_bytes()
     shutil.rmtree(out / "round_002")
-    Exact.asked = 0
+    ExactDepth.asked = 0
     assert reconstruct(scan, out, "--voxel", "0.03", "--resume") == 0
-    assert Exact.asked == 0
+    assert ExactDepth.asked == 0
     assert (out / "memory.npz").read_bytes() == whole
     kept = next((out / "round_000").glob("context_depth_*.npz"))
     data = kept.read_bytes()
@@ -139,7 +123,7 @@ def test_a_resumed_run_reads_it_again(scan, tmp_path):
 
 
 def test_a_view_without_depth_does_not_stop_the_others(scan, tmp_path, monkeypatch, capsys):
-    class Lacking(Exact):
+    class Lacking(ExactDepth):
         def depth(self, scene: Scene, view: View, frame: Frame) -> DepthMap:
             if view.name.startswith("frame-000001") or Lacking.none:
                 raise DegenerateError(f"none shows what {view.name} does")
@@ -170,7 +154,7 @@ def test_the_automatic_voxel_asks_the_source_where_nothing_else_tells(scan, tmp_
 def test_views_off_the_sparse_points_scale_are_reported_and_named(
     tmp_path, monkeypatch, capsys, wrong
 ):
-    class Scaled(Exact):
+    class Scaled(ExactDepth):
         """Depth of some views is by a third too large."""
 
         def depth(self, scene: Scene, view: View, frame: Frame) -> DepthMap:

@@ -12,17 +12,15 @@ import torch
 from command_line import refused
 from micro_weights import write_micro_weights
 from PIL import Image
-from tiny_scan import render, world_from_cam, write_colmap_scan, write_scan
+from tiny_scan import ExactDepth, write_colmap_scan, write_scan
 
 from gvtools.completers import Completer, Completion
 from gvtools.completers.base import create
 from gvtools.completers.geoverse import from_pretrained
 from gvtools.completers.geoverse.config import read
 from gvtools.depth import choice
-from gvtools.depth.source import DepthMap
 from gvtools.errors import ProjectError
 from gvtools.scenes.project import open_project
-from gvtools.scenes.scene import Frame, Scene, View
 from gvtools.training.options import SHIPPED
 from pipelines.cli import main
 from pipelines.reconstruction import prepare
@@ -213,21 +211,8 @@ def test_the_clock_ends_it(scan, weights, tmp_path):
     assert json.loads(figures.read_text())["steps"] >= 1
 
 
-class Exact:
-    """True depth, as if it had been computed from the photographs."""
-
-    name = "exact"
-
-    def covers(self, view: View) -> bool:
-        return True
-
-    def depth(self, scene: Scene, view: View, frame: Frame) -> DepthMap:
-        depth = render(world_from_cam(int(view.name[5])))[1].astype(np.float32)
-        return DepthMap(depth, np.ones_like(depth), self.name)
-
-
 def test_photographs_are_tuned_to_by_computed_depth(weights, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(choice, "_stereo", lambda *_: Exact())
+    monkeypatch.setattr(choice, "_stereo", lambda *_: ExactDepth())
     project = write_colmap_scan(tmp_path / "colmap", views=6)
     out = tmp_path / "out"
     assert tune(project, weights, out, "--steps", 1) == 0
