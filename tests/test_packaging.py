@@ -15,11 +15,7 @@ from gvtools.system_libraries import LIBRARIES
 
 ROOT = Path(__file__).resolve().parents[1]
 # conda-forge's names where they are not PyPI's.
-CONDA = {
-    "torch": "pytorch",
-    "opencv-python-headless": "py-opencv",
-    "matplotlib": "matplotlib-base",
-}
+CONDA = {"torch": "pytorch", "opencv-python-headless": "py-opencv", "matplotlib": "matplotlib-base"}
 
 
 def setup() -> configparser.ConfigParser:

@@ -11,10 +11,7 @@ from gvtools.training.samples import Observation, project_observation
 
 def test_versions_of_judged_maps_are_left_out():
     maps = ("maps/castle2.bsp", "maps/cavern.bsp", "maps/q1.bsp", "maps/q12.bsp")
-    assert unjudged(maps, ("maps/castle.bsp", "maps/q1.bsp")) == [
-        "maps/cavern.bsp",
-        "maps/q12.bsp",
-    ]
+    assert unjudged(maps, ("maps/castle.bsp", "maps/q1.bsp")) == ["maps/cavern.bsp", "maps/q12.bsp"]
 
 
 def test_walks_are_scenes_whose_views_agree(tmp_path):

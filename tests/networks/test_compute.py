@@ -28,11 +28,7 @@ from gvtools.networks.compute import (
     training_type,
 )
 from gvtools.networks.depth_anything.network import DepthAnything3
-from gvtools.training.options import (
-    DenoiserStageOptions,
-    EncoderStageOptions,
-    OptimizerOptions,
-)
+from gvtools.training.options import DenoiserStageOptions, EncoderStageOptions, OptimizerOptions
 from gvtools.training.samples import Draws, TrainingBatch
 from gvtools.training.small_model_stages import EncoderStage
 from gvtools.training.stages import DenoiserStage

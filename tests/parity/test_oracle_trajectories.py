@@ -8,12 +8,7 @@ import pytest
 from oracle import ABSENT, ORACLE, arrays, expected_values
 
 from gvtools.evaluation.statistics import ErrorStatistics
-from gvtools.evaluation.trajectories import (
-    absolute_errors,
-    by_index,
-    by_time,
-    relative_errors,
-)
+from gvtools.evaluation.trajectories import absolute_errors, by_index, by_time, relative_errors
 from gvtools.trajectory_files import read_poses
 
 RELATIVE = 1e-6

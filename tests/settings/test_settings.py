@@ -10,14 +10,7 @@ from hypothesis import strategies as st
 from gvtools.depth.options import FoundationOptions, StereoOptions
 from gvtools.errors import OptionError
 from gvtools.scenes.rgbd import RgbdOptions
-from gvtools.settings import (
-    changes,
-    listing,
-    markdown,
-    with_file,
-    with_texts,
-    with_values,
-)
+from gvtools.settings import changes, listing, markdown, with_file, with_texts, with_values
 from gvtools.settings.base import Settings, entries, keys
 from gvtools.training.corruption import CorruptionOptions
 from gvtools.training.options import (
