@@ -41,7 +41,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 def micro_samples(*settings: str) -> TrainingSamples:
     config, folder = shipped_or_read("micro")
-    config = with_texts(config, list(settings))
+    config = with_texts(config, ["data.size=[24,24]", *settings])
     return TrainingSamples(config, config.network(folder))
 
 
@@ -235,7 +235,7 @@ def test_the_papers_rule_is_taken_from_the_spec(home, monkeypatch):
 
 def words(out: Path, home: Path) -> list[str]:
     start = ["train", "micro", "--stage", "encoder", "--out", str(out), "--device", "cpu"]
-    texts = [*settings(str(home / "shards")), "encoder.statistics=1"]
+    texts = [*settings(str(home / "shards")), "data.size=[24,24]", "encoder.statistics=1"]
     texts += ["encoder.optimizer.steps=5", "encoder.optimizer.batch=2"]
     return [*start, "--sheets", "0", *sets(*texts)]
 
