@@ -158,7 +158,9 @@ def picture_cameras(cameras: Cameras, options: LensOptions, *, captured: Cameras
     """
     first: dict[str, int] = {}
     for row, name in enumerate(cameras.names):
-        first.setdefault(picture_of(name), row)
+        picture = picture_of(name)
+        if picture not in first or name == face_name(picture, "front"):
+            first[picture] = row
     chosen = replace(cameras[list(first.values())], names=tuple(first))
     if options.kind != "equirectangular":
         return chosen

@@ -416,7 +416,8 @@ def _reopened(run: Run, console: Console) -> tuple[Plan, Mapping[str, Any]]:
     begun = round_folder(run.path, 0) if run.rounds else None
     plan = make_plan(scene, settings, say=console.line, round_0=begun)
     identity = run_identity(plan, reading)
-    changed = changed_keys(identity, record)
+    # Those come from the record, with defaults for what later versions added.
+    changed = [key for key in changed_keys(identity, record) if key != "settings"]
     if run.project is not None and "project" in changed:
         changed.remove("project")
     if changed:

@@ -104,6 +104,11 @@ def test_panoramas_stand_upright_and_look_where_the_cameras_do(leaning):
     apart = np.cross(world[:, :3, 2], leaning.world_from_cam[:, :3, 2]) @ up
     assert np.abs(np.degrees(np.arcsin(apart))).max() < 4
     assert pictures.names[:2] == ("0.png", "1.png")
+    # A panorama's faces are one picture, which looks where its front does, wherever that is listed.
+    faces = replace(leaning[:3], names=("a@back.png", "a@front.png", "a@left.png"))
+    (picture,) = picture_cameras(faces, LensOptions(kind="equirectangular"), captured=leaning)
+    assert picture.names == ("a.png",)
+    np.testing.assert_array_equal(picture.cam_from_world[0], pictures.cam_from_world[1])
     # Straight down: the middle is what is above in the camera's picture.
     down = replace(
         CAMERA, cam_from_world=invert_rigid(look_at(np.zeros((1, 3)), -up, up=[0, 1, 0]))

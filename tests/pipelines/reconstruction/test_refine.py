@@ -49,6 +49,8 @@ def refining_poses(copy: Path) -> dict:
     """Let the fit refine poses, too; the run's record."""
     record = json.loads((copy / "run.json").read_text())
     record["settings"]["refine"]["poses"] = True
+    # As of a version that did not have them.
+    record["settings"].pop("lens")
     write_json(copy / "run.json", record)
     return record
 
