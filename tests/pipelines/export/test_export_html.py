@@ -16,11 +16,12 @@ from scipy.spatial.transform import Rotation
 
 from gvtools.appearance.appearance import Appearance
 from gvtools.appearance.gaussians import Gaussians
+from gvtools.cameras import Cameras
 from gvtools.errors import OptionError
 from gvtools.memory.store.local_frame import LocalFrame
 from pipelines.export.formats import ExportOptions
 from pipelines.export.source import ExportSource
-from viz.page.page import PageCamera
+from viz.page.page import PageCamera, PageGroup, SharedPage, page_html
 from viz.page.words import pack_gaussians
 
 PATIENCE = 60.0
@@ -113,6 +114,17 @@ def test_groups_tell_rounds_and_sources(fitted_run, bare_run, tmp_path):
         assert (data["exposures"] is not None) == (run is fitted_run)
         export_run(run.folder, "html", out, "--observed")
         assert not any(generated for _, generated, *_ in scene_of(out)[1])
+
+
+def test_names_of_files_are_text_alone():
+    evil = '</script><img src=x onerror="alert(1)">-->'
+    start = PageCamera(Cameras.pinhole(4, 3, focal=3, name=evil))
+    group = PageGroup(0, generated=False, fitted=False, words=[np.zeros((1, 4), np.uint32)] * 2)
+    page = SharedPage(
+        title=evil, summary="", groups=[group], cameras=[start], start=start, origin=np.zeros(3),
+        up=np.array([0.0, -1, 0]), depth=1.0, near=0.1,
+    )  # fmt: skip
+    assert page_html(page).count("<img") == 0
 
 
 def test_pages_that_are_no_export_are_kept(fitted_run, tmp_path):
