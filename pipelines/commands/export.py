@@ -58,8 +58,8 @@ class ExportCommand(Arguments, ExportOptions):
                     "it out"
                 )
         form.check_path(self.out, self.memory)
-        if splats and form.name in ("splat", "spz"):
-            self._convert(console)
+        if splats and form.name in ("splat", "spz", "html"):
+            self._convert(console, form)
             return
         if form.name in ("colmap", "transforms", "mesh") and self.memory.suffix.lower() == ".ply":
             raise OptionError(
@@ -99,7 +99,7 @@ class ExportCommand(Arguments, ExportOptions):
             raise OptionError(f"--out {self.out}: give --format, one of {names}")
         return fits[0]
 
-    def _convert(self, console: Console) -> None:
+    def _convert(self, console: Console, form: ExportFormat) -> None:
         """Splats of a file in another format."""
         from pipelines.export.splats import write_file
 
@@ -108,4 +108,11 @@ class ExportCommand(Arguments, ExportOptions):
                 raise OptionError(
                     f"{self.key(name)}: {self.memory} is a file of splats; leave it out"
                 )
-        console.line(write_file(read_splats(self.memory), self.out, self))
+        splats = read_splats(self.memory)
+        if form.name == "html":
+            from pipelines.export.html import write_page
+            from pipelines.viewing.source import ViewSource
+
+            console.line(write_page(ViewSource(self.memory).read(), splats, self.out))
+            return
+        console.line(write_file(splats, self.out, self))

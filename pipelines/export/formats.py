@@ -23,7 +23,7 @@ from gvtools.optional import require
 from gvtools.settings import Settings
 
 # How files of SPZ begin, of version 4 and older, and what is read of a file to know its format.
-SPZ, HEAD_BYTES = (b"NGSP", b"\x1f\x8b"), 16
+SPZ, HEAD_BYTES = (b"NGSP", b"\x1f\x8b"), 64
 # What every point format takes, and what a mesh takes beside it.
 POINTS = ("max_points", "observed")
 SPLATS = (*POINTS, "spz_version")

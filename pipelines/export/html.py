@@ -5,10 +5,11 @@ Gaussians come in groups, one for each round and source, which the page shows or
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,6 +25,9 @@ from viz.page.words import pack_gaussians
 from viz.report.pictures import thumbnail
 from viz.viewer.run_view import RunView, cameras_of
 from viz.viewer.standpoint import camera_outside
+
+if TYPE_CHECKING:
+    from gvtools.appearance.appearance import Appearance
 
 # Of the memory, beside fitted Gaussians, where the user gives no number.
 MAX_POINTS = 400_000
@@ -41,7 +45,18 @@ def write_html(source: ExportSource, path: Path, options: ExportOptions) -> str:
         most = MAX_POINTS + (0 if fit is None else len(fit.gaussians))
     splats = source.splats(options.model_copy(update={"max_points": most}), exposed=False)
     run = RunView(source.path, memory, cameras=cameras_of(memory, ()))
-    cameras = list(_cameras(source))
+    return write_page(run, splats, path, cameras=list(_cameras(source)), fit=fit)
+
+
+def write_page(
+    run: RunView,
+    splats: Splats,
+    path: Path,
+    *,
+    cameras: Sequence[PageCamera] = (),
+    fit: Appearance | None = None,
+) -> str:
+    """Write the page of Gaussians, of a run or of a file."""
     depth = run.typical_depth
     page = SharedPage(
         title=run.title,
@@ -51,6 +66,7 @@ def write_html(source: ExportSource, path: Path, options: ExportOptions) -> str:
         start=cameras[0] if cameras else PageCamera(camera_outside(run)),
         origin=splats.origin,
         up=run.up(),
+        mip=splats.mode == "mip",
         depth=depth,
         near=NEAR * depth if fit is None else fit.near,
         exposures=None if fit is None else fit.exposures,
@@ -64,7 +80,7 @@ def write_html(source: ExportSource, path: Path, options: ExportOptions) -> str:
 
 
 def _groups(splats: Splats) -> Iterator[PageGroup]:
-    fitted = np.arange(len(splats)) < (splats.fitted or 0)
+    fitted = np.arange(len(splats)) < (len(splats) if splats.fitted is None else splats.fitted)
     keys = np.stack([splats.rounds, splats.generated, fitted], axis=1)
     for number, generated, whole in np.unique(keys, axis=0):
         chosen = (keys == (number, generated, whole)).all(axis=1)

@@ -89,6 +89,7 @@ class SharedPage:
     up: NDArray[np.float64]  # (3,) unit vector, world frame
     depth: float  # typical, scene units
     near: float  # nothing nearer is drawn, scene units
+    mip: bool = False  # whether the low-pass keeps a Gaussian's light, as files may ask for
     # Of the photographs, in the frame ``exposed_in``; None takes all as equal.
     exposures: Exposures | None = None
     exposed_in: LocalFrame | None = None
@@ -110,6 +111,7 @@ class SharedPage:
             "up": self.up.tolist(),
             "depth": self.depth,
             "near": self.near,
+            "mip": self.mip,
             "far": FARTHEST * self.depth,
             "rounds": self.rounds,
             "start": self.start.view(self.origin),

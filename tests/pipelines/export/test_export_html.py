@@ -112,6 +112,11 @@ def test_groups_tell_rounds_and_sources(fitted_run, bare_run, tmp_path):
         # Harmonics of fitted ones alone, with the photographs' exposures beside them.
         assert {(fitted, len(w)) for *_, fitted, w in groups} <= {(1, 4), (0, 2)}
         assert (data["exposures"] is not None) == (run is fitted_run)
+        export_run(run.folder, "splat", tmp_path / "splats.ply")
+        export_run(tmp_path / "splats.ply", "html", tmp_path / "of_file.html")
+        assert sum(words.shape[1] for *_, words in scene_of(tmp_path / "of_file.html")[1]) == len(
+            splats
+        )
         export_run(run.folder, "html", out, "--observed")
         assert not any(generated for _, generated, *_ in scene_of(out)[1])
 
