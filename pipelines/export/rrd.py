@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,6 +20,7 @@ from gvtools.errors import GvError
 from gvtools.files import replaced_when_written
 from gvtools.runs.layout import RECORD
 from gvtools.runs.run import load_run
+from gvtools.splats import TERMS
 from pipelines.export.formats import ExportOptions
 from pipelines.export.source import ExportSource
 
@@ -79,12 +80,41 @@ def write_rrd(source: ExportSource, path: Path, options: ExportOptions) -> str:
                         f"memory/{kind}/round_{number:03d}",
                         rerun.Points3D(positions, colors=points.colors[rows], radii=radii[rows]),
                     )
+        recording.set_time(TIMELINE, sequence=0)
+        _log_fit(recording, source, origin)
         for shot in _shots(source):
             _log(recording, shot, origin=origin, distance=DISTANCE * extent)
             shots += 1
         recording.flush()
         recording.disconnect()
     return f"{source.points_summary(points)} and {shots} cameras in {path}"
+
+
+def _log_fit(
+    recording: rerun.RecordingStream, source: ExportSource, origin: NDArray[np.float64]
+) -> None:
+    """The fitted Gaussians, where this version of rerun has them."""
+    import rerun
+
+    if source.appearance is None or not hasattr(rerun, "GaussianSplats3D"):
+        return
+    splats = source.splats(ExportOptions(observed=True))
+    one = replace(splats, values=splats.values[: splats.fitted])
+    colors = np.concatenate([one.colors, one.opacities[:, None]], axis=1)
+    # As many harmonics as degree 3 has, whatever is used.
+    above = np.zeros((len(one), TERMS[-1] - 1, 3), np.float32)
+    above[:, : one.harmonics.shape[1] - 1] = one.harmonics[:, 1:]
+    recording.log(
+        "fit",
+        rerun.GaussianSplats3D(
+            one.positions + (one.origin - origin),
+            scales=np.exp(one.log_scales),
+            quaternions=np.roll(one.quaternions, -1, axis=1),
+            colors=np.rint(255 * colors).astype(np.uint8),
+            sh_coefficients=above,
+            spherical_harmonics_degree=one.degree,
+        ),
+    )
 
 
 def _log(
