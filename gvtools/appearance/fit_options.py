@@ -36,6 +36,9 @@ class FitOptions(Settings):
     steps: int | None = Field(None, ge=0)
     """How many steps, where no time is given: the same result every time; 0 leaves the memory's own
     colours."""
+    init: str | None = None
+    """What the fit begins with instead of the project's points or depth: splats, such as another
+    program's or an earlier export, or a cloud of points. It is placed like a scan. [FILE]"""
     most_gaussians: int = Field(200_000, ge=1)
     """How many there may be, all fits of a run together; each ``gvtools refine`` may add as many
     again."""

@@ -30,13 +30,13 @@ OPTIONS = {
     )
 } | {
     "refine": "refine.seconds", "tune": "tune.minutes", "cloud": "scan.file",
-    "cloud_placement": "scan.placement", "lens": "lens.kind",
+    "cloud_placement": "scan.placement", "init": "refine.init", "lens": "lens.kind",
 }  # fmt: skip
 METAVARS = {
     "context": "SPEC", "targets": "SPEC|FILE", "depth": "SOURCE", "max_side": "PIXELS",
     "completer": "NAME", "profile": "NAME", "protocol": "NAME", "voxel": "EDGE",
     "refine": "SECONDS", "tune": "MINUTES", "cloud": "FILE", "cloud_placement": "MATRIX",
-    "lens": "NAME",
+    "init": "FILE", "lens": "NAME",
 }  # fmt: skip
 
 
@@ -148,8 +148,8 @@ def run_settings(
     config = with_file(config, file, presets=presets) if file else with_values(config, presets)
     own = {key: value for key, value in given.items() if key not in presets}
     # A run's record names files wherever it is resumed from.
-    for key in ("scan.file", "scan.placement"):
-        if key in own and (key == "scan.file" or Path(own[key]).is_file()):
+    for key in ("scan.file", "scan.placement", "refine.init"):
+        if key in own and (key != "scan.placement" or Path(own[key]).is_file()):
             own[key] = str(Path(own[key]).resolve())
     return with_texts(with_values(config, own), others)
 

@@ -50,6 +50,7 @@ from gvtools.scenes.resized import reduced
 from gvtools.scenes.scene import Frame, View
 from gvtools.untrusted import load_arrays
 from gvtools.view_selection import evenly_spread
+from pipelines.reconstruction.fit_start import given_start
 from pipelines.reconstruction.voxel import grid_frame
 
 if TYPE_CHECKING:
@@ -454,14 +455,20 @@ def _new_fit(
         frame = earlier.appearance.gaussians.frame
         options, seed = options.replaced(poses=False), seed + len(earlier.appearance.fits)
     views = fit_views(plan, frame, console, sweep=sweep)
+    given = None if earlier is not None else given_start(plan, frame, console)
     try:
         start = first_gaussians(plan, views, frame)
     except GvError as error:
-        console.warn(f"no Gaussians are fitted: {error}")
-        return None
+        if given is None:
+            console.warn(f"no Gaussians are fitted: {error}")
+            return None
+        start = given.gaussians
     surface = known_surface(start, views) if earlier is None else earlier.appearance.surface
+    if given is not None:
+        start = given.gaussians
     return Fit(
         start, views, options=options, seed=seed, surface=surface,
+        begin=CONTINUED if given is not None and given.fitted else 0.0,
         splatter=splatter_on(plan.config.device),
     )  # fmt: skip
 

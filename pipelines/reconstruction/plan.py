@@ -272,10 +272,11 @@ def run_identity(plan: Plan, reading: Mapping[str, Any]) -> dict[str, Any]:
     files += [file for view in targets.truth if view for file in view.files]
     cameras = (scene.subset(plan.context).cameras, targets.cameras)
     points = scene.points
+    init = [] if plan.config.refine.init is None else [Path(plan.config.refine.init)]
     return {
         "project": scene.address,
         "reading": dict(reading),
-        "fingerprint": fingerprint([*files, *targets.files, *plan.config.scan.files()]),
+        "fingerprint": fingerprint([*files, *targets.files, *plan.config.scan.files(), *init]),
         "cameras": array_digest(
             array for c in cameras for array in (c.K, c.cam_from_world, c.width, c.height)
         ),

@@ -28,6 +28,7 @@ from pipelines.reconstruction.voxel import grid_frame
 from pipelines.tuning.options import FEWEST_VIEWS
 
 if TYPE_CHECKING:
+    from gvtools.appearance.fit_options import FitOptions
     from gvtools.depth.source import DepthSource
     from gvtools.runs.context_depth import DepthCache
     from gvtools.runs.folder import RunDirectory
@@ -57,7 +58,8 @@ def make_plan(
     from gvtools.depth.choice import choose_source
     from gvtools.depth.source import RecordedDepth
 
-    check_scan(settings.scan)
+    check_scan(settings.scan, init=settings.refine.init)
+    check_start(settings.refine)
     config = _on_device(settings)
     _check(scene, config)
     scene = reduced(scene, config.max_side)
@@ -284,17 +286,32 @@ def saved_poses(round_0: Path, context: Sequence[str], targets: Cameras) -> RunP
 VIEWS, PIXELS = 40, 5000
 
 
-def check_scan(options: ScanOptions) -> None:
+def check_scan(options: ScanOptions, *, init: str | None = None) -> None:
     """Refuse a scan that cannot be read or placed before anything is computed."""
     from gvtools.scans.read import open_scan
     from gvtools.scans.registration import given_placement
 
     if options.file is None:
-        if options.placement != "estimate":
-            raise OptionError("scan.placement without a scan; expected --cloud FILE beside it")
-        return
-    open_scan(Path(options.file))
+        if options.placement != "estimate" and init is None:
+            raise OptionError(
+                "scan.placement without a scan; expected --cloud or --init FILE beside it"
+            )
+    else:
+        open_scan(Path(options.file))
     given_placement(options.placement)
+
+
+def check_start(options: FitOptions) -> None:
+    """Refuse a file to begin a fit with that cannot be read, or that no fit begins with."""
+    from gvtools.scans.read import open_scan
+    from gvtools.splat_files import holds_splats, read_splats
+
+    if options.init is None:
+        return
+    if not options.wanted:
+        raise OptionError("--init without a fit; leave it out, or give --refine some seconds")
+    path = Path(options.init)
+    read_splats(path) if holds_splats(path) else open_scan(path)
 
 
 def placed_scan(plan: Plan, console: Console) -> PlacedScan | None:

@@ -28,8 +28,9 @@ class ScanOptions(Settings):
     file: str | None = None
     """A PLY, LAS, LAZ, E57 or PCD; none starts from the photographs alone."""
     placement: str = "estimate"
-    """The similarity from the scan's frame to the photographs' world: estimate, identity, a text
-    file with a 3x4 or 4x4 matrix, or its numbers row by row with commas between."""
+    """The similarity from the frame of the scan, else of what the fit begins with, to the
+    photographs' world: estimate, identity, a text file with a 3x4 or 4x4 matrix, or its numbers
+    row by row with commas between."""
     min_fitness: float = Field(0.5, gt=0, le=1)
     """An estimated placement is refused if smaller shares of both the photographs' points and the
     scan's points have a point of the other beside them."""
