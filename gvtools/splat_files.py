@@ -323,7 +323,7 @@ def unpacked(path: Path, *, form: str) -> Iterator[Item]:
 
 def spz(path: Path, *, form: str) -> Iterator[Item]:
     """Rows of an SPZ, for ``read_apart``."""
-    import open3d as o3d
+    from gvtools.o3d import o3d
 
     o3d.utility.set_max_threads(1)
     o3d.utility.set_verbosity_level(o3d.utility.VerbosityLevel.Error)

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 from pydantic import Field
 
 from gvtools.errors import OptionError
-from gvtools.splat_files import holds_splats, read_splats
 from pipelines.commands.arguments import EMPTY
 from pipelines.export.formats import FORMATS, ExportFormat, ExportOptions, FormatName
 from pipelines.options import Arguments
@@ -46,6 +45,7 @@ class ExportCommand(Arguments, ExportOptions):
 
     def run(self, console: Console) -> None:
         from gvtools.runs.run import load_memory
+        from gvtools.splat_files import holds_splats
         from pipelines.export.source import ExportSource
 
         splats = holds_splats(self.memory) and not self.memory.is_dir()
@@ -101,6 +101,7 @@ class ExportCommand(Arguments, ExportOptions):
 
     def _convert(self, console: Console, form: ExportFormat) -> None:
         """Splats of a file in another format."""
+        from gvtools.splat_files import read_splats
         from pipelines.export.splats import write_file
 
         for name in ("max_points", "observed", "round"):

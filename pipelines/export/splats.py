@@ -139,7 +139,7 @@ def _by_gsply(splats: Splats, path: Path, version: int) -> bytes:
 
 
 def _write_by_open3d(splats: Splats, path: Path, options: ExportOptions) -> str:
-    import open3d as o3d
+    from gvtools.o3d import o3d
 
     parts = {
         "positions": splats.positions,

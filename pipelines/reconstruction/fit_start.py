@@ -13,19 +13,30 @@ from gvtools.appearance.gaussians import Gaussians
 from gvtools.appearance.population import from_points
 from gvtools.appearance.splat.project_kernels import VALUES
 from gvtools.errors import DegenerateError
-from gvtools.scans.registration import ESTIMATE, FEWEST, Surface, given_placement, register
+from gvtools.scans.registration import (
+    ESTIMATE,
+    FEWEST,
+    Placement,
+    Surface,
+    given_placement,
+    register,
+)
+from gvtools.scenes.matching import paired
 from gvtools.splat_files import holds_splats, read_splats
 from gvtools.splats import LOG_SCALE, LOGIT, QUATERNION, Splats, place_gaussians
+from gvtools.untrusted import read_json
 from pipelines.reconstruction.prepare import photographed
 
 if TYPE_CHECKING:
     from gvtools.memory.store.local_frame import LocalFrame
-    from gvtools.scans.registration import Placement
     from pipelines.console import Console
     from pipelines.reconstruction.plan import Plan
 
 # Gaussians of at least this opacity are surfaces, by which they are placed.
 OPAQUE = 0.5
+# Folders above a file in which its cameras are sought; how far they may be from the project's on
+# average: centres as a share of the extent, and turns.
+ABOVE, ALIKE = 3, 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +80,9 @@ def _placed(
     options = plan.config.scan
     if options.file is None and options.placement != ESTIMATE:
         return given_placement(options.placement)
+    if (placement := _by_cameras(path, plan)) is not None:
+        console.line(f"{path.name}: placement {placement.summary()}")
+        return placement
     try:
         known = photographed(plan)
     except DegenerateError:
@@ -88,6 +102,40 @@ def _placed(
         raise DegenerateError(f"{path}: {error} (--cloud-placement)") from None
     console.line(f"{path.name}: placement {placement.summary()}")
     return placement
+
+
+def _by_cameras(path: Path, plan: Plan) -> Placement | None:
+    """By the cameras that 3D Gaussian Splatting leaves above its splats.
+
+    None where no file tells them, or the project's are others.
+    """
+    files = [folder / "cameras.json" for folder in path.resolve().parents[:ABOVE]]
+    file = next((file for file in files if file.is_file()), None)
+    if file is None:
+        return None
+    try:
+        entries = read_json(file)
+        told = [np.column_stack([entry["rotation"], entry["position"]]) for entry in entries]
+        rows = paired([str(entry["img_name"]) for entry in entries], plan.scene.names)
+        theirs = np.array([told[row] for row, _ in rows], np.float64).reshape(-1, 3, 4)
+    except (KeyError, TypeError, ValueError):  # somebody else's file of that name
+        return None
+    mine = plan.scene.cameras.world_from_cam[[row for _, row in rows]]
+    if len(rows) < 2 or not np.isfinite(theirs).all():
+        return None
+    u, alike, vt = np.linalg.svd(
+        np.mean(mine[:, :3, :3] @ theirs[:, :, :3].transpose(0, 2, 1), axis=0)
+    )
+    middles = mine[:, :3, 3].mean(axis=0), theirs[:, :, 3].mean(axis=0)
+    moved, around = mine[:, :3, 3] - middles[0], (theirs[:, :, 3] - middles[1]) @ (u @ vt).T
+    scale = np.sqrt((moved**2).sum() / max((around**2).sum(), 1e-300))
+    off = np.linalg.norm(moved - scale * around, axis=1).mean()
+    if alike.min() < 1 - ALIKE or off > ALIKE * np.ptp(moved, axis=0).max():
+        return None
+    matrix = np.eye(4)
+    matrix[:3, :3] = scale * u @ vt
+    matrix[:3, 3] = middles[0] - matrix[:3, :3] @ middles[1]
+    return Placement(matrix, f"by {len(rows)} cameras of {file.name}")
 
 
 def _local(splats: Splats, placement: Placement | None, frame: LocalFrame) -> NDArray[np.float32]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 from command_line import refused
@@ -62,7 +64,8 @@ def saved(rows, path, move=None):
     values, origin = place_gaussians(rows, np.eye(4) if move is None else move)
     values = values.copy()
     values[:, :LOG_SCALE] += origin.astype(np.float32)
-    splats = Splats(values, np.zeros(3), None, 0, np.zeros(len(rows), np.int32))
+    none = np.zeros(len(rows), np.int32)
+    splats = Splats(values, np.zeros(3), None, 0, rounds=none, generated=none > 0)
     write_file(splats, path, ExportOptions())
     return path
 
@@ -87,6 +90,16 @@ def test_splats_lie_where_the_project_is(scan, rows, tmp_path):
     extent = np.ptp(a[:, :LOG_SCALE], axis=0).max()
     assert np.abs(a[:, :LOG_SCALE] - b[:, :LOG_SCALE]).max() < 1e-4 * extent
     assert np.abs(a[:, LOG_SCALE:QUATERNION] - b[:, LOG_SCALE:QUATERNION]).max() < 1e-4
+    cameras = planned(scan).scene.cameras
+    poses = move @ cameras.world_from_cam
+    told = [{"img_name": name.split(".")[0], "position": pose[:3, 3].tolist(),
+             "rotation": (pose[:3, :3] / 2.5).tolist()}
+            for name, pose in zip(cameras.names, poses, strict=True)]  # fmt: skip
+    inside = tmp_path / "point_cloud" / "iteration_30000"
+    inside.mkdir(parents=True)
+    (tmp_path / "cameras.json").write_text(json.dumps(told))
+    by_cameras = started(scan, file.rename(inside / "point_cloud.ply")).gaussians.values
+    np.testing.assert_allclose(by_cameras, b, atol=1e-4)
     np.testing.assert_allclose(a[:, LOGIT:], b[:, LOGIT:], atol=1e-4)
     frame = same.gaussians.frame
     world = frame.to_world(a[:, :LOG_SCALE])
