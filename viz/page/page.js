@@ -89,11 +89,10 @@ async function start() {
   stage.append(canvas);
   canvas.addEventListener("webglcontextlost", () => fail("The graphics card gave up; load again."));
   renderer = new library.WebGLRenderer({ canvas, context, ...plain });
-  const soft = scene.mip ? { preBlurAmount: 0, blurAmount: 0.3 } :
-    { preBlurAmount: 0.3, blurAmount: 0 };
+  const soft = { [scene.mip ? "blurAmount" : "preBlurAmount"]: 0.3 };
   spark = new library.SparkRenderer({
     renderer, onDirty: () => { dirty = true; }, accumExtSplats: true, enableLod: false, clipXY: 8,
-    sortRadial: false, minAlpha: LEAST, maxStdDev: REACH, maxPixelRadius: 8192, ...soft });
+    sortRadial: false, minAlpha: LEAST, maxStdDev: REACH, maxPixelRadius: 8192, blurAmount: 0, ...soft });
   drawAsTheRun(spark.material);
   // Sums of many faint colours need more than the 8 bits of a window.
   const deep = renderer.extensions.has("EXT_color_buffer_float") ||
