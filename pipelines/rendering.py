@@ -303,6 +303,9 @@ class FilmRenderer:
     def frame(self, index: int, panels: Sequence[str], *, captions: bool = False) -> Picture:
         """(H, W, 3) one frame, its panels side by side, each with its name or without."""
         pictures = [self._panel(index, panel) for panel in panels]
+        if self.rig is not None:
+            for picture in pictures:
+                picture[~self.rig.inside] = 0
         if captions:
             pictures = [captioned(*pair) for pair in zip(pictures, panels, strict=True)]
         return np.concatenate(pictures, axis=1)
@@ -310,11 +313,11 @@ class FilmRenderer:
     def _panel(self, index: int, panel: str) -> Picture:
         camera = self.cameras[index]
         if panel == "observed":
-            return self._shown(self._projected(self._observed, camera))
+            return picture_of(self._projected(self._observed, camera))
         if panel == "completed":
-            return self._shown(self._projected(self._completed, camera, fill=filled))
+            return picture_of(self._projected(self._completed, camera, fill=filled))
         guidance = self._projected(self.memory, camera)
-        return self._depth(guidance) if panel == "depth" else self._shown(guidance)
+        return self._depth(guidance) if panel == "depth" else picture_of(guidance)
 
     def _projected(
         self, memory: SpatialMemory, camera: Cameras, *,
@@ -326,14 +329,6 @@ class FilmRenderer:
         self.projecting += seconds
         return guidance
 
-    def _shown(self, guidance: Guidance) -> Picture:
-        return self._outside_black(picture_of(guidance))
-
-    def _outside_black(self, picture: Picture) -> Picture:
-        if self.rig is not None:
-            picture[~self.rig.inside] = 0
-        return picture
-
     def _depth(self, guidance: Guidance) -> Picture:
         from matplotlib import colormaps
 
@@ -343,7 +338,7 @@ class FilmRenderer:
         colors = colormaps["turbo"](np.clip(np.nan_to_num(share), 0, 1))[..., :3]
         picture = np.rint(255 * colors).astype(np.uint8)
         picture[~guidance.valid[0]] = 255
-        return self._outside_black(picture)
+        return picture
 
     @cached_property
     def _observed(self) -> SpatialMemory:

@@ -22,7 +22,7 @@ GPANO = (
     'xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#"><rdf:Description rdf:about="" '
     'xmlns:GPano="http://ns.google.com/photos/1.0/panorama/" GPano:UsePanoramaViewer="True" '
     'GPano:ProjectionType="equirectangular" GPano:StitchingSoftware="{tool}" '
-    'GPano:PoseHeadingDegrees="0" GPano:PosePitchDegrees="0" GPano:PoseRollDegrees="0" '
+    'GPano:PosePitchDegrees="0" GPano:PoseRollDegrees="0" '
     'GPano:FullPanoWidthPixels="{width}" GPano:FullPanoHeightPixels="{height}" '
     'GPano:CroppedAreaImageWidthPixels="{width}" GPano:CroppedAreaImageHeightPixels="{height}" '
     'GPano:CroppedAreaLeftPixels="0" GPano:CroppedAreaTopPixels="0"/></rdf:RDF></x:xmpmeta>'

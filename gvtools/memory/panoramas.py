@@ -23,10 +23,10 @@ from pydantic import Field
 from gvtools.cameras import Cameras, concatenate, invert_rigid
 from gvtools.guidance import IMAGES, Guidance
 from gvtools.scenes.faces import PANORAMA, Face, face_name, panorama_faces, picture_of
+from gvtools.scenes.undistort import camera_of
 from gvtools.settings import Settings
 from gvtools.trajectories import level_up, look_at
 
-Float64 = NDArray[np.float64]
 Float32 = NDArray[np.float32]
 
 # What a guidance holds that is no yes or no, beside colours.
@@ -77,9 +77,7 @@ class Rig:
         """The rig for pictures in the place of some cameras'; None for a perspective lens."""
         if options.kind == "perspective":
             return None
-        angle = 2 * math.pi
-        if options.kind == "fisheye":
-            angle = math.radians(options.field_of_view)
+        angle = math.radians(options.field_of_view if options.kind == "fisheye" else 360)
         fine = float(np.median(cameras.K[:, 0, 0])) * angle
         # Halves and videos' chroma are of whole pixels.
         width = int(options.width or min(max(fine, 16), widest)) // 4 * 4
@@ -193,13 +191,9 @@ def _rays(kind: str, size: tuple[int, int], angle: float) -> tuple[Float32, NDAr
 
 def _faces(focal: float) -> tuple[Face, ...]:
     """The faces of a picture with ``focal`` pixels per radian in its middle."""
-    from gvtools.colmap import pycolmap
-
     width = max(8, round(focal * math.pi) * 2)
-    camera = pycolmap.Camera(
-        model=PANORAMA, width=width, height=width // 2, params=[width, width // 2]
-    )
-    return panorama_faces(camera, degrees=FACE_DEGREES)
+    size = (width, width // 2)
+    return panorama_faces(camera_of(PANORAMA, size, size, what="a rig"), degrees=FACE_DEGREES)
 
 
 def _turned(rays: Float32, face: Face) -> Float32:
