@@ -39,6 +39,8 @@ from gvtools.scenes.matching import named
 from gvtools.scenes.scene import Finding
 
 if TYPE_CHECKING:
+    import pycolmap
+
     from gvtools.features import LightGlueMatcher
 
 REPORT = "capture.json"
@@ -55,12 +57,14 @@ class CaptureReport:
     pictures: int  # number of readable, different pictures
     registered: tuple[str, ...]  # names of those with a camera, in natural order
     left_out: dict[str, str]  # reason for each other picture, by name
-    reprojection_px: float  # mean reprojection error of the triangulated points, pixels
+    # Mean reprojection error of the triangulated points, pixels; None without any.
+    reprojection_px: float | None
     points: int  # number of triangulated points
     track_length: float  # mean number of pictures that a point is seen in
-    # Share of the verified matches that became points, 0 to 1; low for a wrong model.
-    explained: float
-    mapping: str  # "global" or "incremental"
+    # Share of the verified matches that became points, 0 to 1; low for a wrong model; None for
+    # poses that were given.
+    explained: float | None
+    mapping: str  # "global" or "incremental", or whose poses and how they were adjusted
     features: str  # "sift", "aliked" or "disk"
     matching: str  # how pairs were chosen, in words
     # Number of pictures of each further model, not connected to this one.
@@ -221,6 +225,19 @@ def _refuse_filled(out: Path) -> None:
         )
 
 
+def camera_rows(model: pycolmap.Reconstruction) -> tuple[dict[str, Any], ...]:
+    """Model, size and parameters of each camera."""
+    return tuple(
+        {
+            "model": camera.model.name,
+            "width": camera.width,
+            "height": camera.height,
+            "params": [float(value) for value in camera.params],
+        }
+        for camera in model.cameras.values()
+    )
+
+
 def _report(
     source: Path,
     photographs: Sequence[CapturedPhotograph],
@@ -268,15 +285,7 @@ def _report(
         matching=mapped.matching,
         other_models=tuple(len(names) for names in mapped.others),
         overlap=tuple((a, b, count) for (a, b), count in sorted(mapped.pairs.items())),
-        cameras=tuple(
-            {
-                "model": camera.model.name,
-                "width": camera.width,
-                "height": camera.height,
-                "params": [float(value) for value in camera.params],
-            }
-            for camera in model.cameras.values()
-        ),
+        cameras=camera_rows(model),
         metric=placement.metric,
         placed_by=placement.by,
         origin=placement.origin,

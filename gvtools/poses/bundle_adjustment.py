@@ -55,6 +55,8 @@ EXACT = 1.0
 MOST_POINTS = 20_000
 # Poses are taken where they lower the median error to this share.
 MAX_ERROR_RATIO = 0.7
+# Focal lengths that features change by more [log] are not told by them.
+MAX_FOCAL_CHANGE = 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,6 +168,21 @@ def adjusted_poses(
     return _place(poses, found, cameras, well_observed=well_observed, errors=errors)
 
 
+def refine_focals(cameras: Cameras, tracks: Tracks) -> tuple[Cameras, Tracks]:
+    """Adjust focal lengths as well, one of all cameras of equal K, where features tell them."""
+    with quiet_colmap(errors=False):
+        model = _model(cameras, tracks)
+        options = _options()
+        options.refine_focal_length = True
+        adjust(model, options)
+        poses, found = _poses_and_tracks(model, cameras)
+    lenses = [model.cameras[model.images[row + 1].camera_id] for row in range(len(poses))]
+    K = np.array([lens.calibration_matrix() for lens in lenses])
+    if np.abs(np.log(K[:, 0, 0] / cameras.K[:, 0, 0])).max() > MAX_FOCAL_CHANGE:
+        return cameras, tracks
+    return replace(cameras, K=K, cam_from_world=poses), found
+
+
 def can_adjust(cameras: Cameras, tracks: Tracks | None) -> bool:
     """Whether there are enough views, not too many to find features in, and none with skew."""
     enough = len(cameras) >= 2 and (tracks is not None or len(cameras) <= MOST_VIEWS)
@@ -272,17 +289,25 @@ def _solve(model: pycolmap.Reconstruction, error: float | None) -> None:
     """Adjust poses and points, then drop points beyond ``error`` px; None: points alone move."""
     from gvtools.colmap import pycolmap
 
+    options = _options()
+    options.refine_rig_from_world = error is not None
+    adjust(model, options)
+    if error is not None:
+        pycolmap.ObservationManager(model).filter_all_points3D(error, 0.0)
+
+
+def _options() -> pycolmap.BundleAdjustmentOptions:
+    """Intrinsics stay as they are."""
+    from gvtools.colmap import pycolmap
+
     options = pycolmap.BundleAdjustmentOptions()
     fix_cameras(options)
     options.refine_principal_point = False
-    options.refine_rig_from_world = error is not None
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     # In any order of threads sums differ in their last digits.
     options.ceres.solver_options.num_threads = 1
     options.ceres.solver_options.max_num_iterations = 30
-    adjust(model, options)
-    if error is not None:
-        pycolmap.ObservationManager(model).filter_all_points3D(error, 0.0)
+    return options
 
 
 def _poses_and_tracks(model: pycolmap.Reconstruction, cameras: Cameras) -> tuple[Float64, Tracks]:

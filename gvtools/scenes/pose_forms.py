@@ -68,7 +68,7 @@ class _Pair:
     views: tuple[int, int]
     xy: tuple[Float64, Float64]  # (M, 2) each
 
-    def share(self, K: Float64, poses: Float64, *, scale: Float64) -> float:
+    def share(self, K: Float64, poses: Float64, *, scale: Float64, near: float) -> float:
         """How many of the matches lie on epipolar lines."""
         a, b = self.views
         change = poses[1] @ np.linalg.inv(poses[0])
@@ -79,18 +79,38 @@ class _Pair:
         lines, back = first @ F.T, second @ F
         off = np.abs((second * lines).sum(1))
         far = off / np.maximum(np.minimum(*(np.hypot(*r.T[:2]) for r in (lines, back))), 1e-12)
-        return float((far * scale[b] < NEAR).mean())
+        return float((far * scale[b] < near).mean())
+
+
+@dataclass(frozen=True, eq=False)
+class PoseContradiction:
+    """How photographs contradict poses, and which form of them they confirm."""
+
+    message: str
+    form: Callable[[Float64], Float64] | None  # changes a pose to what fits; None where none does
 
 
 def pose_findings(
     scene: Scene, names: Sequence[str] | None = None, *, most_pairs: int = PAIRS
 ) -> list[Finding]:
     """A warning where the photographs of a scene without tracks contradict its poses."""
+    found = pose_contradiction(scene, names, most_pairs=most_pairs)
+    return [] if found is None else [Finding("warning", found.message)]
+
+
+def pose_contradiction(
+    scene: Scene, names: Sequence[str] | None = None, *, most_pairs: int = PAIRS, near: float = NEAR
+) -> PoseContradiction | None:
+    """How the photographs of a scene without tracks contradict its poses; None where they don't.
+
+    Points that one view shows alone, as networks save them, tell nothing of poses.
+    """
     chosen = [
         number for number, view in enumerate(scene.views) if names is None or view.name in names
     ]
-    if len(chosen) < 2 or (scene.points is not None and len(scene.points.point_index)):
-        return []
+    tracks = scene.points is not None and np.bincount(scene.points.point_index, minlength=1)
+    if len(chosen) < 2 or np.max(tracks) > 1:
+        return None
     cameras = scene.cameras
     scale = np.minimum(SIDE / np.maximum(cameras.width, cameras.height), 1)
     pairs = _pairs(scene, chosen, scale, most_pairs=most_pairs)
@@ -99,23 +119,24 @@ def pose_findings(
     def shares(form: Callable[[Float64], Float64] = np.asarray) -> list[float]:
         changed = [np.array([form(poses[view]) for view in pair.views]) for pair in pairs]
         return [
-            pair.share(cameras.K, both, scale=scale)
+            pair.share(cameras.K, both, scale=scale, near=near)
             for pair, both in zip(pairs, changed, strict=True)
         ]
 
     found = shares()
     if sum(len(pair.xy[0]) for pair in pairs) < JUDGED or np.median(found) >= WRONG:
-        return []
+        return None
     tried = {reason: float(np.median(shares(form))) for reason, form in FORMS.items()}
     best = max(tried, key=lambda reason: tried[reason])
-    reason = f"; {best}: then it is {tried[best]:.0%}" if tried[best] > RIGHT else ""
+    fits = tried[best] > RIGHT
+    reason = f"; {best}: then it is {tried[best]:.0%}" if fits else ""
     first, second = (scene.views[view].name for view in pairs[0].views)
     line = (
         f"poses or intrinsics do not fit the photographs: {np.median(found):.0%} of the matches of "
         f"{len(pairs)} pairs (first {first} and {second}) lie where the cameras allow, expected "
         f"more than {WRONG:.0%}{reason}"
     )
-    return [Finding("warning", line)]
+    return PoseContradiction(line, FORMS[best] if fits else None)
 
 
 def _pairs(scene: Scene, chosen: Sequence[int], scale: Float64, *, most_pairs: int) -> list[_Pair]:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 # The picture of the cameras, in the project.
 PICTURE = "capture.png"
 # Options of photographs and videos.
-PHOTOGRAPHIC = ("frames", "masks", "distance", "features", "weights", "lens")
+PHOTOGRAPHIC = ("frames", "masks", "distance", "features", "weights", "lens", "poses")
 
 
 def _distance(text: Any) -> Any:
@@ -46,6 +46,7 @@ class CaptureCommand(RecordingArguments):
         "gvtools capture walk.mp4 --frames 80 --out walk",
         "gvtools capture photos/room --distance IMG_01.jpg,IMG_09.jpg,2.4 --out room",
         "gvtools capture panoramas/hall --out hall",
+        "gvtools capture photos/room --poses vggt/predictions.npz --out room",
         "gvtools capture recordings/kitchen --color-intrinsics 525,525,319.5,239.5 --out kitchen",
     )
     positional = ("input",)
@@ -67,6 +68,9 @@ class CaptureCommand(RecordingArguments):
     [FEATURES LIGHTGLUE]"""
     lens: Literal["auto", "perspective", "equirectangular", "fisheye"] | None = None
     """Of the pictures (auto: recognised from them); panoramas are cut into faces."""
+    poses: Path | None = None
+    """What VGGT, Depth Anything 3, MapAnything, DUSt3R or MASt3R saved for the photographs: .npz,
+    .npy or a COLMAP model, refined where features match. [FILE|DIR]"""
 
     def run(self, console: Console) -> None:
         given = {
@@ -113,6 +117,15 @@ def capture(
         raise ProjectError(
             f"{source}: has poses and depth already; give it to gvtools reconstruct as it is"
         )
+    elif "poses" in options:
+        from gvtools.capture.posed_photographs import capture_posed
+
+        for name in sorted(set(options) - {"poses", "distance"}):
+            raise OptionError(f"--{name}: of captures that find the poses; leave it or --poses out")
+        report = capture_posed(
+            source, out, say=console.line, draw=partial(_draw, title=out.name), **options
+        )
+        _print(report, console)
     else:
         from gvtools.capture.project import capture_photographs
 
@@ -226,11 +239,11 @@ def _print(report: CaptureReport, console: Console) -> None:
     unit = "metres" if report.metric else "no known unit"
     rows = [
         ("registered pictures", f"{len(report.registered)} of {report.pictures}"),
-        ("reprojection error, pixels", f"{report.reprojection_px:.3f}"),
+        ("reprojection error, pixels", _figure(report.reprojection_px, ".3f")),
         ("points", report.points),
         ("pictures that see a point, mean", f"{report.track_length:.1f}"),
         ("pairs that overlap", len(report.overlap)),
-        ("matches that became points", f"{report.explained:.0%}"),
+        ("matches that became points", _figure(report.explained, ".0%")),
         ("features", report.features),
         ("matched", report.matching),
         ("mapping", report.mapping),
@@ -238,6 +251,10 @@ def _print(report: CaptureReport, console: Console) -> None:
         ("unit", f"{unit}; placed by {report.placed_by}, z is up"),
     ]
     _print_table(report, rows, console)
+
+
+def _figure(value: float | None, form: str) -> str:
+    return "not known" if value is None else format(value, form)
 
 
 def _print_rgbd(report: RgbdCaptureReport, console: Console) -> None:

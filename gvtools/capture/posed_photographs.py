@@ -1,0 +1,327 @@
+"""From photographs, and what a network saved of their cameras and points, to a COLMAP project.
+
+What the network saw, resized, cut or padded, is reconciled with the photographs. Where these show
+that the poses are of another form, they are set right; where features match, a bundle adjustment
+refines them, and the network's points move with the cameras that see them.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, replace
+from itertools import combinations
+from pathlib import Path, PurePosixPath
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gvtools.cameras import Cameras
+from gvtools.capture.matching import Say
+from gvtools.capture.photographs import CapturedPhotograph, copy_upright, find_photographs
+from gvtools.capture.placement import place
+from gvtools.capture.predictions import Predictions, read_predictions
+from gvtools.capture.project import (
+    IMAGES,
+    MODEL,
+    REPORT,
+    CaptureReport,
+    camera_rows,
+    replaced_folder,
+)
+from gvtools.errors import OptionError, ProjectError
+from gvtools.files import write_json
+from gvtools.poses.bundle_adjustment import MOST_VIEWS, Tracks, adjusted_poses, refine_focals
+from gvtools.scenes.colmap import read_colmap
+from gvtools.scenes.colmap_writer import build_reconstruction, write_colmap
+from gvtools.scenes.images import read_image
+from gvtools.scenes.matching import is_hidden, named
+from gvtools.scenes.pose_forms import pose_contradiction, pose_findings
+from gvtools.scenes.project import PICTURES
+from gvtools.scenes.resized import reduced
+from gvtools.scenes.scene import Finding, Scene
+
+Float64 = NDArray[np.float64]
+Size = tuple[int, int]  # width and height [px]
+
+# Longer side of the pictures in which features are found for the adjustment [px].
+SIDE = 800
+# Networks round sides to patches of 14 or 16 [px].
+PATCH, LARGEST_PATCH = 14, 16
+# The network's pictures differ by less from the photographs that they show [grey levels], of which
+# so many are looked at.
+SAME, COMPARED = 25.0, 6
+# Focal lengths of one camera's pictures that spread by less than this share are taken for one.
+ONE_FOCAL = 0.2
+# Poses of a network miss by so much: matches lie on their lines below it [px of a small picture].
+NEAR = 8.0
+# How photographs become a network's pictures; "width" and "height" scale that side to its own and
+# round the other to patches, and what is too large or too small is cut or padded at the middle.
+FITS = ("stretch", "cover", "contain", "width", "height")
+
+
+def capture_posed(
+    source: Path,
+    out: Path,
+    *,
+    poses: Path,
+    distance: tuple[str, str, float] | None = None,
+    say: Say = lambda text: None,
+    draw: Callable[[Path, CaptureReport], object] = lambda folder, report: None,
+) -> CaptureReport:
+    """Write a project of photographs and what a network saved of them.
+
+    Args:
+        source: folder of the photographs that the network saw.
+        out: the project's folder; absent or empty.
+        poses: what the network saved, a file or a folder; see ``predictions``.
+        distance: names of two pictures and the distance between their places, metres.
+        draw: adds pictures to the project's folder before it gets its name.
+    """
+    if not source.is_dir():
+        raise OptionError(f"--poses: {source} is no folder; expected the pictures the network saw")
+    predictions = read_predictions(poses)
+    with replaced_folder(out) as work:
+        photographs, findings = find_photographs(source)
+        sideways = [item.name for item in photographs if item.turned]
+        if sideways:
+            raise ProjectError(
+                f"{source}: {len(sideways)} photographs are stored on their side "
+                f"({named(sideways)}), which some networks heed and some do not; save them upright "
+                "and run the network on these"
+            )
+        rows, met = _rows(predictions, photographs, source=source, poses=poses)
+        kept = [item for item in photographs if item.name in rows]
+        copy_upright(kept, work / IMAGES)
+        given = predictions.cameras[[rows[item.name] for item in kept]]
+        scaled = _scaled_sizes(predictions, kept, given, rows=rows, poses=poses)
+        cameras = _pooled(_reconciled(kept, given, scaled), kept)
+        say(f"comparing the poses with {len(kept)} photographs")
+        cameras, scene, forms = _right_form(cameras, work)
+        say("adjusting the poses to features of neighbouring pictures")
+        adjusted, tracks, how = _adjusted(cameras, scene)
+        # What is left once features had their say.
+        forms += [] if len(tracks.point) else pose_findings(scene)
+        view, xy, points = _seen_points(predictions, cameras, adjusted, scaled=scaled, rows=rows)
+        both = np.concatenate([tracks.view, view]), np.concatenate([tracks.xy, xy])
+        point = np.concatenate([tracks.point, len(tracks.positions) + np.arange(len(view))])
+        _, first = np.unique(point, return_index=True)
+        model = build_reconstruction(
+            adjusted, np.concatenate([tracks.positions, points]),
+            _colors(scene, both[0][first], both[1][first]),
+            point_index=point, view_index=both[0], xy=both[1],
+        )  # fmt: skip
+        locations = {item.name: item.location for item in kept if item.location}
+        placement, placed = place(model, locations=locations, distance=distance)
+        shutil.rmtree(work / MODEL)
+        (work / MODEL).mkdir(parents=True)
+        model.write_binary(str(work / MODEL))
+        errors = tracks.reprojection_errors(adjusted, adjusted.cam_from_world)
+        report = CaptureReport(
+            source=str(source.resolve()),
+            pictures=len(photographs),
+            registered=adjusted.names,
+            left_out={i.name: f"no camera in {poses}" for i in photographs if i not in kept},
+            reprojection_px=float(errors.mean()) if len(errors) else None,
+            points=len(model.points3D),
+            track_length=len(point) / max(len(first), 1),
+            explained=None,
+            mapping=f"{poses.name}, {how}",
+            features="sift",
+            matching="neighbours by their poses",
+            other_models=(),
+            overlap=_overlap(tracks, adjusted.names),
+            cameras=camera_rows(model),
+            metric=placement.metric,
+            placed_by=placement.by,
+            origin=placement.origin,
+            findings=(*findings, *met, *forms, *placed),
+        )
+        write_json(work / REPORT, asdict(report))
+        draw(work, report)
+    return report
+
+
+def _rows(
+    predictions: Predictions, photographs: Sequence[CapturedPhotograph], *, source: Path,
+    poses: Path,
+) -> tuple[dict[str, int], list[Finding]]:  # fmt: skip
+    """The network's camera of each photograph: that of its name, or of its place in the folder."""
+    count, there = len(predictions.cameras), [item.name for item in photographs]
+    if not predictions.has_names:
+        names = [path.relative_to(source).as_posix() for path in source.rglob("*")]
+        # As networks list folders: by names as text.
+        order = sorted(
+            name for name in names
+            if PurePosixPath(name).suffix.lower() in PICTURES and not is_hidden(name)
+        )  # fmt: skip
+        if len(order) != count:
+            raise ProjectError(
+                f"--poses {poses}: {count} cameras without names, and {source} holds {len(order)} "
+                "pictures; expected one camera for each; give the folder that the network saw"
+            )
+        text = f"{poses} names no pictures: its cameras are those of {named(order)}, in this order"
+        rows = {name: row for row, name in enumerate(order) if name in there}
+        return rows, [Finding("info", text)]
+    for part in ("name", "stem"):
+        own = Counter(getattr(PurePosixPath(name), part) for name in there)
+        told = {getattr(PurePosixPath(n), part): r for r, n in enumerate(predictions.cameras.names)}
+        keys = {name: getattr(PurePosixPath(name), part) for name in there}
+        rows = {name: told[key] for name, key in keys.items() if key in told and own[key] == 1}
+        if len(rows) > 1:
+            text = (
+                f"{count - len(rows)} of {count} cameras of {poses} are of no picture of {source}"
+            )
+            return rows, [Finding("warning", text)] if count > len(rows) else []
+    raise ProjectError(
+        f"--poses {poses}: cameras of {named(predictions.cameras.names)}; expected names of "
+        f"pictures of {source}, as {named(there)}"
+    )
+
+
+def _scaled(fit: str, photo: Size, net: Size) -> tuple[float, float]:
+    """Width and height of a whole photograph in the pixels of what the network saw of it."""
+    (width, height), (w, h) = photo, net
+    if fit == "stretch":
+        return w, h
+    if fit == "width":
+        return w, max(PATCH, round(height * w / width / PATCH) * PATCH)
+    if fit == "height":
+        return max(PATCH, round(width * h / height / PATCH) * PATCH), h
+    scale = (max if fit == "cover" else min)(w / width, h / height)
+    return width * scale, height * scale
+
+
+def _difference(rgb: NDArray[np.uint8], shown: NDArray[np.uint8], fit: str) -> float:
+    """By how much a network's picture differs from a photograph under a fit [grey levels]."""
+    net = shown.shape[1], shown.shape[0]
+    scale = np.array(_scaled(fit, (rgb.shape[1], rgb.shape[0]), net)) / rgb.shape[1::-1]
+    shift = (np.array(net) - scale * rgb.shape[1::-1]) / 2 + scale / 2 - 0.5
+    small = cv2.blur(rgb, [max(1, round(1 / side)) for side in scale])
+    matrix = np.column_stack([np.diag(scale), shift])
+    # What a fit pads is white or black in the network's picture.
+    black, white = (
+        cv2.absdiff(cv2.warpAffine(small, matrix, net, borderValue=(tone,) * 3), shown)
+        for tone in (0, 255)
+    )
+    return float(np.minimum(black, white).mean())
+
+
+def _scaled_sizes(
+    predictions: Predictions, items: Sequence[CapturedPhotograph], given: Cameras, *,
+    rows: dict[str, int], poses: Path,
+) -> Float64:  # fmt: skip
+    """(V, 2) sizes of whole photographs in the network's pixels, by its pictures or by sizes."""
+    nets: list[Size] = list(zip(given.width.tolist(), given.height.tolist(), strict=True))
+    near = all(
+        abs(w / item.size[0] * item.size[1] - h) < LARGEST_PATCH
+        for item, (w, h) in zip(items, nets, strict=True)
+    )
+    fit = FITS[0] if near and predictions.stretched else FITS[1]
+    if predictions.pictures is not None:
+        looked = [items[at] for at in np.unique(np.linspace(0, len(items) - 1, COMPARED).round(0))
+                  .astype(int)]  # fmt: skip
+        pairs = [(read_image(i.path).rgb, predictions.pictures[rows[i.name]]) for i in looked]
+        errors = {fit: np.median([_difference(*pair, fit) for pair in pairs]) for fit in FITS}
+        fit = min(FITS, key=lambda fit: errors[fit])
+        if errors[fit] > SAME:
+            raise ProjectError(
+                f"--poses {poses}: its pictures differ from the photographs by {errors[fit]:.0f} "
+                f"grey levels, expected at most {SAME:.0f}; give the folder that the network saw"
+            )
+    return np.array([_scaled(fit, i.size, net) for i, net in zip(items, nets, strict=True)])
+
+
+def _reconciled(items: Sequence[CapturedPhotograph], given: Cameras, scaled: Float64) -> Cameras:
+    """The cameras of the photographs themselves."""
+    photo, K = np.array([item.size for item in items]), given.K.copy()
+    K[:, :2, 2] -= (np.column_stack([given.width, given.height]) - scaled) / 2
+    K[:, :2] *= (photo / scaled)[..., None]
+    names = tuple(item.name for item in items)
+    return Cameras(K, given.cam_from_world, photo[:, 0], photo[:, 1], names)
+
+
+def _pooled(cameras: Cameras, items: Sequence[CapturedPhotograph]) -> Cameras:
+    """One K, the median, for the pictures of one camera, where the network's agree."""
+    K = cameras.K.copy()
+    for camera in {item.camera for item in items}:
+        mine = [row for row, item in enumerate(items) if item.camera == camera]
+        if np.ptp(K[mine, 0, 0]) <= ONE_FOCAL * np.median(K[mine, 0, 0]):
+            K[mine] = np.median(K[mine], axis=0)
+    return replace(cameras, K=K)
+
+
+def _right_form(cameras: Cameras, work: Path) -> tuple[Cameras, Scene, list[Finding]]:
+    """The cameras with poses of the form that the photographs confirm, and their scene."""
+    write_colmap(work / MODEL, cameras)
+    scene = read_colmap(work)
+    found = pose_contradiction(scene, near=NEAR)
+    if found is None or found.form is None:
+        return cameras, scene, []
+    poses = np.stack([found.form(pose) for pose in cameras.cam_from_world])
+    cameras = replace(cameras, cam_from_world=poses)
+    write_colmap(work / MODEL, cameras)
+    return cameras, read_colmap(work), [Finding("warning", f"{found.message}: done")]
+
+
+def _adjusted(cameras: Cameras, scene: Scene) -> tuple[Cameras, Tracks, str]:
+    """Cameras on which features agree, their tracks [px of the photographs], and how, in words."""
+    none = np.zeros(0, np.int64)
+    nothing = Tracks(np.zeros((0, 3)), none, none, np.zeros((0, 2)))
+    if len(scene) > MOST_VIEWS:
+        return cameras, nothing, f"as saved: more than {MOST_VIEWS} pictures are not adjusted"
+    small = reduced(scene, SIDE)
+    found = adjusted_poses([view.load() for view in small.views], small.cameras)
+    if found is None:
+        return cameras, nothing, "as saved: features tell no better poses"
+    scale = np.column_stack([
+        cameras.width / small.cameras.width, cameras.height / small.cameras.height
+    ])  # fmt: skip
+    tracks = replace(found.tracks, xy=found.tracks.xy * scale[found.tracks.view])
+    after, tracks = refine_focals(replace(cameras, cam_from_world=found.poses), tracks)
+    before, now = found.errors
+    return after, tracks, f"bundle-adjusted: median error {before:.2f} to {now:.2f} px"
+
+
+def _seen_points(
+    predictions: Predictions, cameras: Cameras, adjusted: Cameras, *, scaled: Float64,
+    rows: dict[str, int],
+) -> tuple[NDArray[np.int64], Float64, Float64]:  # fmt: skip
+    """Of the network's points the view, the place in it [px], and that in the adjusted world."""
+    number = np.full(len(predictions.cameras), -1)
+    number[[rows[name] for name in cameras.names]] = np.arange(len(cameras))
+    view, photo = number[predictions.view], np.column_stack([cameras.width, cameras.height])
+    net = np.column_stack([predictions.cameras.width, predictions.cameras.height])
+    middle = predictions.xy - net[predictions.view] / 2
+    xy = (middle / scaled[view] + 0.5) * photo[view]
+    z = predictions.points
+    if z.ndim > 1:
+        pose = cameras.cam_from_world[view]
+        z = np.einsum("mj,mj->m", pose[:, 2, :3], z) + pose[:, 2, 3]
+    use = (view >= 0) & (xy >= 0).all(axis=1) & (xy < photo[view]).all(axis=1) & (z > 0)
+    view, xy, z = view[use], xy[use], z[use]
+    rays = np.column_stack([xy, np.ones(len(xy))])
+    rays = np.einsum("mij,mj->mi", np.linalg.inv(adjusted.K)[view], rays) * z[:, None]
+    back = adjusted.world_from_cam[view]
+    return view, xy, np.einsum("mij,mj->mi", back[:, :3, :3], rays) + back[:, :3, 3]
+
+
+def _overlap(tracks: Tracks, names: Sequence[str]) -> tuple[tuple[str, str, int], ...]:
+    """Pairs of pictures that see common points, and how many."""
+    views: dict[int, set[int]] = {}
+    for point, view in zip(tracks.point.tolist(), tracks.view.tolist(), strict=True):
+        views.setdefault(point, set()).add(view)
+    pairs = Counter(pair for seen in views.values() for pair in combinations(sorted(seen), 2))
+    return tuple((names[a], names[b], count) for (a, b), count in sorted(pairs.items()))
+
+
+def _colors(scene: Scene, view: NDArray[np.int64], xy: Float64) -> NDArray[np.uint8]:
+    """(M, 3) colours of places in views."""
+    colors = np.zeros((len(view), 3), np.uint8)
+    for row in np.unique(view):
+        rgb, mine = scene.views[row].load().rgb, view == row
+        x, y = xy[mine].astype(int).T
+        colors[mine] = rgb[y.clip(0, rgb.shape[0] - 1), x.clip(0, rgb.shape[1] - 1)]
+    return colors

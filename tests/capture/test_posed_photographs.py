@@ -1,0 +1,220 @@
+"""``gvtools capture --poses``: what networks save, in miniatures by a room's true cameras."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+from command_line import refused, run_command
+from scipy.spatial.transform import Rotation
+from walls import write_project
+
+from gvtools.cameras import Cameras
+from gvtools.capture.posed_photographs import capture_posed
+from gvtools.scenes.colmap_writer import write_colmap
+from gvtools.scenes.pose_forms import pose_findings
+from gvtools.scenes.project import open_project
+from gvtools.similarity import align_poses
+
+pytestmark = pytest.mark.usefixtures("unpainted")
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+@pytest.fixture(scope="module")
+def room(wall_walk, tmp_path_factory):
+    """Six photographs."""
+    return write_project(tmp_path_factory.mktemp("posed") / "room", wall_walk[:6]).parent
+
+
+@pytest.fixture(scope="module")
+def truth(room):
+    """The room's true cameras and pictures."""
+    scene = open_project(room / "transforms.json")
+    return scene.cameras, [view.load().rgb for view in scene.views]
+
+
+@pytest.fixture(scope="module")
+def depths(wall_walk):
+    return [picture.depth for picture in wall_walk[:6]]
+
+
+def shrunk(array, scaled, net):
+    """Resized to one size, then cut at the middle to another."""
+    small = cv2.resize(array, scaled, interpolation=cv2.INTER_AREA)
+    left, top = ((a - b) // 2 for a, b in zip(scaled, net, strict=True))
+    return small[top : top + net[1], left : left + net[0]]
+
+
+def miniature(truth, depths, scaled, net):
+    """(V, ...) pictures, depth, K and poses of a network that sees the photographs so."""
+    cameras, pictures = truth
+    left, top = ((a - b) // 2 for a, b in zip(scaled, net, strict=True))
+    own = cameras.resized(*scaled).cropped(left, top, width=net[0], height=net[1])
+    images = np.stack([shrunk(rgb, scaled, net) for rgb in pictures])
+    return images, np.stack([shrunk(z, scaled, net) for z in depths]), own
+
+
+def noisy(poses):
+    """Turned by half a degree or so."""
+    turns = np.random.default_rng(3).normal(size=(len(poses), 3)) * np.deg2rad(0.4)
+    changed = poses.copy()
+    changed[:, :3] = Rotation.from_rotvec(turns).as_matrix() @ changed[:, :3]
+    return changed
+
+
+def world_points(own, depth):
+    rays = [own.rays(row) * depth[row][..., None] for row in range(len(own))]
+    return np.stack([
+        ray @ pose[:3, :3].T + pose[:3, 3]
+        for ray, pose in zip(rays, own.world_from_cam, strict=True)
+    ])  # fmt: skip
+
+
+def vggt(folder, truth, depths):
+    images, depth, own = miniature(truth, depths, (126, 98), (126, 98))
+    arrays = {
+        "pose_enc": np.zeros((len(own), 9), np.float32),
+        "depth": depth[..., None].astype(np.float32),
+        "depth_conf": np.ones(depth.shape, np.float32),
+        "world_points": world_points(own, depth).astype(np.float32),
+        "world_points_conf": np.ones(depth.shape, np.float32),
+        "images": images.transpose(0, 3, 1, 2).astype(np.float32) / 255,
+        "extrinsic": noisy(own.cam_from_world)[:, :3].astype(np.float32),
+        "intrinsic": own.K.astype(np.float32),
+        "pose_enc_list": np.array(None, dtype=object),
+    }
+    np.savez(folder / "predictions.npz", **arrays)
+    return folder / "predictions.npz"
+
+
+def depth_anything(folder, truth, depths):
+    """Without pictures: sizes alone tell how the photographs were reduced."""
+    _, depth, own = miniature(truth, depths, (126, 98), (126, 98))
+    (folder / "exports/mini_npz").mkdir(parents=True)
+    np.savez_compressed(
+        folder / "exports/mini_npz/results.npz", depth=depth, conf=np.ones(depth.shape),
+        extrinsics=own.cam_from_world[:, :3], intrinsics=own.K,
+    )  # fmt: skip
+    return folder
+
+
+def mapanything(folder, truth, depths):
+    """Resized and cut; poses map to the world."""
+    images, depth, own = miniature(truth, depths, (150, 112), (126, 112))
+    np.savez(
+        folder / "predictions.npz", extrinsic=own.world_from_cam, intrinsic=own.K,
+        world_points=world_points(own, depth), conf=np.ones(depth.shape),
+        depth=depth[..., None], images=images / np.float32(255),
+        final_mask=np.ones(depth.shape, bool),
+    )  # fmt: skip
+    return folder / "predictions.npz"
+
+
+def dust3r(folder, truth, depths):
+    """Loose arrays, points in the world, one focal length of a picture that is cut."""
+    images, depth, own = miniature(truth, depths, (160, 120), (160, 112))
+    arrays = {
+        "poses": own.world_from_cam, "focals": own.K[:, 0, 0], "imgs": images / np.float32(255),
+        "pts3d": world_points(own, depth), "conf": np.ones(depth.shape),
+    }  # fmt: skip
+    for name, array in arrays.items():
+        np.save(folder / f"{name}.npy", array)
+    return folder
+
+
+def opengl(folder, truth, depths):
+    """Another convention than the names say."""
+    _, depth, own = miniature(truth, depths, (126, 98), (126, 98))
+    np.savez(
+        folder / "own.npz", extrinsics=own.world_from_cam @ FLIP, intrinsics=own.K, depth=depth
+    )
+    return folder / "own.npz"
+
+
+def colmap(folder, truth, depths):
+    """demo_colmap.py of VGGT: points that one picture sees each."""
+    cameras, _ = truth
+    points = world_points(cameras, np.stack(depths))[:, ::8, ::8]
+    count = points.shape[1] * points.shape[2]
+    y, x = np.mgrid[:120:8, :160:8] + 0.5
+    write_colmap(
+        folder / "sparse", cameras, points=points.reshape(-1, 3),
+        point_index=np.arange(count * len(cameras)),
+        view_index=np.repeat(np.arange(len(cameras)), count),
+        xy=np.tile(np.column_stack([x.ravel(), y.ravel()]), (len(cameras), 1)),
+    )  # fmt: skip
+    return folder
+
+
+SLOW = [pytest.param(layout, marks=pytest.mark.slow) for layout in (dust3r, colmap)]
+
+
+@pytest.mark.parametrize("layout", [vggt, depth_anything, mapanything, opengl, *SLOW])
+def test_what_a_network_saved_becomes_a_project(layout, truth, depths, room, tmp_path):
+    (tmp_path / "net").mkdir()
+    poses = layout(tmp_path / "net", truth, depths)
+    out = tmp_path / "out"
+    if layout is vggt:
+        run_command("capture", room / "images", "--poses", poses, "--out", out)
+    else:
+        capture_posed(room / "images", out, poses=poses)
+    report = json.loads((out / "capture.json").read_text())
+    told = " ".join(item["message"] for item in report["findings"])
+    assert layout is not vggt or "median error" in report["mapping"]
+    scene, cameras = open_project(out), truth[0]
+    assert scene.names == cameras.names
+    assert not pose_findings(scene)
+    assert ("do not fit the photographs" in told) == (layout is opengl)
+    found = scene.cameras
+    np.testing.assert_allclose(found.K[:, 0, 0], cameras.K[:, 0, 0], rtol=0.03)
+    # The world is levelled: where the photographs were taken, the points are, too.
+    moved = found.cam_from_world @ align_poses(found.cam_from_world, cameras.cam_from_world)
+    extent = np.linalg.norm(np.ptp(cameras.centers, axis=0))
+    away = np.linalg.norm(np.linalg.inv(moved)[:, :3, 3] - cameras.centers, axis=1)
+    assert away.max() < 0.05 * extent
+    points = scene.points
+    seen = [np.abs(far(points, found, row, depths) - 1) for row in range(len(found))]
+    assert len(points.positions) > 1000 and np.median(np.concatenate(seen)) < 0.03
+
+
+def far(points, cameras: Cameras, row, depths):
+    """Depth of the points that a view sees over the true one."""
+    mine = points.view_index == row
+    z = cameras[row].project(points.positions[points.point_index[mine]])[1][0]
+    x, y = points.xy[mine].astype(int).T
+    return z / depths[row][y, x]
+
+
+def test_a_wrong_count_is_refused(truth, depths, room, tmp_path, capsys):
+    poses = vggt(tmp_path, truth, depths)
+    shutil.copytree(room / "images", tmp_path / "fewer")
+    next(iter(sorted((tmp_path / "fewer").iterdir()))).unlink()
+    line = refused(
+        capsys, "capture", tmp_path / "fewer", "--poses", poses, "--out", tmp_path / "out"
+    )
+    assert "6 cameras without names" in line and "5 pictures" in line
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("arrays", "reason"),
+    [
+        ({"extrinsics": np.array([None])}, "objects"),
+        ({"depth": np.ones((2, 4, 4))}, "no poses"),
+        ({"extrinsics": np.tile(np.eye(4), (3, 1, 1))}, "no intrinsics"),
+        (
+            {"extrinsics": np.tile(2 * np.eye(4)[:3], (6, 1, 1)),
+             "intrinsics": np.tile(np.diag([9.0, 9, 1]), (6, 1, 1))},
+            "no rotation",
+        ),
+    ],
+)  # fmt: skip
+def test_other_files_are_refused(arrays, reason, room, tmp_path, capsys):
+    np.savez(tmp_path / "x.npz", **arrays)
+    line = refused(
+        capsys, "capture", room / "images", "--poses", tmp_path / "x.npz", "--out", tmp_path / "o"
+    )
+    assert reason in line
