@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from gvtools.errors import MemoryFileError
 from gvtools.glb import join_glb, split_glb
+from gvtools.scans.read import read_scan
 from gvtools.splat_files import READERS, read_splats
 from gvtools.splats import SH, TERMS, TO_RUB, Splats, place_gaussians, turn_gaussians
 from pipelines.export.formats import ExportOptions
@@ -153,6 +154,17 @@ def test_a_file_is_converted_and_the_suffix_tells_the_format(tmp_path, capsys):
     said = refused(capsys, "export", file, "--out", tmp_path / "c.ply", "--observed")
     assert "--observed" in said and "leave it out" in said
     assert "give --format" in refused(capsys, "export", tmp_path, "--out", tmp_path / "c.usdc")
+
+
+@pytest.mark.parametrize("end", [".splat", ".compressed.ply"])
+def test_splats_are_scans(tmp_path, end):
+    given = some(0)
+    scan = read_scan(written(tmp_path, end, given))
+    chosen = given.logits > 0.02
+    away, place = cKDTree(scan.positions + scan.origin).query(given.positions[chosen])
+    assert away.max() < 0.01 and len(scan.positions) <= (given.logits > -0.02).sum()
+    colors = 255 * given.colors[chosen]
+    np.testing.assert_allclose(scan.colors[place], colors, atol=3)
 
 
 def test_harmonics_of_no_whole_degree_are_refused(tmp_path):

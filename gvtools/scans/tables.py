@@ -16,6 +16,7 @@ from gvtools.kernels import compiled
 from gvtools.ply import point_vertices, read_header
 from gvtools.ranges import color_names
 from gvtools.scans.points import CHUNK, GENERATED, Chunk, ScanFile, Station
+from gvtools.splat_files import PACKED, read_splats
 
 # A number and what parts it from the next one; what one takes at most.
 LEAST_TEXT, MOST_TEXT = 2, 64
@@ -134,6 +135,8 @@ def _lines(file: IO[bytes], count: int, most: int) -> Iterator[bytes]:
 def open_ply(path: Path) -> ScanFile:
     """A PLY, its header read: of either byte order or as text, with or without faces behind."""
     header = read_header(path)
+    if any(PACKED in dict(item.columns) for item in header.elements):
+        return open_splats(path)
     vertices = point_vertices(path, header)
     layout = "rows" if header.order else "text"
     last = not any(item.count for item in header.elements if item is not vertices)
@@ -142,6 +145,14 @@ def open_ply(path: Path) -> ScanFile:
     kinds = {name: np.dtype(kind) for name, kind in vertices.columns}
     chunks = (_ply_chunk(columns, kinds) for columns in table.chunks(path))
     return ScanFile(path, table.count, (Station(path.stem),), chunks)
+
+
+def open_splats(path: Path) -> ScanFile:
+    """The centres of a file of Gaussians, whatever its format."""
+    splats = read_splats(path)
+    columns = dict(zip("xyz", splats.positions.T + splats.origin[:, None], strict=True))
+    columns |= dict(zip(SPLATS, (*splats.harmonics[:, 0].T, splats.logits), strict=True))
+    return ScanFile(path, len(splats), (Station(path.stem),), iter([_splat_chunk(columns)]))
 
 
 def _ply_chunk(columns: Columns, kinds: Mapping[str, np.dtype[Any]]) -> Chunk:

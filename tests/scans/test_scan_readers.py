@@ -486,7 +486,11 @@ def test_text_as_other_programs_write_it(tmp_path, name, change):
         ("a.pcd", lambda text: text.replace(" 300", " 200"), "more lines than the 200 points"),
         ("a.ply", lambda text: text.replace("ascii", "binary_little_endian"), "points as text"),
         ("a.ply", lambda text: text.replace("0.", "0,"), "with decimal points"),
-        ("a.ply", lambda text: text.replace(" x", " packed_position"), "compressed as SuperSplat"),
+        (
+            "a.ply",
+            lambda text: text.replace(" x", " packed_position"),
+            "expected a whole compressed.ply",
+        ),
     ],
 )
 def test_headers_that_contradict_the_points(tmp_path, name, change, said):
