@@ -76,13 +76,15 @@ def capture_posed(
     Args:
         source: folder of the photographs that the network saw.
         out: the project's folder; absent or empty.
-        poses: what the network saved, a file or a folder; see ``predictions``.
+        poses: what the network saved, a file or a folder, see ``predictions``; or a folder of Depth
+            Anything 3's weights, by which it is computed.
         distance: names of two pictures and the distance between their places, metres.
         draw: adds pictures to the project's folder before it gets its name.
     """
     if not source.is_dir():
         raise OptionError(f"--poses: {source} is no folder; expected the pictures the network saw")
-    predictions = read_predictions(poses)
+    has_weights = poses.is_dir() and any(poses.rglob("*.safetensors"))
+    predictions = None if has_weights else read_predictions(poses)
     with replaced_folder(out) as work:
         photographs, findings = find_photographs(source)
         sideways = [item.name for item in photographs if item.turned]
@@ -92,6 +94,11 @@ def capture_posed(
                 f"({named(sideways)}), which some networks heed and some do not; save them upright "
                 "and run the network on these"
             )
+        if predictions is None:
+            from gvtools.capture.depth_anything_poses import predict
+
+            say(f"running Depth Anything 3 on {len(photographs)} photographs")
+            predictions = predict(photographs, poses)
         rows, met = _rows(predictions, photographs, source=source, poses=poses)
         kept = [item for item in photographs if item.name in rows]
         copy_upright(kept, work / IMAGES)
@@ -165,11 +172,15 @@ def _rows(
         text = f"{poses} names no pictures: its cameras are those of {named(order)}, in this order"
         rows = {name: row for row, name in enumerate(order) if name in there}
         return rows, [Finding("info", text)]
-    for part in ("name", "stem"):
-        own = Counter(getattr(PurePosixPath(name), part) for name in there)
-        told = {getattr(PurePosixPath(n), part): r for r, n in enumerate(predictions.cameras.names)}
-        keys = {name: getattr(PurePosixPath(name), part) for name in there}
-        rows = {name: told[key] for name, key in keys.items() if key in told and own[key] == 1}
+    keys: tuple[Callable[[str], str], ...] = (
+        str, lambda name: PurePosixPath(name).name, lambda name: PurePosixPath(name).stem
+    )  # fmt: skip
+    for key in keys:
+        own = Counter(key(name) for name in there)
+        told = {key(name): row for row, name in enumerate(predictions.cameras.names)}
+        rows = {
+            name: told[key(name)] for name in there if key(name) in told and own[key(name)] == 1
+        }
         if len(rows) > 1:
             text = (
                 f"{count - len(rows)} of {count} cameras of {poses} are of no picture of {source}"

@@ -127,13 +127,13 @@ def _from_arrays(arrays: Arrays) -> Predictions:
     cameras = Cameras(
         K, invert_rigid(rigid) if to_world else rigid, np.array(width), np.array(height), ()
     )
-    seen = _sample(depth if depth is not None else world, one(SURE, 3, 4))
+    seen = sample_points(depth if depth is not None else world, one(SURE, 3, 4))
     stretched = not to_world and not np.allclose(K[:, 0, 0], K[:, 1, 1], rtol=1e-6)
     shown = None if pictures is None else pictures.astype(np.uint8)
     return Predictions(cameras, False, shown, stretched, *seen)
 
 
-def _sample(
+def sample_points(
     values: NDArray[Any] | None, sure: NDArray[Any] | None
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
     """Of the more certain pixels of depth or points: camera, place, and value."""

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from command_line import refused, run_command
+from micro_weights import write_micro_weights
 from scipy.spatial.transform import Rotation
 from walls import write_project
 
@@ -218,3 +219,31 @@ def test_other_files_are_refused(arrays, reason, room, tmp_path, capsys):
         capsys, "capture", room / "images", "--poses", tmp_path / "x.npz", "--out", tmp_path / "o"
     )
     assert reason in line
+
+
+def test_cameras_of_depth_anything_are_decoded(truth):
+    import torch
+
+    from gvtools.capture.depth_anything_poses import decode_cameras
+    from gvtools.networks.depth_anything.encoder import encode_cameras
+
+    cameras = truth[0]
+    K = cameras.K.copy()
+    K[:, :2, 2] = 80, 60
+    encoding = encode_cameras(
+        torch.from_numpy(cameras.cam_from_world), torch.from_numpy(K), (120, 160)
+    )
+    found = decode_cameras(encoding, (120, 160), names=cameras.names)
+    np.testing.assert_allclose(found.K, K, atol=1e-9)
+    np.testing.assert_allclose(found.cam_from_world, cameras.cam_from_world, atol=1e-9)
+
+
+def test_weights_of_depth_anything_compute_the_poses(room, tmp_path):
+    """Random ones: what comes is a project with a warning, not the room."""
+    run_command(
+        "capture", room / "images", "--out", tmp_path / "out", "--poses",
+        write_micro_weights(tmp_path / "weights"),
+    )  # fmt: skip
+    report = json.loads((tmp_path / "out/capture.json").read_text())
+    assert len(report["registered"]) == 6 and len(open_project(tmp_path / "out")) == 6
+    assert any("do not fit the photographs" in item["message"] for item in report["findings"])
