@@ -103,7 +103,7 @@ def capture_posed(
         kept = [item for item in photographs if item.name in rows]
         copy_upright(kept, work / IMAGES)
         given = predictions.cameras[[rows[item.name] for item in kept]]
-        scaled = _scaled_sizes(predictions, kept, given, rows=rows, poses=poses)
+        scaled, cut = _scaled_sizes(predictions, kept, given, rows=rows, poses=poses)
         cameras = _pooled(_reconciled(kept, given, scaled), kept)
         say(f"comparing the poses with {len(kept)} photographs")
         cameras, scene, forms = _right_form(cameras, work)
@@ -144,7 +144,7 @@ def capture_posed(
             metric=placement.metric,
             placed_by=placement.by,
             origin=placement.origin,
-            findings=(*findings, *met, *forms, *placed),
+            findings=(*findings, *met, *cut, *forms, *placed),
         )
         write_json(work / REPORT, asdict(report))
         draw(work, report)
@@ -223,7 +223,7 @@ def _difference(rgb: NDArray[np.uint8], shown: NDArray[np.uint8], fit: str) -> f
 def _scaled_sizes(
     predictions: Predictions, items: Sequence[CapturedPhotograph], given: Cameras, *,
     rows: dict[str, int], poses: Path,
-) -> Float64:  # fmt: skip
+) -> tuple[Float64, list[Finding]]:  # fmt: skip
     """(V, 2) sizes of whole photographs in the network's pixels, by its pictures or by sizes."""
     nets: list[Size] = list(zip(given.width.tolist(), given.height.tolist(), strict=True))
     near = all(
@@ -231,6 +231,10 @@ def _scaled_sizes(
         for item, (w, h) in zip(items, nets, strict=True)
     )
     fit = FITS[0] if near and predictions.stretched else FITS[1]
+    told = (
+        f"{poses} is of pictures of {nets[0][0]}x{nets[0][1]} pixels: the photographs are taken to"
+    )
+    told += " have been stretched to it" if fit == FITS[0] else " have been reduced and cut to it"
     if predictions.pictures is not None:
         looked = [items[at] for at in np.unique(np.linspace(0, len(items) - 1, COMPARED).round(0))
                   .astype(int)]  # fmt: skip
@@ -242,7 +246,9 @@ def _scaled_sizes(
                 f"--poses {poses}: its pictures differ from the photographs by {errors[fit]:.0f} "
                 f"grey levels, expected at most {SAME:.0f}; give the folder that the network saw"
             )
-    return np.array([_scaled(fit, i.size, net) for i, net in zip(items, nets, strict=True)])
+    sizes = np.array([_scaled(fit, i.size, net) for i, net in zip(items, nets, strict=True)])
+    known = predictions.pictures is not None or [item.size for item in items] == nets
+    return sizes, [] if known else [Finding("info", told)]
 
 
 def _reconciled(items: Sequence[CapturedPhotograph], given: Cameras, scaled: Float64) -> Cameras:

@@ -68,6 +68,8 @@ def read_predictions(path: Path) -> Predictions:
             if file.suffix != ".npy":
                 with archive(file) as opened:
                     held = {name.removesuffix(".npy") for name in opened.namelist()} & {*EVERY}
+                # Of points that depth tells as well, VGGT's would take gigabytes.
+                held -= {*POINTS} if held & {*DEPTH} else set()
                 if len(held) > len(fullest):
                     fullest = load_arrays(file, *sorted(held))
         return _from_arrays(fullest)
