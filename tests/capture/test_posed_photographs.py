@@ -143,10 +143,12 @@ def colmap(folder, truth, depths):
     return folder
 
 
-SLOW = [pytest.param(layout, marks=pytest.mark.slow) for layout in (depth_anything, dust3r, colmap)]
+SLOW = [pytest.param(layout, marks=pytest.mark.slow) for layout in (
+    depth_anything, dust3r, colmap, mapanything,
+)]  # fmt: skip
 
 
-@pytest.mark.parametrize("layout", [vggt, mapanything, opengl, *SLOW])
+@pytest.mark.parametrize("layout", [vggt, opengl, *SLOW])
 def test_what_a_network_saved_becomes_a_project(layout, truth, depths, room, tmp_path):
     (tmp_path / "net").mkdir()
     poses = layout(tmp_path / "net", truth, depths)

@@ -109,7 +109,7 @@ def _runs(process: int) -> bool:
     return state != "Z"
 
 
-@pytest.mark.parametrize("workers", [0, 1])
+@pytest.mark.parametrize("workers", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_why_a_sample_is_missing_arrives_in_one_line(workers):
     with pytest.raises(DegenerateError, match=r"^sample 0 cannot be drawn$"):
         next(batches(Refusing(), [range(2)], workers=workers))
