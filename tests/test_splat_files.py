@@ -98,8 +98,10 @@ def test_lower_degrees_stay_what_they_are(tmp_path, end, degree):
     assert found.degree == degree
 
 
-@pytest.mark.parametrize(("end", "version"), [(".spz", 4), pytest.param(".spz", 3, marks=pytest.mark.slow),
-                                             (".compressed.ply", 4)])  # fmt: skip
+@pytest.mark.parametrize(
+    ("end", "version"),
+    [(".spz", 4), pytest.param(".spz", 3, marks=pytest.mark.slow), (".compressed.ply", 4)],
+)
 def test_gsply_reads_the_same(tmp_path, end, version):
     gsply, given = pytest.importorskip("gsply"), some()
     file = written(tmp_path, end, given, spz_version=version)
