@@ -266,9 +266,13 @@ def _triangulate(
     near = nearest_pairs(cameras.cam_from_world, count=NEIGHBOURS, shift=unit)
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = list_pairs([(names[a], names[b]) for a, b in near], work)
+    matching = pycolmap.FeatureMatchingOptions()
+    # Indices built side by side share BLAS's threads, and round as these happen to be free.
+    matching.num_threads = 1
     pycolmap.match_image_pairs(
-        database, pairing_options=pairing, verification_options=verification()
-    )
+        database, matching_options=matching, pairing_options=pairing,
+        verification_options=verification(),
+    )  # fmt: skip
     options = pycolmap.IncrementalPipelineOptions()
     options.triangulation.ignore_two_view_tracks = False
     options.random_seed = options.triangulation.random_seed = SEED
