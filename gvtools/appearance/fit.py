@@ -82,6 +82,8 @@ KEPT_BYTES = 2**30
 LEAST_GAIN = 0.1
 # The progress at which refined poses are checked, beside the end.
 POSE_CHECKS = (0.3, 0.6)
+# Greatest exposure [log] that a start from elsewhere tells of a photograph.
+MOST_GAIN = 0.7
 # Where Gaussians are added, those at least so wide are split, smaller ones are cloned [px].
 WIDE = 2.0
 # Gaussians in a photograph's free space lose this share of their opacity at each step on it.
@@ -376,6 +378,21 @@ class Fit:
         given = [row for row in range(len(self.views)) if row not in self._validation]
         gains = self.cameras.log_gains[given]
         return Exposures(self.cameras.given[given], gains - gains.mean(axis=0), self.cameras.depth)
+
+    def compare_exposures(self) -> None:
+        """Set the photographs' exposures to those at which the start shows them best."""
+        if not self.cameras.exposure:
+            return
+        found = np.zeros((len(self.views), 3))
+        for row, view in enumerate(self.views):
+            shown = self._picture(row, self.cameras.given[row])
+            where = shown.solid if view.mask is None else shown.solid & view.mask
+            pairs = shown.rgb[where] * view.rgb[where] / np.float32(255)
+            squares = np.square(shown.rgb[where]).sum(axis=0)
+            if squares.all() and pairs.any(axis=0).all():
+                found[row] = np.log(pairs.sum(axis=0) / squares)
+        gains = found - found.mean(axis=0)
+        self.cameras.log_gains[:] = np.clip(gains, -MOST_GAIN, MOST_GAIN)
 
     def _error(self, number: int, picture: Picture) -> float:
         """Negative PSNR of a rendered picture against its photograph [dB]."""

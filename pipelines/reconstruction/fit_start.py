@@ -32,6 +32,9 @@ if TYPE_CHECKING:
     from pipelines.console import Console
     from pipelines.reconstruction.plan import Plan
 
+# The progress at which a fit begins with fitted Gaussians. The fox in 30 s: 30.55 dB so, 30.33 at
+# 0.35, 30.21 at 0.6, 29.76 at 0.85 and 29.39 without them.
+GIVEN = 0.15
 # Gaussians of at least this opacity are surfaces, by which they are placed.
 OPAQUE = 0.5
 # Folders above a file in which its cameras are sought; how far they may be from the project's on

@@ -50,7 +50,7 @@ from gvtools.scenes.resized import reduced
 from gvtools.scenes.scene import Frame, View
 from gvtools.untrusted import load_arrays
 from gvtools.view_selection import evenly_spread
-from pipelines.reconstruction.fit_start import given_start
+from pipelines.reconstruction.fit_start import GIVEN, given_start
 from pipelines.reconstruction.voxel import grid_frame
 
 if TYPE_CHECKING:
@@ -466,11 +466,14 @@ def _new_fit(
     surface = known_surface(start, views) if earlier is None else earlier.appearance.surface
     if given is not None:
         start = given.gaussians
-    return Fit(
+    fit = Fit(
         start, views, options=options, seed=seed, surface=surface,
-        begin=CONTINUED if given is not None and given.fitted else 0.0,
+        begin=GIVEN if given is not None and given.fitted else 0.0,
         splatter=splatter_on(plan.config.device),
     )  # fmt: skip
+    if given is not None and given.fitted:
+        fit.compare_exposures()
+    return fit
 
 
 def _options(plan: Plan) -> FitOptions:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,8 @@ from run_files import reconstructed
 from scipy.spatial.transform import Rotation
 from tiny_scan import write_colmap_scan, write_scan
 
+from gvtools.appearance.fit import Fit
+from gvtools.appearance.fit_options import FitOptions
 from gvtools.scenes.project import open_project
 from gvtools.settings import with_texts
 from gvtools.splats import LOG_SCALE, LOGIT, QUATERNION, Splats, place_gaussians
@@ -154,3 +157,23 @@ def test_what_no_fit_can_begin_with_is_refused(scan, tmp_path, capsys, name, con
         capsys, "reconstruct", scan, "--out", out, "--init", tmp_path / name, *words
     )
     assert not out.exists()
+
+
+def test_photographs_begin_with_the_exposure_at_which_the_start_shows_them_best(plan):
+    """Pictures of the start, every other one a half brighter."""
+    frame = grid_frame(plan.scene, plan.context)
+    views = fit_views(plan, frame, QUIET, sweep=None)
+    start = first_gaussians(plan, views, frame)
+    start.values[:, LOGIT] = 4
+    options, gains = FitOptions(steps=1), np.where(np.arange(len(views)) % 2, 0.9, 0.6)
+    drawn = Fit(start, views, options=options, begin=0.5)
+    pictures = [
+        drawn._picture(row, view.cam_from_local).rgb * gain * 255
+        for row, (view, gain) in enumerate(zip(views, gains, strict=True))
+    ]
+    views = [replace(view, rgb=np.rint(rgb).astype(np.uint8))
+             for view, rgb in zip(views, pictures, strict=True)]  # fmt: skip
+    fit = Fit(start, views, options=options, begin=0.5)
+    fit.compare_exposures()
+    expected = np.log(gains) - np.log(gains).mean()
+    np.testing.assert_allclose(fit.cameras.log_gains, expected[:, None].repeat(3, 1), atol=0.01)
