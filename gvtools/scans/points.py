@@ -60,7 +60,7 @@ class ScanFile:
     stations: tuple[Station, ...]  # at least one
     chunks: Iterator[Chunk]  # all points, in the order of the file, read as they are asked for
     crs: str = ""  # the coordinate system that it names, WKT or "EPSG:N"
-    notes: tuple[str, ...] = ()  # what its header says and is not followed
+    notes: tuple[str, ...] = ()  # what of its header was ignored
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,8 +20,8 @@ from gvtools.runs.run import load_run
 from gvtools.splats import SH, Splats
 from pipelines.export.formats import ExportOptions
 from pipelines.export.source import ExportSource
+from viz.page.packing import pack_gaussians
 from viz.page.page import PageCamera, PageGroup, SharedPage, page_html
-from viz.page.words import pack_gaussians
 from viz.report.pictures import thumbnail
 from viz.viewer.run_view import RunView, cameras_of
 from viz.viewer.standpoint import camera_outside

@@ -6,9 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gvtools.appearance.appearance import Appearance
 from gvtools.appearance.gaussians import Gaussians
 from gvtools.appearance.population import from_points
 from gvtools.appearance.splat.project_kernels import VALUES
@@ -25,6 +27,7 @@ from gvtools.scenes.matching import paired
 from gvtools.splat_files import holds_splats, read_splats
 from gvtools.splats import LOG_SCALE, LOGIT, QUATERNION, Splats, place_gaussians
 from gvtools.untrusted import read_json
+from gvtools.view_selection import evenly_spread
 from pipelines.reconstruction.prepare import photographed
 
 if TYPE_CHECKING:
@@ -37,6 +40,10 @@ if TYPE_CHECKING:
 GIVEN = 0.15
 # Gaussians of at least this opacity are surfaces, by which they are placed.
 OPAQUE = 0.5
+# Splats that are this much nearer [dB] to the median of so many photographs, with this longer side
+# [px], than the mean colour lie where they belong. What is nearer than this share of the median
+# distance is not drawn.
+LEAST_GAIN, LOOKED_AT, SIDE, NEAR = 2.0, 5, 160, 0.02
 # Folders above a file in which its cameras are sought; how far they may be from the project's on
 # average: centres as a share of the extent, and turns.
 ABOVE, ALIKE = 3, 0.02
@@ -69,11 +76,34 @@ def given_start(plan: Plan, frame: LocalFrame, console: Console) -> GivenStart |
     splats = read_splats(path)
     opaque = splats.opacities > OPAQUE
     surface = splats.positions[opaque if opaque.any() else slice(None)] + splats.origin
-    placement = _placed(surface, plan, console, path=path)
+    estimated = plan.config.scan.placement == ESTIMATE
+    if estimated and _shows(_local(splats, None, frame), plan, frame):
+        placement = None
+        console.line(f"{path.name}: placement as it is, since the photographs show it")
+    else:
+        placement = _placed(surface, plan, console, path=path)
     values = _strongest(_local(splats, placement, frame), options.most_gaussians)
     fewer = f" of {len(splats):,}" if len(values) < len(splats) else ""
     console.line(f"fitting begins with {len(values):,}{fewer} Gaussians of {path}")
     return GivenStart(Gaussians(values, frame=frame), fitted=True)
+
+
+def _shows(values: NDArray[np.float32], plan: Plan, frame: LocalFrame) -> bool:
+    """Whether Gaussians in a frame look like the photographs, more than their mean colour does."""
+    gaussians = Gaussians(values, frame=frame)
+    gains = []
+    for name in evenly_spread(plan.context, LOOKED_AT):
+        view = plan.scene[name]
+        rgb = view.load().rgb
+        factor = min(SIDE / max(rgb.shape[:2]), 1)
+        size = [max(1, round(side * factor)) for side in rgb.shape[1::-1]]
+        photograph = np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)) / 255
+        camera = view.camera.resized(*size)
+        depth = np.linalg.norm(frame.to_world(values[:, :LOG_SCALE]) - camera.centers[0], axis=1)
+        shown = Appearance(gaussians, float(NEAR * np.median(depth))).picture(camera).rgb
+        errors = [np.square(each - photograph).mean() for each in (shown, photograph.mean((0, 1)))]
+        gains.append(10 * np.log10((errors[1] + 1e-9) / (errors[0] + 1e-9)))
+    return bool(np.median(gains) > LEAST_GAIN)
 
 
 def _placed(

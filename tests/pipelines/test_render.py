@@ -24,16 +24,6 @@ def run(*words: object) -> None:
     run_command("render", *words, quiet=True)
 
 
-@pytest.fixture(scope="module")
-def box(tmp_path_factory):
-    """A project of six views and a run whose memory holds three of them."""
-    root = tmp_path_factory.mktemp("box")
-    scene = write_box(root / "project")
-    (root / "run").mkdir()
-    fused(scene, [0, 2, 4]).save(root / "run" / "memory.npz")
-    return root
-
-
 def rendered(folder, stem):
     rgb = np.asarray(Image.open(folder / f"{stem}.rgb.png"))
     depth = np.load(folder / f"{stem}.depth.npz")["depth"]

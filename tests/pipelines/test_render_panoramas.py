@@ -7,7 +7,7 @@ import json
 import cv2
 import numpy as np
 import pytest
-from box_project import HEIGHT, SIZE, WIDTH, fused, write_box
+from box_project import HEIGHT, SIZE, WIDTH
 from command_line import refused, run_command
 from PIL import Image
 from tiny_scan import write_scan
@@ -21,15 +21,6 @@ from pipelines.reconstruction.settings import RunSettings
 from pipelines.spherical_metadata import mark_mp4
 
 pytestmark = pytest.mark.usefixtures("unpainted")
-
-
-@pytest.fixture(scope="module")
-def box(tmp_path_factory):
-    root = tmp_path_factory.mktemp("box")
-    scene = write_box(root / "project")
-    (root / "run").mkdir()
-    fused(scene, [0, 2, 4]).save(root / "run" / "memory.npz")
-    return root
 
 
 def test_a_panorama_is_a_picture_that_viewers_know(box, tmp_path):

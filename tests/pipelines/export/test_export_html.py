@@ -21,8 +21,8 @@ from gvtools.errors import OptionError
 from gvtools.memory.store.local_frame import LocalFrame
 from pipelines.export.formats import ExportOptions
 from pipelines.export.source import ExportSource
+from viz.page.packing import pack_gaussians
 from viz.page.page import PageCamera, PageGroup, SharedPage, page_html
-from viz.page.words import pack_gaussians
 
 PATIENCE = 60.0
 

@@ -1,4 +1,4 @@
-"""What ``gvtools evaluate`` says of the small run, which tests of scores share."""
+"""The figures of the small run, shared by tests of scores."""
 
 from __future__ import annotations
 
