@@ -248,12 +248,10 @@ def recorded_sources(
     for entry, (collection, weight, own_share) in zip(whole, opened, strict=True):
         name = _unique(collection.title, [source.name for source in sources])
         estimated = None if entry.estimated is None else draw(open_collection(entry.estimated))
-        samples = estimated
-        if estimated is None or own_share > 0:
-            samples = own = draw(collection)
-            if own_share < 1 or estimated is not None:
-                samples = OwnOrEstimated(own, estimated, own_share, seed)
-        assert samples is not None
+        own = draw(collection) if estimated is None or own_share > 0 else estimated
+        samples = own
+        if own_share < 1 or estimated is not None:
+            samples = OwnOrEstimated(own, estimated, own_share, seed)
         sources.append(SampleSource(name, share * weight / total, samples))
     return tuple(sources)
 

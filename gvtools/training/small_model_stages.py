@@ -252,7 +252,7 @@ class HeadsStage(Stage):
         """Errors of the targets as inference makes them; gradients reach the heads alone."""
         model, context = self.model, batch.views.context
         with torch.no_grad():
-            prepared = self.prepare(batch, draws, model)
+            prepared = self.prepare(batch, draws)
             like = prepared.hints.level1
             level1 = model.sample1(
                 prepared,

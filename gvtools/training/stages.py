@@ -72,9 +72,9 @@ class Stage(nn.Module):
         """The loss, and its terms for the log."""
         raise NotImplementedError
 
-    def prepare(self, batch: TrainingBatch, draws: Draws, model: GeoVerse) -> Prepared:
-        """The batch as ``model`` takes it; student and teacher get the same noise."""
-        return model.prepare(batch.views, seed=draws.seeds("video", batch.images.shape[1]))
+    def prepare(self, batch: TrainingBatch, draws: Draws) -> Prepared:
+        """The batch as the model takes it."""
+        return self.model.prepare(batch.views, seed=draws.seeds("video", batch.images.shape[1]))
 
     def noisy_state(
         self, clean: Tensor, noise: Tensor, uniform: Tensor
@@ -99,7 +99,7 @@ class DenoiserStage(Stage):
     def forward(self, batch: TrainingBatch, draws: Draws) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss, and its terms for the log."""
         model, options = self.model, self.options
-        prepared = self.prepare(batch, draws, model)
+        prepared = self.prepare(batch, draws)
         clean0, clean1 = model.clean_latents(batch.true_views)
         device = clean1.device
         drop = draws.uniform("cameras", 1)[:, 0] < options.cameras
@@ -190,7 +190,12 @@ class ReflowStage(Stage):
     def forward(self, batch: TrainingBatch, draws: Draws) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss, and its terms for the log."""
         model, options, flow = self.model, self.options, self.model.config.flow
-        prepared = self.prepare(batch, draws, model)
+        # Once for both: the encoder and the video model are frozen. What takes their features in is
+        # not, so that the teacher's is by its own weights.
+        seed = draws.seeds("video", batch.images.shape[1])
+        video = model.video_features(batch.views, seed=seed)
+        prepared = model.prepare(batch.views, video=video)
+        taught = self._teacher[0].with_video(prepared, video)
         _, clean = model.clean_latents(batch.true_views)
         bounds = options.bounds or flow.level1
         intervals, t = interval_times(
@@ -198,7 +203,7 @@ class ReflowStage(Stage):
         )
         noise = draws.normal("eps", clean.shape, clean.device)
         pair = reflow_pair(
-            self._teacher_velocity(batch, draws, prepared),
+            self._teacher_velocity(taught),
             clean,
             noise,
             intervals=intervals,
@@ -213,12 +218,9 @@ class ReflowStage(Stage):
         total = fast_loss(reflow, matching, rho=options.rho)
         return total, {"reflow": reflow, "flow": matching}
 
-    def _teacher_velocity(self, batch: TrainingBatch, draws: Draws, prepared: Prepared) -> Velocity:
+    def _teacher_velocity(self, prepared: Prepared) -> Velocity:
         """The teacher's velocity (state, t), with classifier-free guidance if that is asked for."""
         teacher, scale = self._teacher[0], self.options.cfg_scale
-        if self.options.rho > 0:
-            # By its own weights, from which the student's move away.
-            prepared = self.prepare(batch, draws, teacher)
 
         def velocity(conditions: Prepared) -> Velocity:
             return lambda state, t: teacher.velocity1(

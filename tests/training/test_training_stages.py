@@ -11,7 +11,9 @@ from torch import Tensor
 from gvtools.completers.geoverse.flow import interpolate, velocity_from_clean, velocity_target
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.completers.geoverse.refiner import CompletedViews, RefinerConfig
+from gvtools.completers.geoverse.video_prior import VideoFeatures
 from gvtools.errors import OptionError
+from gvtools.networks.depth_anything.network import DepthAnything3
 from gvtools.training.data import TrainingSamples
 from gvtools.training.options import RefinerStageOptions, ReflowStageOptions, shipped_or_read
 from gvtools.training.samples import Draws, TrainingBatch
@@ -65,6 +67,55 @@ def test_a_denoiser_that_is_right_has_nothing_to_distil(model, monkeypatch):
     for number in range(4):
         _, terms = stage(batch, Draws(0, "reflow", number, (0, 1, 2, 3)))
         assert float(terms["reflow"].detach()) < 1e-6 and float(terms["flow"].detach()) < 1e-6
+
+
+@pytest.mark.parametrize("injection", ["control", "shared"])
+def test_student_and_teacher_share_what_is_frozen_and_nothing_else(monkeypatch, injection):
+    model = micro.model(micro.config(injection=injection))
+    features, views = micro.video_features(1, 4), micro.batch()
+    asked: list[str] = []
+
+    class Prior:
+        def features(self, *given: Any, **options: Any) -> VideoFeatures:
+            asked.append("video")
+            return features
+
+    def encode(self: DepthAnything3, *given: Any, **options: Any) -> list[Tensor]:
+        asked.append("encoder")
+        return original(self, *given, **options)
+
+    original = DepthAnything3.encode
+    monkeypatch.setattr(DepthAnything3, "encode", encode)
+    model.attach_video(Prior())
+    model.prepare(views)
+    once = sorted(asked)
+    stage = ReflowStage(model, ReflowStageOptions(steps=2))
+    teacher = stage._teacher[0]
+    expected = teacher.prepare(views)
+    own = model.control or model.shared
+    assert own is not None
+    with torch.no_grad():
+        for parameter in own.parameters():
+            parameter.add_(0.1)
+    seen: dict[bool, Any] = {}
+    velocity = GeoVerse.velocity1
+
+    def spied(self: GeoVerse, prepared: Any, *given: Any, **options: Any) -> Tensor:
+        seen[self is teacher] = prepared
+        return velocity(self, prepared, *given, **options)
+
+    monkeypatch.setattr(GeoVerse, "velocity1", spied)
+    asked.clear()
+    stage(TrainingBatch(views, views.images, views.depth), Draws(0, "reflow", 0, (0,)))
+    # The truth is encoded once more; nothing else is.
+    assert sorted(asked) == sorted([*once, "encoder"]) and once.count("video") == 1
+
+    def entering(prepared: Any) -> list[Tensor]:
+        return prepared.adapted or [keys.key for keys in prepared.keys.values()]
+
+    both = zip(entering(seen[True]), entering(expected), entering(seen[False]), strict=True)
+    for taught, as_before, student in both:
+        assert torch.equal(taught, as_before) and not torch.equal(taught, student)
 
 
 # mypy: no-check-untyped-defs

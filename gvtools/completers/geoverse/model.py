@@ -287,26 +287,35 @@ class GeoVerse(nn.Module):
             conditions = Conditions(hints.level1, camera, depth=depth)
             grid = (hints.level1.shape[-2], hints.level1.shape[-1])
             prepared = Prepared(batch, hints, conditions, Positions(config.level1, camera, grid))
-        if config.injection == "none" or (self.without_video and video is None):
+        if video is None:
+            video = self.video_features(source, seed=seed)
+        return self.with_video(prepared, video)
+
+    def video_features(
+        self, batch: ViewBatch, *, seed: int | Sequence[Sequence[int]] = 0
+    ) -> VideoFeatures | None:
+        """Of the frozen prior; None where nothing takes them."""
+        if self.config.injection == "none" or self.without_video:
+            return None
+        if self.video is None:
+            raise CheckpointError(
+                "this GeoVerse configuration needs the video prior and none was loaded; put the "
+                "truncated Wan2.2-VACE folder at video/ (gvtools weights list), or use a "
+                "configuration with injection = 'none'"
+            )
+        with self.clock(VIDEO):
+            return self.video.features(batch.images, batch.valid, batch.context, seed=seed)
+
+    def with_video(self, prepared: Prepared, features: VideoFeatures | None) -> Prepared:
+        """``prepared`` with video features; gradients reach the adapters."""
+        if features is None or self.config.injection == "none":
             return prepared
         with self.clock(VIDEO):
-            if video is None:
-                if self.video is None:
-                    raise CheckpointError(
-                        "this GeoVerse configuration needs the video prior and none was loaded; "
-                        "put the truncated Wan2.2-VACE folder at video/ (gvtools weights list), or "
-                        "use a configuration with injection = 'none'"
-                    )
-                video = self.video.features(source.images, source.valid, source.context, seed=seed)
-            return self.with_video(prepared, video)
-
-    def with_video(self, prepared: Prepared, features: VideoFeatures) -> Prepared:
-        """``prepared`` with video features; gradients reach the adapters."""
-        if self.control is not None:
-            adapted = self.control.adapted(features.tensors, prepared.grid)
-            return replace(prepared, adapted=adapted)
-        keys = self._keys(features, prepared.level1.camera, prepared.grid)
-        return replace(prepared, video=features, keys=keys)
+            if self.control is not None:
+                adapted = self.control.adapted(features.tensors, prepared.grid)
+                return replace(prepared, adapted=adapted)
+            keys = self._keys(features, prepared.level1.camera, prepared.grid)
+            return replace(prepared, video=features, keys=keys)
 
     def _keys(
         self, video: VideoFeatures | None, camera: CameraCondition, grid: tuple[int, int]
