@@ -37,6 +37,8 @@ ORTHONORMAL = 1e-3
 
 # About so many cells hold a point of a surface, and at most so many of its points are kept.
 POINTS, KNOWN = 6000, 250_000
+# What is so many extents away from the median is a stray value, not a surface.
+FAR_OUT = 1000
 # Fewest and most points that features are computed for.
 FEWEST_FEATURES, MOST = 100, 20_000
 # In cubes that hold one point: radii of normals and features; and most neighbours in these.
@@ -479,8 +481,10 @@ def extent_of(positions: Float64) -> float:
 
 
 def subsample(surface: Surface, rng: np.random.Generator) -> Surface:
-    """A random KNOWN of the points, or all."""
+    """A random KNOWN of the points, or all, but those that lie FAR_OUT extents away."""
     rows, seen = rows_of(surface, KNOWN, rng), surface.seen_from
+    away = np.abs(surface.positions[rows] - np.median(surface.positions, axis=0)).max(axis=1)
+    rows = rows[away < FAR_OUT * extent_of(surface.positions)]
     return Surface(surface.positions[rows], None if seen is None else seen[rows])
 
 
