@@ -7,19 +7,23 @@ thousandfold; an archive or an array may claim terabytes in a kilobyte; a name m
 
 from __future__ import annotations
 
+import atexit
 import codecs
 import csv
 import io
 import json
 import math
 import os
+import shutil
 import stat
 import struct
 import sys
+import tempfile
 import zipfile
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Protocol
 
@@ -244,6 +248,40 @@ def archive(source: Path | bytes) -> Iterator[zipfile.ZipFile]:
             yield opened
     except (zipfile.BadZipFile, *PARSER_ERRORS) as error:
         raise ValueError(f"damaged archive: {error or type(error).__name__}") from None
+
+
+def unpacked(path: Path) -> Path:
+    """What a ZIP archive holds, in a folder that lasts as long as the process.
+
+    Folders that hold one folder alone are gone through. Files have the archive's time, so that they
+    are the same ones whenever it is unpacked.
+    """
+    with reading(path):
+        time = regular(path).stat().st_mtime_ns
+    return _unpacked(path.resolve(), time)
+
+
+@cache
+def _unpacked(path: Path, time: int) -> Path:
+    work = Path(tempfile.mkdtemp(prefix="gvtools-"))
+    atexit.register(shutil.rmtree, work, ignore_errors=True)
+    # Messages that name its files tell which archive is meant.
+    home = work / path.name
+    home.mkdir()
+    advice = "expected a ZIP archive; unpack it and give its folder"
+    with reading(path, advice), archive(path) as opened:
+        for item in opened.infolist():
+            name = item.filename.replace("\\", "/")
+            if item.is_dir() or name.endswith("/") or name.startswith("__MACOSX/"):
+                continue
+            file = named_file(home, name, where=str(path))
+            file.parent.mkdir(parents=True, exist_ok=True)
+            with opened.open(item) as source, file.open("wb") as target:
+                shutil.copyfileobj(source, target)
+            os.utime(file, ns=(time, time))
+    while len(inner := list(home.iterdir())) == 1 and inner[0].is_dir():
+        home = inner[0]
+    return home
 
 
 def unpack_gzip(data: bytes, most: int) -> bytes:

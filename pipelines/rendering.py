@@ -34,6 +34,7 @@ from gvtools.memory.splat.api import SplatOptions
 from gvtools.optional import require
 from gvtools.runs.run import at_run_poses, load_appearance, load_memory
 from gvtools.runs.target_files import to_bytes, write_png
+from gvtools.scenes.layout import holds_views
 from gvtools.scenes.scene import Frame
 from gvtools.trajectories import PATHS, named_path
 from pipelines.reconstruction.rounds import CachedProjection, Clock, complete_targets
@@ -273,7 +274,7 @@ def _path_cameras(
 
         cameras = read_transforms_cameras(Path(place))
         return cameras[list(map(cameras.names.index, select(cameras.names, selection or "all")))]
-    if Path(place).is_dir():
+    if holds_views(place):
         from gvtools.scenes.project import open_project
 
         scene = open_project(Path(place))

@@ -6,6 +6,7 @@ not notice that a binary file ends early: binary files are walked record by reco
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 from gvtools.cameras import rigid_transform
 from gvtools.errors import ProjectError
 from gvtools.scenes.faces import perspective_views
+from gvtools.scenes.matching import named, natural
 from gvtools.scenes.photographs import rotation_findings
 from gvtools.scenes.scene import Finding, Scene, SparsePoints, natural_key
 from gvtools.scenes.undistort import Undistortion, undistortion
@@ -35,6 +37,10 @@ RIGGED = ("rigs", "frames")
 PLACES = ("sparse", ".", "colmap/sparse", "sparse_txt")
 # Bytes of the smallest record of each binary file.
 LEAST_BYTES = {"cameras": 24, "images": 73, "points3D": 51, "rigs": 8, "frames": 68}
+# In texts, which the reader refuses with NaN and infinity, this stands for them.
+LOST = 1e300
+_NUMBER = re.compile(r"[-+\d.eE]+|[-+]?nan|[-+]?inf")
+_NAN = re.compile(r"(?<=\s)[+-]?(nan|inf(inity)?)(?=\s)", re.IGNORECASE)
 # What the reader's terser complaints mean.
 REASONS = {
     "camera.VerifyParams()": "a camera has not as many parameters as its model needs",
@@ -240,21 +246,13 @@ def text_names(folder: Path) -> dict[int, str]:
             second = next(rest, "").split()
             if len(row) == 10 and row[0].isdecimal():
                 names[number_key(row[0])] = row[9].strip()
-                if len(second) == 10 and not _is_number(second[-1]):
+                if len(second) == 10 and not _NUMBER.fullmatch(second[-1]):
                     raise ProjectError(
                         f"{path}: image {row[9].strip()} is followed by another, {second[-1]}; "
                         "expected two lines an image, the second with its features or empty; add "
                         "an empty line after each"
                     )
     return names
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
 
 
 @dataclass(frozen=True, eq=False)
@@ -298,6 +296,8 @@ def load_model(folder: Path, *, faces: bool = False) -> ColmapModel:
     reconstruction, mended = _read(files)
     findings += mended
     findings += _contradicting_text(files, reconstruction)
+    lost, met = _without_lost(files, reconstruction)
+    findings += met
     if reconstruction.num_reg_images() == 0:
         raise ProjectError(
             f"{folder}: no registered image among {reconstruction.num_images()}; expected at least "
@@ -306,9 +306,9 @@ def load_model(folder: Path, *, faces: bool = False) -> ColmapModel:
     images, defects = _registered(files, reconstruction)
     findings += rotation_findings(defects)
     count = reconstruction.num_images()
-    if count > len(images):
-        line = f"{count - len(images)} of {count} images have no pose"
-        findings.append(Finding("warning", line))
+    if unposed := count - len(images) - lost:
+        line = f"{unposed} of {count} images have no pose"
+        findings.append(Finding("warning", line, unposed))
     used = {image.camera_id for image in images}
     unused = sorted(set(reconstruction.cameras) - used)
     if unused:
@@ -367,6 +367,40 @@ def _read(files: ModelFiles) -> tuple[pycolmap.Reconstruction, list[Finding]]:
     return reconstruction, [Finding("warning", line)] if changed else []
 
 
+def _without_lost(
+    files: ModelFiles, reconstruction: pycolmap.Reconstruction
+) -> tuple[int, list[Finding]]:
+    """Take points and poses out that hold no numbers; how many poses, and what is to be said."""
+    findings = []
+    lost = [key for key, point in reconstruction.points3D.items() if not _known(point.xyz)]
+    for key in lost:
+        reconstruction.delete_point3D(key)
+    if lost:
+        line = f"{len(lost)} sparse points hold NaN or infinity: dropped"
+        findings.append(Finding("warning", line))
+    names = text_names(files.folder) if files.suffix == ".txt" else {}
+    dropped, frames = list[str](), set[int]()
+    for key, image in reconstruction.images.items():
+        pose = image.cam_from_world() if image.has_pose else None
+        if pose is not None and not (_known(pose.matrix()) and pose.rotation.quat.any()):
+            dropped.append(names.get(key, image.name))
+            frames.add(image.frame_id)
+    for frame in frames:
+        reconstruction.deregister_frame(frame)
+    if dropped:
+        line = (
+            f"{len(dropped)} of {reconstruction.num_images()} images have NaN, infinity or a "
+            f"quaternion of 0 in their pose: dropped ({named(natural(dropped))})"
+        )
+        findings.append(Finding("warning", line, len(dropped)))
+    return len(dropped), findings
+
+
+def _known(values: NDArray[np.float64]) -> bool:
+    """Whether all numbers are known: neither NaN, infinity nor what stands for them."""
+    return bool((np.abs(values) < LOST / 10).all())
+
+
 def _mend(folder: Path, out: Path, suffix: str) -> int | None:
     """Write a model again without what names absent images; how many elements, None: no change."""
     stems = [stem for stem in (*REQUIRED, *RIGGED) if (folder / f"{stem}{suffix}").is_file()]
@@ -375,7 +409,8 @@ def _mend(folder: Path, out: Path, suffix: str) -> int | None:
     for stem in stems:
         data = read_bytes(folder / f"{stem}{suffix}")
         if suffix == ".txt":
-            text = read_text(folder / f"{stem}.txt")
+            whole = read_text(folder / f"{stem}.txt")
+            text = whole if stem == "cameras" else _NAN.sub(f"{LOST}", whole)
             first = {"points3D": 8, "frames": 10}.get(stem)
             lines = []
             for line in text.splitlines():
@@ -392,7 +427,7 @@ def _mend(folder: Path, out: Path, suffix: str) -> int | None:
                 head = words[:first] if stem == "points3D" else [*words[:9], str(len(kept))]
                 lines.append(" ".join([*head, *(word for part in kept for word in part)]))
             new = ("\n".join(lines) + "\n").encode()
-            changed |= lines != text.splitlines() or not data.startswith(text[:1].encode())
+            changed |= lines != whole.splitlines() or not data.startswith(text[:1].encode())
         elif stem in ("points3D", "frames"):
             new, left_out = _without(data, stem, known)
             count += left_out * (stem == "points3D")
@@ -511,11 +546,6 @@ def sparse_points(model: ColmapModel, scene: Scene) -> tuple[SparsePoints | None
     rows = rows[sound[rows]]
     ordered = [points[int(key)] for key in ids]
     positions = np.array([item.xyz for item in ordered], np.float64)
-    if not np.isfinite(positions).all():
-        raise ProjectError(
-            f"{model.files.folder}: {int((~np.isfinite(positions)).any(axis=1).sum())} sparse "
-            "points hold NaN or infinity; expected finite positions; export the model again"
-        )
     colors = np.array([item.color for item in ordered], np.uint8)
     errors = np.array([item.error for item in ordered], np.float32)
     tracks_of = SparsePoints(positions, colors, errors, point[rows], view[rows], xy[rows])

@@ -66,11 +66,7 @@ class ImageHeader:
     height: int  # pixels, as stored
     mode: str  # Pillow's name of the pixel layout ("RGB", "L", "RGBA", "I;16", ...)
     orientation: int = 1  # EXIF orientation of a JPEG, 1 when absent
-
-    @property
-    def has_alpha(self) -> bool:
-        """Whether the picture carries an alpha channel, which is read as a mask."""
-        return self.mode in WITH_ALPHA
+    has_alpha: bool = False  # whether pixels may be transparent, which is read as a mask
 
 
 def read_header(path: Path) -> ImageHeader:
@@ -78,7 +74,8 @@ def read_header(path: Path) -> ImageHeader:
     with _picture(path) as image:
         # Other formats are decoded whole when asked for EXIF.
         exif = image.getexif() if image.format in ("JPEG", "MPO") else {}
-        return ImageHeader(image.width, image.height, image.mode, orientation_of(exif))
+        turned = orientation_of(exif)
+        return ImageHeader(image.width, image.height, image.mode, turned, _has_alpha(image))
 
 
 def orientation_of(exif: Mapping[int, Any]) -> int:
@@ -113,6 +110,10 @@ def _without_alpha(rgba: NDArray[np.uint8], alpha: str) -> Frame:
         rgb = np.rint(rgb * share + (255 if alpha == "white" else 0) * (1 - share)).astype(np.uint8)
     mask = rgba[..., 3] >= OPAQUE_FROM
     return Frame(rgb, mask=None if alpha != "mask" or mask.all() else mask)
+
+
+def _has_alpha(image: Image.Image) -> bool:
+    return image.mode in WITH_ALPHA or "transparency" in image.info
 
 
 def _is_deep(image: Image.Image) -> bool:
@@ -173,7 +174,7 @@ def _decode(image: Image.Image, path: Path | str, *, alpha: str = "mask") -> Fra
     if image.mode.startswith("I;16"):
         grey = (np.asarray(image) >> 8).astype(np.uint8)
         return Frame(np.repeat(grey[..., None], 3, axis=-1))
-    if image.mode in WITH_ALPHA or "transparency" in image.info:
+    if _has_alpha(image):
         return _without_alpha(np.array(image.convert("RGBA")), alpha)
     return Frame(np.array(image.convert("RGB")))
 
@@ -187,7 +188,7 @@ def read_mask(path: Path) -> NDArray[np.bool_]:
         # Where black is stored with loss, it is not quite black.
         least = OPAQUE_FROM if image.format in LOSSY else 1
         used = np.asarray(image if image.mode.startswith("I") else image.convert("L")) >= least
-        if image.mode not in WITH_ALPHA and "transparency" not in image.info:
+        if not _has_alpha(image):
             return used
         opaque = np.asarray(image.convert("RGBA"))[..., 3] >= OPAQUE_FROM
     if opaque.all():

@@ -48,6 +48,7 @@ class SceneReport:
     kind: str  # "colmap", "rgbd" or "transforms"
     ok: bool  # a run can read it: at least one view, and no error among the findings
     views: int  # how many
+    dropped: int  # frames that were left out, for reasons among the findings
     views_opened: int  # how many had their pixels decoded
     sizes: dict[str, int]  # "WIDTHxHEIGHT" with the number of views of that size
     focal_px: tuple[float, float]  # smallest and largest focal length of the views' pinhole cameras
@@ -113,6 +114,7 @@ def inspect(scene: Scene, *, probes: int | None = None) -> SceneReport:
         kind=scene.kind,
         ok=bool(scene.views) and all(finding.level != "error" for finding in findings),
         views=len(scene),
+        dropped=sum(finding.dropped for finding in findings),
         views_opened=len(opened),
         sizes=dict(sizes),
         focal_px=(float(focal.min()), float(focal.max())),

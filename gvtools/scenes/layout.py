@@ -14,6 +14,9 @@ if TYPE_CHECKING:
 # A scene of a data set as a project is named, beside folders and files.
 SPEC = "spec:"
 FORM = f"{SPEC}NAME:SCENE"
+# Files that a project may be.
+ARCHIVE = ".zip"
+PACKED = (".json", ".r3d", ARCHIVE)
 
 
 def is_address(path: Path | str) -> bool:
@@ -23,6 +26,11 @@ def is_address(path: Path | str) -> bool:
     (True, False)
     """
     return str(path).startswith(SPEC)
+
+
+def holds_views(path: Path | str) -> bool:
+    """Whether a place is opened as a project, rather than read as a trajectory."""
+    return is_address(path) or Path(path).is_dir() or Path(path).suffix.lower() in PACKED
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -125,7 +126,7 @@ class _Sieve:
         for reason, names in self.dropped.items():
             listed = "; ".join([named(names), *self.details[reason]])
             line = f"{len(names)} of {self.total} frames {reason}: dropped ({listed})"
-            found.append(Finding("warning", line))
+            found.append(Finding("warning", line, len(names)))
         found += [Finding("info", f"{count} {line}") for line, count in self.scaled.items()]
         return found + rotation_findings(self.defects) + conversion_findings(self.headers)
 
@@ -187,7 +188,7 @@ def posed_scene(
             report.append(Finding("warning", line))
     photographs.sort(key=lambda item: natural_key(item.name))
     report += lens_findings([item.lens for item in photographs])
-    report += mask_findings([item.frame.mask for item in photographs if item.frame.mask])
+    report += mask_findings([item.frame for item in photographs])
     report += _mask_sizes(photographs)
     deep = [i.frame.image for i in photographs if i.frame.read is None]
     white = white_of_pictures([path for path in deep if path.suffix.lower() in DEEP])
@@ -206,22 +207,33 @@ def posed_scene(
     return Scene(Path(root), kind, views_of_scene, None, tuple(report), metric=metric)
 
 
-def mask_findings(files: Sequence[Path]) -> list[Finding]:
-    """A warning where a few of the masks, evenly spread, all leave everything in or out."""
-    shares = []
-    for file in files[:: -(-len(files) // MASKS) or 1]:
-        try:
-            shares.append(float(read_mask(file).mean()))
-        except GvError:  # said where its view is read
-            continue
-    if not shares or 0 < min(shares) < 1 or 0 < max(shares) < 1 or min(shares) != max(shares):
-        return []
-    what = "take everything out" if max(shares) == 0 else "leave everything in"
-    line = (
-        f"masks {what} in all of {len(shares)} that were opened, first {files[0].name}; expected "
-        "black or transparent pixels where a picture is to be ignored, and others elsewhere"
-    )
-    return [Finding("warning", line)]
+def mask_findings(frames: Sequence[PosedFrame]) -> list[Finding]:
+    """Warnings where masks, or alpha, of a few frames, evenly spread, take all or nothing out."""
+    masks = [item.mask for item in frames if item.mask]
+    pictures = [item.image for item in frames if item.read is None]
+    findings = []
+    for noun, files in (("masks", masks), (f"alpha channels, each {ALPHA['mask']},", pictures)):
+        shares = {}
+        for file in files[:: -(-len(files) // MASKS) or 1]:
+            with suppress(GvError):  # said where its view is read
+                used = read_mask(file) if files is masks else _opaque(file)
+                shares[file.name] = float(used.mean())
+        nothing = [name for name, share in shares.items() if share == 0]
+        everything = [name for name, share in shares.items() if share == 1 and files is masks]
+        if nothing or len(everything) == len(shares) > 0:
+            what = "take everything out in" if nothing else "leave everything in in"
+            line = (
+                f"{noun} {what} {len(nothing or everything)} of {len(shares)} that were opened, "
+                f"first {(nothing or everything)[0]}; expected black or transparent pixels where a "
+                "picture is to be ignored, and others elsewhere"
+            )
+            findings.append(Finding("warning", line))
+    return findings
+
+
+def _opaque(picture: Path) -> NDArray[np.bool_]:
+    mask = read_image(picture).mask if read_header(picture).has_alpha else None
+    return np.ones(1, np.bool_) if mask is None else mask
 
 
 def _mask_sizes(photographs: Sequence[Photograph]) -> list[Finding]:

@@ -16,7 +16,7 @@ from gvtools.scenes.calibration import load_matrix
 from gvtools.scenes.collection import SceneCollection, of_scenes
 from gvtools.scenes.colmap_model import find_model
 from gvtools.scenes.images import ALPHA
-from gvtools.scenes.layout import FORM, SPEC, is_address
+from gvtools.scenes.layout import ARCHIVE, FORM, SPEC, is_address
 from gvtools.scenes.matching import named
 from gvtools.scenes.phones import POLYCAM, RECORD3D, SCANNER_APP, STRAY_SCANNER
 from gvtools.scenes.photographs import Photograph
@@ -24,6 +24,7 @@ from gvtools.scenes.rgbd import LAYOUTS, RgbdOptions, count_unposed
 from gvtools.scenes.scene import Finding, Scene
 from gvtools.scenes.transforms import FILE as TRANSFORMS
 from gvtools.scenes.transforms import SPLITS, is_transforms, read_transforms
+from gvtools.untrusted import unpacked
 
 PICTURES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg")
@@ -51,8 +52,8 @@ def open_project(
     """The scene of a COLMAP workspace, a posed RGB-D folder, a phone's or a ``transforms.json``.
 
     Args:
-        path: the folder, a ``transforms.json``, an ``.r3d``, or ``spec:NAME:SCENE`` for a scene of
-            a data set.
+        path: the folder, a ``.zip`` of it, a ``transforms.json``, an ``.r3d``, or
+            ``spec:NAME:SCENE`` for a scene of a data set.
         images: the image folder, where the project does not say it (COLMAP, transforms).
         masks: the mask folder (COLMAP, transforms).
         rgbd: what a posed RGB-D folder does not tell by itself.
@@ -91,6 +92,12 @@ def open_project(
         raise ProjectError(f"{path}: no such folder{_nearest(path)}")
     if not path.is_dir() and not path.is_file():
         raise ProjectError(f"{path}: neither a folder nor a file; expected one of them")
+    if is_archive(path):
+        try:
+            scene = open_project(unpacked(path), images=images, masks=masks, rgbd=rgbd, model=model)
+        except UnposedError as error:
+            raise UnposedError(path, error.found, _capture(path)) from None
+        return replace(scene, root=path)
     if path.suffix.lower() in (*VIDEOS, BAG) and path.is_file():
         kind = "a recording" if path.suffix.lower() == BAG else "a video"
         raise UnposedError(path, f"{kind} without cameras", _capture(path))
@@ -111,7 +118,7 @@ def open_project(
             raise OptionError(f"{path}: no posed RGB-D folder; expected no RGB-D options")
         if not told and path.suffix.lower() != ".json":
             raise ProjectError(
-                f"{path}: no project by its suffix; expected a folder, or a transforms.json "
+                f"{path}: no project by its suffix; expected a folder, a .zip or a transforms.json "
                 f"(gvtools capture also takes {', '.join(VIDEOS)} and {BAG})"
             )
         if folder is None:
@@ -145,12 +152,18 @@ def _with_alpha(scene: Scene, alpha: str) -> Scene:
     findings = (
         replace(found, message=found.message.replace(ALPHA["mask"], ALPHA[alpha]))
         for found in scene.findings
+        if found.level == "info" or ALPHA["mask"] not in found.message
     )
     return replace(scene, views=views, findings=tuple(findings))
 
 
 def _capture(path: Path) -> str:
     return f"find the cameras first: gvtools capture {shlex.quote(str(path))} --out PROJECT"
+
+
+def is_archive(path: Path) -> bool:
+    """Whether a path is of a ZIP archive, which is read as the folder that it holds."""
+    return path.suffix.lower() == ARCHIVE and path.is_file()
 
 
 def is_recording(folder: Path) -> bool:
@@ -160,7 +173,8 @@ def is_recording(folder: Path) -> bool:
 
 def is_project(folder: Path) -> bool:
     """Whether ``open_project`` would take the folder for a project, going by its files' names."""
-    return find_model(folder) is not None or is_transforms(folder) or is_recording(folder)
+    told = find_model(folder) is not None or is_transforms(folder) or is_recording(folder)
+    return told or is_archive(folder)
 
 
 def _nearest(path: Path) -> str:
@@ -175,11 +189,8 @@ def _unknown(path: Path) -> ProjectError:
     if unposed:
         return UnposedError(path, f"{unposed} RGB-D frames without poses", _capture(path))
     entries = sorted(entry.name + "/" * entry.is_dir() for entry in path.iterdir())
-    inside = [
-        str(folder)
-        for folder in sorted([*path.glob("*/"), *path.glob("dense/*/"), *path.glob("*.r3d")])
-        if is_project(folder)
-    ]
+    there = (place for form in ("*/", "dense/*/", "*.r3d", "*.zip") for place in path.glob(form))
+    inside = [str(place) for place in sorted(there) if is_project(place)]
     pictures = [name for name in entries if Path(name).suffix.lower() in PICTURES]
     if not inside and all(entry.is_dir() for entry in path.iterdir() if _is_other(entry)):
         pictures += [p.name for p in path.glob("*/*") if p.suffix.lower() in PICTURES]

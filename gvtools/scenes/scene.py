@@ -64,6 +64,7 @@ class Finding:
 
     level: str
     message: str
+    dropped: int = 0  # frames that are left out for what it tells
 
     def __post_init__(self) -> None:
         # Names and values of files are part of it.

@@ -52,7 +52,7 @@ class CaptureCommand(RecordingArguments):
     positional = ("input",)
 
     input: Path
-    """A folder of photographs, a video, or a folder of colour and depth without poses. [INPUT]"""
+    """A folder or .zip of photographs, or of colour and depth without poses; a video. [INPUT]"""
     out: Path
     """A new folder. [PROJECT]"""
     frames: int | None = None
@@ -90,18 +90,20 @@ def capture(
         reading: what the user said of RGB-D, see ``RecordingArguments.reading``.
         options: what the user said of photographs and videos, by names of PHOTOGRAPHIC.
     """
-    from gvtools.scenes.project import BAG, VIDEOS, is_recording
+    from gvtools.scenes.project import BAG, VIDEOS, is_archive, is_recording
     from gvtools.scenes.rgbd import count_unposed
+    from gvtools.untrusted import unpacked
 
     if not source.exists():
         raise ProjectError(
             f"{source}: no such file or folder; expected photographs, a video, or a folder of "
             "colour and depth"
         )
+    source = unpacked(source) if is_archive(source) else source
     is_bag = source.is_file() and source.suffix.lower() == BAG
     if source.is_file() and not is_bag and source.suffix.lower() not in VIDEOS:
         raise OptionError(
-            f"{source}: expected a folder of photographs or of colour and depth, a video "
+            f"{source}: expected a folder (or .zip) of photographs or of colour and depth, a video "
             f"({', '.join(VIDEOS)}), or a RealSense recording ({BAG})"
         )
     masks = options.get("masks")

@@ -30,7 +30,7 @@ class CheckCommand(SceneArguments):
     positional = ("project",)
 
     project: Path
-    """A folder, a transforms.json or spec:NAME:SCENE. [PROJECT]"""
+    """A folder, a .zip of it, a transforms.json or spec:NAME:SCENE. [PROJECT]"""
     json_: Path | None = None
     """Write the report there. [FILE]"""
 
@@ -65,7 +65,7 @@ def _print(result: SceneReport, console: Console) -> None:
     rows: list[tuple[str, Any]] = [
         ("project", result.root),
         ("kind", result.kind),
-        ("views", result.views),
+        ("views", f"{result.views} ({result.dropped} dropped)" if result.dropped else result.views),
         ("views opened", result.views_opened),
         ("sizes", ", ".join(f"{size} ({n} views)" for size, n in result.sizes.items())),
         ("focal length, pixels", _span(*result.focal_px)),
@@ -94,7 +94,10 @@ def _print(result: SceneReport, console: Console) -> None:
         for finding in result.findings:
             if finding.level == level:
                 console.line(f"{level}: {finding.message}")
-    console.line(f"ok: {'true' if result.ok else 'false'}")
+    warnings = sum(finding.level == "warning" for finding in result.findings)
+    counts = {"frames dropped": result.dropped, "warnings": warnings}
+    said = "; ".join(f"{what}: {count}" for what, count in counts.items() if count)
+    console.line(f"ok: {'true' if result.ok else 'false'}{said and f' ({said})'}")
 
 
 def _span(low: float, high: float) -> str:

@@ -45,7 +45,7 @@ def _opened(path: Path, layout: str, root: Path | None) -> Trajectory:
     """The poses as they stand in a file or project."""
     from gvtools.scenes.colmap_model import find_model
     from gvtools.scenes.data_sets.catalogue import open_address
-    from gvtools.scenes.layout import is_address
+    from gvtools.scenes.layout import holds_views, is_address
     from gvtools.trajectory_files import Trajectory, read_poses
 
     if is_address(path):
@@ -53,7 +53,7 @@ def _opened(path: Path, layout: str, root: Path | None) -> Trajectory:
         return Trajectory(scene.cameras.world_from_cam, scene.names)
     if not path.exists():
         raise ProjectError(f"{path}: no such file or folder; expected a trajectory")
-    if path.is_file() and path.suffix.lower() not in (".json", ".npz"):
+    if path.is_file() and path.suffix.lower() != ".npz" and not holds_views(path):
         return read_poses(path, layout=layout)
     if path.suffix.lower() == ".npz" or (path / "run.json").is_file():
         from gvtools.runs.run import load_memory

@@ -18,7 +18,7 @@ from gvtools.memory.panoramas import WIDEST_FRAME, LensOptions, Rig, picture_cam
 from gvtools.runs.digests import array_digest, fingerprint
 from gvtools.runs.poses import RunPoses, posed, with_poses
 from gvtools.scenes.depth_contradictions import unit_findings
-from gvtools.scenes.layout import is_address
+from gvtools.scenes.layout import holds_views, is_address
 from gvtools.scenes.matching import natural
 from gvtools.scenes.pixel_contradictions import probed
 from gvtools.scenes.pose_forms import pose_findings
@@ -156,7 +156,7 @@ def resolve_targets(
         return _path(scene, context, name, count=int(count))
     path, at, selection = spec.partition("@")
     if path and (is_address(path) or _exists(path)) and spec not in scene.names:
-        if is_address(path) or Path(path).is_dir() or Path(path).suffix == ".json":
+        if holds_views(path):
             targets = _project(path, selection if at else "all", scene, max_side=max_side)
             if not allow_overlap:
                 _check_pictures(scene, context, targets)

@@ -41,6 +41,14 @@ def test_a_good_project_is_ok_and_told_in_lines(tmp_path, capsys):
     assert "info: depth unit: 0.001 m" in out
 
 
+def test_dropped_pictures_stand_beside_the_verdict(tmp_path, capsys):
+    workspace(tmp_path)
+    next((tmp_path / "images").rglob("*.png")).unlink()
+    check(tmp_path)
+    out = capsys.readouterr().out
+    assert "3 (1 dropped)" in out and "ok: true (frames dropped: 1; warnings: 1)" in out
+
+
 def test_json_holds_the_report(tmp_path):
     reconstruction = workspace(tmp_path / "project", "PINHOLE")
     check(tmp_path / "project", "--json", tmp_path / "report.json")

@@ -14,6 +14,7 @@ from gvtools.errors import GvError, ProjectError, ShapeError
 from gvtools.scenes.colmap import read_colmap
 from gvtools.scenes.colmap_writer import write_colmap
 from gvtools.scenes.images import read_depth, stored_depth_size, write_depth_map
+from gvtools.scenes.inspection import reprojection_errors
 
 VIEWS, POINTS = 5, 60
 
@@ -57,7 +58,6 @@ def test_absurd_inner_count_is_refused(tmp_path):
     [
         ("images", r"^1 \S+ ", "1 ", "images.txt is malformed"),
         ("images", r"^1 \S+ ", "1 word ", "images.txt is malformed"),
-        ("images", r"^1 \S+ ", "1 nan ", "images.txt is malformed"),
         # A lost line: what is read as an image is a line of points.
         ("images", r"^1 .*\n", "", "damaged"),
         ("images", r"^1 ", "1e999 ", "images.txt is malformed"),
@@ -102,19 +102,33 @@ def test_points_cut_off_at_a_line_end_are_noticed(tmp_path):
 @pytest.mark.parametrize(
     ("name", "offset", "value", "told"),
     [
-        ("points3D", 8 + 8, np.inf, "1 sparse points hold NaN or infinity"),
-        ("images", 8 + 4 + 4 * 8, np.nan, "NaN"),  # tx of the first image
-        ("cameras", 8 + 24, np.nan, r"camera 1: SIMPLE_RADIAL 96x72 .* NaN"),
+        ("points3D", 8 + 8, np.inf, "1 sparse points hold NaN or infinity: dropped"),
+        ("images", 8 + 4 + 4 * 8, np.nan, "1 of 4 images have NaN, .*: dropped"),  # tx of the first
+        ("cameras", 8 + 24, np.nan, r"camera 1: SIMPLE_RADIAL 96x72 .* NaN|as many parameters"),
     ],
 )
-def test_numbers_that_are_not_finite_are_refused(tmp_path, name, offset, value, told):
-    workspace(tmp_path, classic=True)
-    path = tmp_path / f"sparse/0/{name}.bin"
-    data = bytearray(path.read_bytes())
-    struct.pack_into("<d", data, offset, value)
-    path.write_bytes(data)
-    with pytest.raises(GvError, match=told):
-        read_colmap(tmp_path)
+@pytest.mark.parametrize("text", [False, True])
+def test_numbers_that_are_not_finite(tmp_path, name, offset, value, told, text):
+    workspace(tmp_path, classic=True, text=text)
+    path = tmp_path / f"sparse/0/{name}.{'txt' if text else 'bin'}"
+    if text:
+        lines = path.read_text().splitlines()
+        row = next(i for i, line in enumerate(lines) if not line.startswith("#"))
+        words = lines[row].split()
+        words[{"points3D": 1, "images": 5, "cameras": 4}[name]] = str(value)
+        path.write_text("\n".join([*lines[:row], " ".join(words), *lines[row + 1 :], ""]))
+    else:
+        data = bytearray(path.read_bytes())
+        struct.pack_into("<d", data, offset, value)
+        path.write_bytes(data)
+    if name == "cameras":
+        with pytest.raises(GvError, match=told):
+            read_colmap(tmp_path)
+        return
+    scene = read_colmap(tmp_path)
+    assert len(scene) == (3 if name == "images" else 4)
+    assert any(re.match(told, finding.message) for finding in scene.findings)
+    assert np.nanmax(reprojection_errors(scene)) < 1
 
 
 @pytest.mark.parametrize("classic", [False, True])

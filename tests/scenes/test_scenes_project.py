@@ -1,8 +1,11 @@
 # mypy: no-check-untyped-defs
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
+import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -36,6 +39,25 @@ def test_kinds_are_found_out(tmp_path, make, kind):
     scene = open_project(tmp_path / "project")
     assert scene.kind == kind
     assert scene.views[0].load().rgb.dtype == np.uint8
+    packed = Path(shutil.make_archive(str(tmp_path / "packed"), "zip", tmp_path, "project"))
+    unpacked = open_project(packed)
+    assert (unpacked.kind, unpacked.names, unpacked.address) == (kind, scene.names, str(packed))
+    assert np.array_equal(unpacked.views[0].load().rgb, scene.views[0].load().rgb)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "told"),
+    [
+        ("../a.txt", b"a", "names the file '../a.txt', which lies outside"),
+        ("a.txt", bytes(300 << 20), "members claim 314572800 bytes"),
+        ("a.txt", b"", "holds a.txt; expected one of"),
+    ],
+)
+def test_archives_that_hold_no_project(tmp_path, name, content, told):
+    with zipfile.ZipFile(tmp_path / "a.zip", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr(name, content)
+    with pytest.raises(ProjectError, match=told):
+        open_project(tmp_path / "a.zip")
 
 
 def test_colmap_goes_before_transforms_and_says_so(tmp_path):
@@ -99,6 +121,9 @@ def test_alpha_of_pictures(tmp_path, alpha, masked, value):
     assert (loaded.mask is not None and not loaded.mask[:, :40].any()) == masked
     assert loaded.rgb[10, 10].tolist() == [value] * 3 and loaded.rgb[10, 90].tolist() == [100] * 3
     assert any(f"alpha channel: {ALPHA[alpha]}" in item.message for item in scene.findings)
+    save(tmp_path / "images" / "a.png", picture * np.uint8([1, 1, 1, 0]))
+    levels = [item.level for item in open_project(tmp_path, alpha=alpha).findings]
+    assert ("warning" in levels) == masked  # all of it is transparent
 
 
 def test_alpha_of_another_name(tmp_path):
