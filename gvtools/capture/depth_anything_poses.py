@@ -41,9 +41,11 @@ def predict(photographs: Sequence[CapturedPhotograph], weights: Path) -> Predict
         patch=network.config.encoder.patch,
     )  # fmt: skip
     pictures = [torch.from_numpy(read_image(item.path).rgb) for item in photographs]
-    small = [resample(rgb.permute(2, 0, 1)[None].float() / 255, size) for rgb in pictures]
+    small = torch.cat([
+        resample(rgb.permute(2, 0, 1)[None].float() / 255, size) for rgb in pictures
+    ]).clamp(0, 1)  # fmt: skip
     with autocast(place, dtype):
-        levels = network.encode(torch.cat(small).clamp(0, 1)[None].to(place))
+        levels = network.encode(small[None].to(place))
         geometry = network.geometry(levels, network.encoder.grid(*size))
         encoding = network.cam_dec(levels[-1][:, :, 0])
     names = tuple(item.name for item in photographs)
@@ -51,7 +53,8 @@ def predict(photographs: Sequence[CapturedPhotograph], weights: Path) -> Predict
         array[0].float().cpu().numpy() for array in (geometry.depth, geometry.depth_confidence)
     )
     cameras = decode_cameras(encoding[0], size, names=names)
-    return Predictions(cameras, True, None, True, *sample_points(depth, sure))
+    shown = (small.permute(0, 2, 3, 1) * 255).byte().numpy()
+    return Predictions(cameras, True, shown, True, *sample_points(depth, sure))
 
 
 def decode_cameras(encoding: Tensor, size: tuple[int, int], *, names: tuple[str, ...]) -> Cameras:

@@ -185,17 +185,23 @@ def _explained(models: Sequence[pycolmap.Reconstruction], pairs: Pairs) -> float
     """
     largest, *rest = sorted(models, key=lambda model: -model.num_reg_images())
     elsewhere = [_names(model) for model in rest]
-    names = {image.image_id: image.name for image in largest.images.values()}
-    shared: Counter[tuple[str, str]] = Counter()
-    for point in largest.points3D.values():
-        seen = sorted({names[element.image_id] for element in point.track.elements})
-        shared.update(combinations(seen, 2))
+    shared = shared_points(largest)
     became = matches = 0
     for pair, count in pairs.items():
         if not any(others.issuperset(pair) for others in elsewhere):
             matches += count
             became += min(count, shared[min(pair), max(pair)])
     return became / max(1, matches)
+
+
+def shared_points(model: pycolmap.Reconstruction) -> Counter[tuple[str, str]]:
+    """Pairs of pictures, each in order of names, and how many points both see."""
+    names = {image.image_id: image.name for image in model.images.values()}
+    shared: Counter[tuple[str, str]] = Counter()
+    for point in model.points3D.values():
+        seen = sorted({names[element.image_id] for element in point.track.elements})
+        shared.update(combinations(seen, 2))
+    return shared
 
 
 def _settle(model: pycolmap.Reconstruction, *, refine: bool) -> None:

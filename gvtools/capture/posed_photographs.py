@@ -11,7 +11,6 @@ import shutil
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
-from itertools import combinations
 from pathlib import Path, PurePosixPath
 
 import cv2
@@ -19,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
+from gvtools.capture.mapping import shared_points
 from gvtools.capture.matching import Say
 from gvtools.capture.photographs import CapturedPhotograph, copy_upright, find_photographs
 from gvtools.capture.placement import place
@@ -44,6 +44,7 @@ from gvtools.scenes.resized import reduced
 from gvtools.scenes.scene import Finding, Scene
 
 Float64 = NDArray[np.float64]
+Pictures = NDArray[np.uint8]
 Size = tuple[int, int]  # width and height [px]
 
 # Longer side of the pictures in which features are found for the adjustment [px].
@@ -104,7 +105,7 @@ def capture_posed(
         copy_upright(kept, work / IMAGES)
         given = predictions.cameras[[rows[item.name] for item in kept]]
         scaled, cut = _scaled_sizes(predictions, kept, given, rows=rows, poses=poses)
-        cameras = _pooled(_reconciled(kept, given, scaled), kept)
+        cameras = _reconciled(kept, given, scaled)
         say(f"comparing the poses with {len(kept)} photographs")
         cameras, scene, forms = _right_form(cameras, work)
         say("adjusting the poses to features of neighbouring pictures")
@@ -117,9 +118,9 @@ def capture_posed(
         _, first = np.unique(point, return_index=True)
         model = build_reconstruction(
             adjusted, np.concatenate([tracks.positions, points]),
-            _colors(scene, both[0][first], both[1][first]),
-            point_index=point, view_index=both[0], xy=both[1],
+            np.zeros((len(first), 3), np.uint8), point_index=point, view_index=both[0], xy=both[1],
         )  # fmt: skip
+        model.extract_colors_for_all_images(str(work / IMAGES))
         locations = {item.name: item.location for item in kept if item.location}
         placement, placed = place(model, locations=locations, distance=distance)
         shutil.rmtree(work / MODEL)
@@ -139,12 +140,12 @@ def capture_posed(
             features="sift",
             matching="neighbours by their poses",
             other_models=(),
-            overlap=_overlap(tracks, adjusted.names),
+            overlap=tuple((*pair, count) for pair, count in sorted(shared_points(model).items())),
             cameras=camera_rows(model),
             metric=placement.metric,
             placed_by=placement.by,
             origin=placement.origin,
-            findings=(*findings, *met, *cut, *forms, *placed),
+            findings=(*findings, *predictions.findings, *met, *cut, *forms, *placed),
         )
         write_json(work / REPORT, asdict(report))
         draw(work, report)
@@ -176,11 +177,9 @@ def _rows(
         str, lambda name: PurePosixPath(name).name, lambda name: PurePosixPath(name).stem
     )  # fmt: skip
     for key in keys:
-        own = Counter(key(name) for name in there)
-        told = {key(name): row for row, name in enumerate(predictions.cameras.names)}
-        rows = {
-            name: told[key(name)] for name in there if key(name) in told and own[key(name)] == 1
-        }
+        own, told = (Counter(map(key, names)) for names in (there, predictions.cameras.names))
+        number = {key(name): row for row, name in enumerate(predictions.cameras.names)}
+        rows = {name: number[key(name)] for name in there if own[key(name)] == told[key(name)] == 1}
         if len(rows) > 1:
             text = (
                 f"{count - len(rows)} of {count} cameras of {poses} are of no picture of {source}"
@@ -205,19 +204,53 @@ def _scaled(fit: str, photo: Size, net: Size) -> tuple[float, float]:
     return width * scale, height * scale
 
 
-def _difference(rgb: NDArray[np.uint8], shown: NDArray[np.uint8], fit: str) -> float:
-    """By how much a network's picture differs from a photograph under a fit [grey levels]."""
-    net = shown.shape[1], shown.shape[0]
+def _shown(rgb: NDArray[np.uint8], net: Size, fit: str) -> Pictures:
+    """(2, h, w, 3) what a network sees of a photograph under a fit, padded in black and white."""
     scale = np.array(_scaled(fit, (rgb.shape[1], rgb.shape[0]), net)) / rgb.shape[1::-1]
     shift = (np.array(net) - scale * rgb.shape[1::-1]) / 2 + scale / 2 - 0.5
     small = cv2.blur(rgb, [max(1, round(1 / side)) for side in scale])
     matrix = np.column_stack([np.diag(scale), shift])
-    # What a fit pads is white or black in the network's picture.
-    black, white = (
-        cv2.absdiff(cv2.warpAffine(small, matrix, net, borderValue=(tone,) * 3), shown)
-        for tone in (0, 255)
-    )
-    return float(np.minimum(black, white).mean())
+    return np.stack([
+        cv2.warpAffine(small, matrix, net, borderValue=(tone,) * 3) for tone in (0, 255)
+    ]).astype(np.uint8)  # fmt: skip
+
+
+def _difference(shown: Pictures, picture: NDArray[np.uint8]) -> float:
+    """By how much a network's picture differs from what it is shown [grey levels]."""
+    return float(np.minimum(*(cv2.absdiff(each, picture) for each in shown)).mean())
+
+
+def _fit_of(
+    pictures: Pictures, items: Sequence[CapturedPhotograph], rows: dict[str, int], *, poses: Path
+) -> str:
+    """The fit under which photographs are the network's pictures, each its own."""
+    height, width = pictures.shape[1:3]
+    looked = [items[row] for row in np.unique(np.linspace(0, len(items) - 1, COMPARED).round(0))
+              .astype(int)]  # fmt: skip
+    shown = {fit: [_shown(read_image(item.path).rgb, (width, height), fit) for item in looked]
+             for fit in FITS}  # fmt: skip
+    own = [pictures[rows[item.name]] for item in looked]
+    errors = {fit: np.median(list(map(_difference, shown[fit], own))) for fit in FITS}
+    fit = min(FITS, key=lambda fit: errors[fit])
+    if errors[fit] > SAME:
+        raise ProjectError(
+            f"--poses {poses}: its pictures differ from the photographs by {errors[fit]:.0f} "
+            f"grey levels, expected at most {SAME:.0f}; give the folder that the network saw"
+        )
+    small = [_reduced(picture) for picture in pictures]
+    for item, pair in zip(looked, shown[fit], strict=True):
+        apart = [_difference(np.stack(list(map(_reduced, pair))), other) for other in small]
+        if 2 * min(apart) < apart[rows[item.name]]:
+            raise ProjectError(
+                f"--poses {poses}: its picture {rows[item.name] + 1} is to be {item.name}, which "
+                f"looks like number {np.argmin(apart) + 1}; expected the order of names as text; "
+                "rename the photographs so that this is the order in which the network saw them"
+            )
+    return fit
+
+
+def _reduced(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    return np.asarray(cv2.resize(picture, (32, 32), interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def _scaled_sizes(
@@ -226,48 +259,43 @@ def _scaled_sizes(
 ) -> tuple[Float64, list[Finding]]:  # fmt: skip
     """(V, 2) sizes of whole photographs in the network's pixels, by its pictures or by sizes."""
     nets: list[Size] = list(zip(given.width.tolist(), given.height.tolist(), strict=True))
-    near = all(
+    fits = {}
+    for size in {item.size for item in items}:
+        if predictions.pictures is not None:
+            alike = [item for item in items if item.size == size]
+            fits[size] = _fit_of(predictions.pictures, alike, rows, poses=poses)
+    near = predictions.stretched and all(
         abs(w / item.size[0] * item.size[1] - h) < LARGEST_PATCH
         for item, (w, h) in zip(items, nets, strict=True)
     )
-    fit = FITS[0] if near and predictions.stretched else FITS[1]
-    told = (
-        f"{poses} is of pictures of {nets[0][0]}x{nets[0][1]} pixels: the photographs are taken to"
-    )
-    told += " have been stretched to it" if fit == FITS[0] else " have been reduced and cut to it"
-    if predictions.pictures is not None:
-        looked = [items[at] for at in np.unique(np.linspace(0, len(items) - 1, COMPARED).round(0))
-                  .astype(int)]  # fmt: skip
-        pairs = [(read_image(i.path).rgb, predictions.pictures[rows[i.name]]) for i in looked]
-        errors = {fit: np.median([_difference(*pair, fit) for pair in pairs]) for fit in FITS}
-        fit = min(FITS, key=lambda fit: errors[fit])
-        if errors[fit] > SAME:
-            raise ProjectError(
-                f"--poses {poses}: its pictures differ from the photographs by {errors[fit]:.0f} "
-                f"grey levels, expected at most {SAME:.0f}; give the folder that the network saw"
-            )
-    sizes = np.array([_scaled(fit, i.size, net) for i, net in zip(items, nets, strict=True)])
-    known = predictions.pictures is not None or [item.size for item in items] == nets
-    return sizes, [] if known else [Finding("info", told)]
+    guess = "stretch" if near else "cover"
+    sizes = np.array([
+        _scaled(fits.get(item.size, guess), item.size, net)
+        for item, net in zip(items, nets, strict=True)
+    ])  # fmt: skip
+    if fits or [item.size for item in items] == nets:
+        return sizes, []
+    of = f"{poses} is of pictures of {nets[0][0]}x{nets[0][1]} pixels"
+    if not predictions.has_names and np.ptp(sizes.max(axis=1)) > LARGEST_PATCH:
+        raise ProjectError(
+            f"--poses {of}, and the photographs are of several shapes: how each was cut is not "
+            "told; expected the network's pictures as well (Depth Anything 3: --export-format npz)"
+        )
+    how = "stretched" if near else "reduced and cut"
+    return sizes, [Finding("info", f"{of}: the photographs are taken to have been {how} to it")]
 
 
 def _reconciled(items: Sequence[CapturedPhotograph], given: Cameras, scaled: Float64) -> Cameras:
-    """The cameras of the photographs themselves."""
+    """The cameras of the photographs: one K, the median, for one camera's, where they agree."""
     photo, K = np.array([item.size for item in items]), given.K.copy()
     K[:, :2, 2] -= (np.column_stack([given.width, given.height]) - scaled) / 2
     K[:, :2] *= (photo / scaled)[..., None]
-    names = tuple(item.name for item in items)
-    return Cameras(K, given.cam_from_world, photo[:, 0], photo[:, 1], names)
-
-
-def _pooled(cameras: Cameras, items: Sequence[CapturedPhotograph]) -> Cameras:
-    """One K, the median, for the pictures of one camera, where the network's agree."""
-    K = cameras.K.copy()
     for camera in {item.camera for item in items}:
         mine = [row for row, item in enumerate(items) if item.camera == camera]
         if np.ptp(K[mine, 0, 0]) <= ONE_FOCAL * np.median(K[mine, 0, 0]):
             K[mine] = np.median(K[mine], axis=0)
-    return replace(cameras, K=K)
+    names = tuple(item.name for item in items)
+    return Cameras(K, given.cam_from_world, photo[:, 0], photo[:, 1], names)
 
 
 def _right_form(cameras: Cameras, work: Path) -> tuple[Cameras, Scene, list[Finding]]:
@@ -323,22 +351,3 @@ def _seen_points(
     rays = np.einsum("mij,mj->mi", np.linalg.inv(adjusted.K)[view], rays) * z[:, None]
     back = adjusted.world_from_cam[view]
     return view, xy, np.einsum("mij,mj->mi", back[:, :3, :3], rays) + back[:, :3, 3]
-
-
-def _overlap(tracks: Tracks, names: Sequence[str]) -> tuple[tuple[str, str, int], ...]:
-    """Pairs of pictures that see common points, and how many."""
-    views: dict[int, set[int]] = {}
-    for point, view in zip(tracks.point.tolist(), tracks.view.tolist(), strict=True):
-        views.setdefault(point, set()).add(view)
-    pairs = Counter(pair for seen in views.values() for pair in combinations(sorted(seen), 2))
-    return tuple((names[a], names[b], count) for (a, b), count in sorted(pairs.items()))
-
-
-def _colors(scene: Scene, view: NDArray[np.int64], xy: Float64) -> NDArray[np.uint8]:
-    """(M, 3) colours of places in views."""
-    colors = np.zeros((len(view), 3), np.uint8)
-    for row in np.unique(view):
-        rgb, mine = scene.views[row].load().rgb, view == row
-        x, y = xy[mine].astype(int).T
-        colors[mine] = rgb[y.clip(0, rgb.shape[0] - 1), x.clip(0, rgb.shape[1] - 1)]
-    return colors

@@ -1,11 +1,13 @@
 """Cameras and points as feed-forward networks save them: arrays by name, or a COLMAP model.
 
 VGGT (``predictions.npz``, ``sparse``), Depth Anything 3 (``exports/npz``, ``mini_npz``, COLMAP),
-MapAnything (``predictions.npz``, ``sparse``), DUSt3R and MASt3R (poses, focal lengths, ``pts3d``).
+MapAnything (``predictions.npz``, ``sparse``), DUSt3R and MASt3R (poses, focal lengths, ``pts3d``),
+Pi3 (``predictions.npz``: points alone tell the focal lengths), CUT3R (files of each picture).
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,28 +16,39 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras, invert_rigid, rigid_transform
-from gvtools.errors import ProjectError
+from gvtools.errors import ProjectError, ShapeError
 from gvtools.scenes.colmap_model import find_model, load_model
+from gvtools.scenes.images import read_image
 from gvtools.scenes.matching import named
+from gvtools.scenes.scene import Finding
 from gvtools.untrusted import archive, load_array, load_arrays, reading
 
 Arrays = dict[str, NDArray[Any]]
 
 # What the arrays are called. Poses map from the world to the camera, or back.
 FROM_WORLD = ("extrinsics", "extrinsic", "cam_from_world", "w2c")
-TO_WORLD = ("camera_poses", "cam2world", "cams2world", "world_from_cam", "c2w", "im_poses", "poses")
+TO_WORLD = (
+    "camera_poses", "cam2world", "cams2world", "world_from_cam", "c2w", "im_poses", "poses", "pose"
+)  # fmt: skip
 INTRINSICS, FOCALS = ("intrinsics", "intrinsic", "K", "Ks"), ("focals", "focal", "im_focals")
 DEPTH = ("depth", "depth_map", "depthmaps", "depths", "depth_z")
 POINTS = ("world_points", "pts3d", "points")
 SURE = ("depth_conf", "world_points_conf", "conf", "confs", "im_conf")
 PICTURES = ("images", "image", "imgs", "img_no_norm")
-EVERY = (*FROM_WORLD, *TO_WORLD, *INTRINSICS, *FOCALS, *DEPTH, *POINTS, *SURE, *PICTURES)
+EVERY = {*FROM_WORLD, *TO_WORLD, *INTRINSICS, *FOCALS, *DEPTH, *POINTS, *SURE, *PICTURES}
 # Points that are kept, of those no less certain than the median.
 MOST_POINTS = 50_000
 EXPECTED = (
     "expected poses (extrinsics, extrinsic, camera_poses, cam2world) and intrinsics in .npz or "
-    ".npy, or a COLMAP model, as VGGT, Depth Anything 3, MapAnything, DUSt3R or MASt3R save them"
+    ".npy, or a COLMAP model, as VGGT, Depth Anything 3, MapAnything, DUSt3R, MASt3R, Pi3 or CUT3R "
+    "save them"
 )
+# What files of other kinds lack.
+LACKS = {
+    ".glb": "a scene to look at: cameras are drawn in it, without intrinsics or names of pictures",
+    ".ply": "points without cameras",
+    **dict.fromkeys((".pt", ".pth", ".pkl", ".pickle"), "it needs pickle, which may hold code"),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +62,7 @@ class Predictions:
     view: NDArray[np.int64]  # (M,) the camera of each point
     xy: NDArray[np.float64]  # (M, 2) where that sees it [px of the network's picture]
     points: NDArray[np.float64]  # (M,) z-depth in that camera, or (M, 3) in the world
+    findings: tuple[Finding, ...] = ()
 
 
 def read_predictions(path: Path) -> Predictions:
@@ -56,23 +70,45 @@ def read_predictions(path: Path) -> Predictions:
     model = find_model(path) if path.is_dir() else None
     if model is not None:
         return _from_colmap(model)
-    # Of several files, as Depth Anything 3 writes, the one that tells most.
+    with reading(f"--poses {path}", EXPECTED, also=(ShapeError,)):
+        return _from_arrays(_fullest(path))
+
+
+def _fullest(path: Path) -> Arrays:
+    """The arrays of a file, or of that which tells most of a folder's, as Depth Anything 3's."""
+    files = sorted(path.rglob("*.np[yz]")) if path.is_dir() else [path]
+    frames = [file for file in files if file.parent == path / "camera"]
+    if frames:
+        return _of_frames(path, [file.stem for file in frames])
     fullest: Arrays = {}
-    with reading(f"--poses {path}", EXPECTED):
-        files = sorted(path.rglob("*.np[yz]")) if path.is_dir() else [path]
-        for folder in sorted({file.parent for file in files}):
-            alone = [file for file in files if file.parent == folder and file.stem in EVERY]
-            arrays = {file.stem: load_array(file) for file in alone if file.suffix == ".npy"}
-            fullest = max(fullest, arrays, key=len)
-        for file in files:
-            if file.suffix != ".npy":
-                with archive(file) as opened:
-                    held = {name.removesuffix(".npy") for name in opened.namelist()} & {*EVERY}
-                # Of points that depth tells as well, VGGT's would take gigabytes.
-                held -= {*POINTS} if held & {*DEPTH} else set()
-                if len(held) > len(fullest):
-                    fullest = load_arrays(file, *sorted(held))
-        return _from_arrays(fullest)
+    for folder in sorted({file.parent for file in files}):
+        alone = [file for file in files if file.parent == folder and file.stem in EVERY]
+        arrays = {file.stem: load_array(file) for file in alone if file.suffix == ".npy"}
+        fullest = max(fullest, arrays, key=len)
+    for file in files:
+        if file.suffix not in (".npy", ".npz") and file.is_file():
+            raise ValueError(LACKS.get(file.suffix.lower(), f"of the kind {file.suffix!r}"))
+        if file.suffix != ".npy":
+            with archive(file) as opened:
+                held = {name.removesuffix(".npy") for name in opened.namelist()} & EVERY
+            # Of points that depth tells as well, VGGT's would take gigabytes.
+            held -= {*POINTS} if held & {*DEPTH} else set()
+            if len(held) > len(fullest):
+                fullest = load_arrays(file, *sorted(held))
+    return fullest
+
+
+def _of_frames(path: Path, names: Sequence[str]) -> Arrays:
+    """What CUT3R saves of each picture in ``camera``, ``depth``, ``conf`` and ``color``."""
+    cameras = [load_arrays(path / f"camera/{name}.npz", "pose", "intrinsics") for name in names]
+    arrays = {key: np.stack([camera[key] for camera in cameras]) for key in ("pose", "intrinsics")}
+    for kind in ("depth", "conf"):
+        if (path / kind).is_dir():
+            arrays[kind] = np.stack([load_array(path / kind / f"{name}.npy") for name in names])
+    if (path / "color").is_dir():
+        colors = [read_image(path / "color" / f"{name}.png").rgb for name in names]
+        arrays["images"] = np.stack(colors)
+    return arrays
 
 
 def _from_arrays(arrays: Arrays) -> Predictions:
@@ -87,8 +123,9 @@ def _from_arrays(arrays: Arrays) -> Predictions:
             raise ValueError(f"{name} is of shape {arrays[name].shape} and type {found.dtype}")
         return found
 
-    poses, K = one((*FROM_WORLD, *TO_WORLD), 3), one(INTRINSICS, 3)
+    poses, K, focals = one((*FROM_WORLD, *TO_WORLD), 3), one(INTRINSICS, 2, 3), one(FOCALS, 1, 2)
     depth, world, pictures = one(DEPTH, 3, 4), one(POINTS, 4), one(PICTURES, 4)
+    sure = one(SURE, 3, 4)
     if poses is None:
         raise ValueError(f"no poses among {named(sorted(arrays)) or 'its arrays'}")
     rigid = np.stack([
@@ -97,42 +134,61 @@ def _from_arrays(arrays: Arrays) -> Predictions:
     # MapAnything names so what maps to the world, as 4x4.
     to_world = not arrays.keys() & {*FROM_WORLD}
     to_world |= "extrinsic" in arrays and poses.shape[1:] == (4, 4)
-    if depth is not None and depth.ndim == 4:
-        depth = depth[..., 0]
+    rigid = invert_rigid(rigid) if to_world else rigid
+    depth, sure = (
+        each[..., 0] if each is not None and each.ndim == 4 else each for each in (depth, sure)
+    )
     if pictures is not None:
         if pictures.shape[1] == 3:
             pictures = pictures.transpose(0, 2, 3, 1)
         if pictures.dtype.kind == "f":
             low = -1 if np.nanmin(pictures) < -0.05 else 0
             pictures = np.clip((pictures - low) / (1 - low), 0, 1) * 255
-    shaped = next((array for array in (depth, world, pictures) if array is not None), None)
-    focals = None if shaped is None else one(FOCALS, 1, 2)
-    if K is None and (focals is None or shaped is None):
-        raise ValueError("no intrinsics, nor focal lengths with depth, points or pictures")
-    if K is None or shaped is not None:
-        assert shaped is not None
-        height, width = shaped.shape[1:3]
+    shaped = [each for each in (depth, world, pictures, sure) if each is not None]
+    if shaped:
+        height, width = shaped[0].shape[1:3]
+    elif K is not None:
+        width, height = np.rint(2 * K[..., :2, 2].reshape(-1, 2)[0]).astype(int)
     else:
-        width, height = np.rint(2 * K[0, :2, 2]).astype(int)
+        raise ValueError("no intrinsics, nor focal lengths with depth, points or pictures")
+    for each in shaped:
+        if each.shape[:3] != (len(poses), height, width):
+            raise ValueError(f"{len(poses)} poses of {width}x{height} pixels beside {each.shape}")
+    if K is None and focals is None and world is not None:
+        focals = _focal_lengths(world, rigid)
     if K is None:
-        assert focals is not None
+        if focals is None:
+            raise ValueError("neither intrinsics nor points that tell them")
         K = np.tile([[1.0, 0, width / 2], [0, 1.0, height / 2], [0, 0, 1]], (len(focals), 1, 1))
         K[:, [0, 1], [0, 1]] = focals.reshape(len(focals), -1)
-    if not (K.shape[1:] == (3, 3) and len(K) == len(poses) and np.isfinite(K).all()):
+    # One is of all pictures.
+    K = np.broadcast_to(K, (len(poses), *K.shape[-2:])) if K.size == 9 else K
+    if K.shape != (len(poses), 3, 3) or not np.isfinite(K).all():
         raise ValueError(f"{len(poses)} poses, and intrinsics of shape {K.shape} or not finite")
     if not (K[:, [0, 1], [0, 1]] > 0).all():
         raise ValueError("focal lengths that are not above 0")
-    for array in (depth, world, pictures):
-        if array is not None and array.shape[:3] != (len(poses), height, width):
-            raise ValueError(f"{len(poses)} poses of {width}x{height} pixels beside {array.shape}")
     K = np.where([[1, 0, 1], [0, 1, 1], [0, 0, 1]], K, 0).astype(np.float64)
-    cameras = Cameras(
-        K, invert_rigid(rigid) if to_world else rigid, np.array(width), np.array(height), ()
-    )
-    seen = sample_points(depth if depth is not None else world, one(SURE, 3, 4))
+    cameras = Cameras(K, rigid, np.array(width), np.array(height), ())
+    seen = sample_points(depth if depth is not None else world, sure)
     stretched = not to_world and not np.allclose(K[:, 0, 0], K[:, 1, 1], rtol=1e-6)
     shown = None if pictures is None else pictures.astype(np.uint8)
     return Predictions(cameras, False, shown, stretched, *seen)
+
+
+def _focal_lengths(world: NDArray[Any], poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(V, 2) by which cameras with principal points in the middle see points at their pixels."""
+    height, width = world.shape[1:3]
+    x, y = np.arange(width) + 0.5 - width / 2, np.arange(height) + 0.5 - height / 2
+    found = []
+    for pose, points in zip(poses, world, strict=True):
+        local = points @ pose[:3, :3].T + pose[:3, 3]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            along = x[None] * local[..., 2] / local[..., 0]
+            down = y[:, None] * local[..., 2] / local[..., 1]
+        # Near the middle they hang by little.
+        outer = np.abs(x) > width / 8, np.abs(y) > height / 8
+        found.append([np.nanmedian(along[:, outer[0]]), np.nanmedian(down[outer[1]])])
+    return np.array(found)
 
 
 def sample_points(
@@ -144,10 +200,10 @@ def sample_points(
     usable = np.isfinite(values) & (values > 0) if values.ndim == 3 else (
         np.isfinite(values).all(axis=3)
     )  # fmt: skip
-    if sure is not None and sure.size == usable.size:
-        usable &= sure.reshape(usable.shape) >= np.nanmedian(sure)
-    rows = np.flatnonzero(usable)
-    rows = np.random.default_rng(0).permutation(rows)[:MOST_POINTS]
+    if sure is not None:
+        sure = np.nan_to_num(sure)
+        usable &= sure >= np.median(sure)
+    rows = np.random.default_rng(0).permutation(np.flatnonzero(usable))[:MOST_POINTS]
     view, y, x = np.unravel_index(np.sort(rows), usable.shape)
     xy = np.column_stack([x, y]).astype(np.float64) + 0.5
     return view.astype(np.int64), xy, values[view, y, x].astype(np.float64)
@@ -170,14 +226,16 @@ def _from_colmap(folder: Path) -> Predictions:
         np.array([lens.width for lens in lenses]), np.array([lens.height for lens in lenses]),
         tuple(image.name for image in images),
     )  # fmt: skip
-    # Each point as the first picture shows it.
-    found: dict[int, tuple[int, Any, Any]] = {}
+    # Each point as the first camera sees it: where VGGT says that pictures show it, they do not.
+    first: dict[int, int] = {}
     for row, image in enumerate(images):
         for seen in model.images[image.image_id].get_observation_points2D():
-            key = int(seen.point3D_id)
-            if key not in found and key in model.points3D:
-                found[key] = row, seen.xy, model.points3D[key].xyz
-    kept = list(found.values())[:: max(1, -(-len(found) // MOST_POINTS))]
-    view = np.array([row for row, _, _ in kept], np.int64)
-    xy, points = (np.array([item[at] for item in kept]).reshape(-1, at + 1) for at in (1, 2))
-    return Predictions(cameras, True, None, False, view, xy, points)
+            first.setdefault(int(seen.point3D_id), row)
+    kept = sorted(first.keys() & model.points3D.keys())[:: max(1, -(-len(first) // MOST_POINTS))]
+    view = np.array([first[key] for key in kept], np.int64)
+    points = np.array([model.points3D[key].xyz for key in kept]).reshape(-1, 3)
+    pose = cameras.cam_from_world[view]
+    local = np.einsum("mij,mj->mi", pose[:, :3, :3], points) + pose[:, :3, 3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        xy = np.einsum("mij,mj->mi", cameras.K[view], local / local[:, 2:])[:, :2]
+    return Predictions(cameras, True, None, False, view, xy, points, loaded.findings)

@@ -69,9 +69,9 @@ class CaptureCommand(RecordingArguments):
     lens: Literal["auto", "perspective", "equirectangular", "fisheye"] | None = None
     """Of the pictures (auto: recognised from them); panoramas are cut into faces."""
     poses: Path | None = None
-    """What VGGT, Depth Anything 3, MapAnything, DUSt3R or MASt3R saved for the photographs: .npz,
-    .npy or a COLMAP model, refined where features match; or a folder of Depth Anything 3's
-    weights. [FILE|DIR]"""
+    """What VGGT, Depth Anything 3, MapAnything, DUSt3R, MASt3R, Pi3 or CUT3R saved for the
+    photographs: .npz, .npy or a COLMAP model, refined where features match; or a folder of Depth
+    Anything 3's weights. [FILE|DIR]"""
 
     def run(self, console: Console) -> None:
         given = {
@@ -291,6 +291,8 @@ def _draw(out: Path, report: CaptureReport | RgbdCaptureReport, *, title: str) -
 
     Behind them the sparse points, or the depth of some keyframes.
     """
+    import numpy as np
+
     from gvtools.capture.rgbd_project import RgbdCaptureReport, points_from_above
     from gvtools.files import replaced_when_written
     from gvtools.scenes.project import open_project
@@ -301,8 +303,8 @@ def _draw(out: Path, report: CaptureReport | RgbdCaptureReport, *, title: str) -
         pictures = "frames"
         cameras, points = points_from_above(scene, report.keyframes)
     else:
-        assert scene.points is not None
-        pictures, cameras, points = "pictures", scene.cameras, scene.points.positions
+        pictures, cameras = "pictures", scene.cameras
+        points = np.zeros((0, 3)) if scene.points is None else scene.points.positions
     title = f"{title}: {len(report.registered)} of {report.pictures} {pictures}"
     figure = draw_capture(cameras, points, report.overlap, title=title)
     with replaced_when_written(out / PICTURE) as temporary:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -194,6 +195,62 @@ def test_a_wrong_count_is_refused(truth, depths, room, tmp_path, capsys):
     )
     assert "10 cameras without names" in line and "9 pictures" in line
     assert not (tmp_path / "out").exists()
+
+
+def test_pictures_in_another_order_are_refused(truth, room, tmp_path, capsys):
+    """Faint ones, as those of a slow film: each resembles its neighbours."""
+    cameras, pictures = truth
+    faint = [100 + rgb // 6 for rgb in pictures]
+    (tmp_path / "images").mkdir()
+    for name, rgb in zip(cameras.names, faint, strict=True):
+        cv2.imwrite(str(tmp_path / "images" / name), rgb)
+    np.savez(
+        tmp_path / "x.npz", extrinsics=cameras.cam_from_world, intrinsics=cameras.K,
+        images=np.roll(faint, 1, axis=0),
+    )  # fmt: skip
+    line = refused(
+        capsys, "capture", tmp_path / "images", "--poses", tmp_path / "x.npz", "--out",
+        tmp_path / "out",
+    )  # fmt: skip
+    assert "picture 1 is to be 0.png, which looks like number 2" in line
+
+
+def test_pictures_of_several_shapes_need_those_of_the_network(truth, room, tmp_path, capsys):
+    cameras, pictures = truth
+    (tmp_path / "images").mkdir()
+    for row, (name, rgb) in enumerate(zip(cameras.names, pictures, strict=True)):
+        cv2.imwrite(str(tmp_path / "images" / name), rgb[: 120 - 40 * (row == 3)])
+    np.savez(
+        tmp_path / "x.npz", extrinsics=cameras.cam_from_world, intrinsics=cameras.K,
+        depth=np.ones((10, 70, 84)),
+    )  # fmt: skip
+    line = refused(
+        capsys, "capture", tmp_path / "images", "--poses", tmp_path / "x.npz", "--out",
+        tmp_path / "out",
+    )  # fmt: skip
+    assert "of 84x70 pixels, and the photographs are of several shapes" in line
+
+
+def test_a_name_that_two_cameras_share_is_no_pictures(truth, room, tmp_path, capsys):
+    cameras = replace(truth[0], names=tuple(f"{'ab'[row % 2]}/{row // 2}.png" for row in range(10)))
+    write_colmap(tmp_path / "sparse", cameras)
+    line = refused(
+        capsys, "capture", room / "images", "--poses", tmp_path, "--out", tmp_path / "out"
+    )
+    assert "cameras of a/0.png" in line
+
+
+def test_poses_alone_of_pictures_without_features_become_a_project(truth, tmp_path):
+    cameras = truth[0][:3]
+    (tmp_path / "images").mkdir()
+    for row, name in enumerate(cameras.names):
+        rgb = np.repeat(np.mgrid[:120, :160].sum(axis=0)[..., None] * (row + 2) // 8, 3, axis=2)
+        cv2.imwrite(str(tmp_path / "images" / name), rgb.astype(np.uint8))
+    np.savez(tmp_path / "x.npz", extrinsics=cameras.cam_from_world, intrinsics=cameras.K)
+    run_command(
+        "capture", tmp_path / "images", "--poses", tmp_path / "x.npz", "--out", tmp_path / "out"
+    )
+    assert len(open_project(tmp_path / "out")) == 3
 
 
 @pytest.mark.parametrize(
