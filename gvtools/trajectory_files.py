@@ -34,6 +34,7 @@ _DECIMAL = re.compile(r"[+-]?\d+(,\d+)?(e[+-]?\d+)?", re.IGNORECASE)
 _ZERO = re.compile(r"[+-]?0*\.?0*(e[+-]?\d+)?", re.IGNORECASE)
 _LOST = {f"{sign}{word}" for sign in ("", "+", "-") for word in ("nan", "inf", "infinity")}
 _UNIT = re.compile(r"\s*[\[(]\s*([^\])]*?)\s*[\])]")
+_PART = re.compile(r"(?:\w+_)?(n|nano)?sec(?:s|onds)?")
 _TIME = re.compile(r"(?:\w+_)?(?:time|(?:time_?)?stamps?|n?secs?|seconds|t)(?:_(ns|us|ms|s))?")
 _TURN = re.compile(r"(?:q|quat\w*?|rot\w*?|ori\w*?)(?:[._]\w+)??[._]?([xyzw])(?:_world\w*)?")
 _PLACE = re.compile(r"(?:t|p|pos\w*?|trans\w*?)?(?:[._]\w+)??[._]?([xyz])(?:_world\w*)?")
@@ -124,7 +125,8 @@ def read_poses(path: str | Path, *, layout: str = "auto", lost: bool = False) ->
 class _Form:
     """How the lines of a file are read."""
 
-    columns: tuple[int, ...] | None  # of time, position and quaternion (x, y, z, w); None: KITTI's
+    # Of time, position, quaternion (x, y, z, w) and the time's nanoseconds, if any; None: KITTI's.
+    columns: tuple[int, ...] | None
     more: bool = False  # whether there may be more columns
     unit: str = ""  # of the time stamps, as the head names it
     notes: tuple[str, ...] = ()
@@ -253,6 +255,7 @@ def read_trajectory(path: str | Path, like: Cameras, *, layout: str = "auto") ->
     form, rows = _form(path, layout)
     for _, words in rows:
         name = words[form.columns[0]] if form.columns else f"{len(names):06d}"
+        name = ".".join([name, *(words[column].zfill(9) for column in (form.columns or ())[8:])])
         name = words[0] if form.columns is None and len(words) % 4 else name
         # Published ground truth holds repeated timestamps; names have to differ.
         repeats[name] = repeats.get(name, -1) + 1
@@ -267,7 +270,7 @@ def _rows(
 ) -> tuple[tuple[tuple[int, ...], str] | None, list[tuple[int, list[str]]], bool]:
     """Columns and unit that a head names, line numbers and words, whether commas part them."""
     try:
-        text = read_text(path)
+        text = read_text(path).replace('"', "")
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "not a text file"
         raise ProjectError(f"{path}: cannot be read as a trajectory ({reason})") from error
@@ -302,13 +305,16 @@ def _joined(rows: list[tuple[int, list[str]]]) -> list[tuple[int, list[str]]]:
 
 
 def _head(line: str) -> tuple[tuple[int, ...], str] | None:
-    """Columns of time, position and quaternion (x, y, z, w), and the time's unit."""
+    """Columns as ``_Form`` has them, and the time's unit."""
     line = _UNIT.sub(r"[\1]", line.strip().lstrip("#%").strip().lower())
     found: dict[str, int] = {}
+    parts: dict[bool, int] = {}
     unit = ""
     for column, word in enumerate(re.split(r"\s*[,;]\s*|\s+", line)):
         name, _, given = word.rstrip("]").partition("[")
         name = "_".join(name.split(".")[-2:])
+        if match := _PART.fullmatch(name):
+            parts.setdefault(bool(match[1]), column)
         if (match := _TURN.fullmatch(name)) and "q" + match[1] not in found:
             found["q" + match[1]] = column
         elif (match := _TIME.fullmatch(name)) and "time" not in found:
@@ -317,7 +323,10 @@ def _head(line: str) -> tuple[tuple[int, ...], str] | None:
             unit = {"n": "ns", "u": "us", "µ": "us", "m": "ms", "s": "s"}.get(given[:1], "")
         elif (match := _PLACE.fullmatch(name)) and match[1] not in found:
             found[match[1]] = column
-    keys = ("time", "x", "y", "z", "qx", "qy", "qz", "qw")
+    keys = ["time", "x", "y", "z", "qx", "qy", "qz", "qw"]
+    if len(parts) == 2:  # of a time's seconds and the nanoseconds that belong to them
+        found["time"], found["fraction"], unit = parts[False], parts[True], "s"
+        keys.append("fraction")
     return (tuple(found[key] for key in keys), unit) if set(keys) <= set(found) else None
 
 
@@ -338,12 +347,13 @@ def _read(
             if defect > ROTATION_ROUNDING:
                 poses[i] = nearest
         return stamps, poses
-    values = np.empty((len(rows), 8))
+    values = np.empty((len(rows), len(columns)))
     for i, (number, words) in enumerate(rows):
         if len(words) > max(columns) and (len(words) == 8 or more):
             words = [words[column] for column in columns]
-        values[i] = _numbers(words, 8, where=f"{path}:{number}")
-    norms = np.linalg.norm(values[:, 4:], axis=1)
+        values[i] = _numbers(words, len(columns), where=f"{path}:{number}")
+    turns = values[:, 4:8]
+    norms = np.linalg.norm(turns, axis=1)
     if (wrong := np.flatnonzero(np.abs(norms - 1) > QUATERNION_TOLERANCE)).size:
         raise ProjectError(
             f"{path}:{rows[wrong[0]][0]}: a quaternion of length {norms[wrong[0]]:.6g}; expected 1 "
@@ -351,9 +361,9 @@ def _read(
         )
     from scipy.spatial.transform import Rotation
 
-    poses[:, :3, :3] = Rotation.from_quat(values[:, 4:]).as_matrix()
+    poses[:, :3, :3] = Rotation.from_quat(turns).as_matrix()
     poses[:, :3, 3] = values[:, 1:4]
-    return values[:, 0], poses
+    return values[:, 0] + 1e-9 * values[:, 8:].sum(axis=1), poses
 
 
 def _matrix(words: list[str], count: int, *, where: str) -> tuple[float, Float64]:
@@ -375,7 +385,10 @@ def _numbers(words: list[str], count: int, *, where: str) -> Float64:
     try:
         values = np.array([float(word) for word in words])
     except ValueError as error:
-        raise ProjectError(f"{where}: {str(error)[:200]}; expected {count} numbers") from None
+        raise ProjectError(
+            f"{where}: {str(error)[:200]}; expected {count} numbers, or a first line that names "
+            f"the columns ({_NAMES['tum']})"
+        ) from None
     if not np.isfinite(values).all():
         raise ProjectError(f"{where}: NaN or infinity; remove the line or mend it")
     return values

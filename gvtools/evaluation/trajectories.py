@@ -357,7 +357,9 @@ def by_time(
     if not len(kept):
         step = float(np.median(np.diff(np.sort(long)))) if len(long) > 1 else 0.0
         near = "or a greater largest difference" if gaps.min() < step / 2 else "if clocks differ"
-        spans = " and ".join(f"{times.min():.6g} to {times.max():.6g}" for times in (first, second))
+        spans = " and ".join(
+            f"{times.min():.12g} to {times.max():.12g}" for times in (first, second)
+        )
         raise DegenerateError(
             f"association by time: no pair within {max_difference:g} s, the nearest are "
             f"{gaps.min():.3g} s apart ({spans} s); give an offset, {near}"

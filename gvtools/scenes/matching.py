@@ -100,7 +100,12 @@ def _leading_number(path: Path) -> int | str:
     return int(match.group(1)) if match else path.stem
 
 
-STAMP = re.compile(r"\d+\.\d+|\d{13,19}")
+# A name's time, after what all share in front: seconds, seconds and nanoseconds, or a whole number
+# of a finer unit, which no date is (20261127083015).
+STAMP = re.compile(
+    r"\d+\.\d+|(?P<prefix>.*?(?<!\d))(?:\d{9,10}\.\d+|\d{9,10}[_-]\d{9}|"
+    r"(?!(?:19|20)\d\d[01]\d[0-3]\d{7}(?:\d{3})?$)\d{13,19})"
+)
 # What else than a picture's suffix the same frame's files end in, as 7-Scenes has them.
 _KINDS = (".color", ".rgb")
 
@@ -121,13 +126,18 @@ def stem(name: str) -> str:
 def times_in(names: Sequence[str]) -> Float64 | None:
     """(N,) seconds, where every picture is named by a time of its own; else None.
 
+    What stands in front of the times has to be the same.
+
     >>> times_in(["cam0/1403636579763555584.png", "cam0/1403636579813555456.png"]).round(2)
     array([1.40363658e+09, 1.40363658e+09])
     """
     stems = [PurePosixPath(stem(name)).name for name in names]
-    if not len(names) == len(set(stems)) > 0 or not all(map(STAMP.fullmatch, stems)):
+    matches = [match for match in map(STAMP.fullmatch, stems) if match]
+    if not len(names) == len(set(stems)) == len(matches) > 0:
         return None
-    return in_seconds(np.array(stems, np.float64))
+    prefixes = {match["prefix"] or "" for match in matches}
+    texts = [text[len(min(prefixes)) :].replace("_", ".").replace("-", ".") for text in stems]
+    return in_seconds(np.array(texts, np.float64)) if len(prefixes) == 1 else None
 
 
 def paired(first: Sequence[str], second: Sequence[str]) -> list[tuple[int, int]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -236,11 +237,11 @@ class TrajectoryCommand(RootArguments):
     align: Literal["none", "se3", "sim3"] = "sim3"
     """Of the estimate's centres to the reference's."""
     delta: int = 1
-    """Frames between the poses of a pair. [N]"""
+    """Of rpe: frames from the first pose of a pair to the second. [N]"""
     all_pairs: bool = False
-    """Pairs start at every frame."""
+    """Of rpe: pairs start at every frame; else each where the last one ended."""
     associate: Literal["auto", "time", "name", "index"] = "auto"
-    """Auto: what both have, in the order name, time, index."""
+    """Auto: by what both have, in the order time, name, index."""
     max_difference: float = Field(0.01, ge=0)
     """Of times that belong together. [seconds]"""
     offset: float = 0.0
@@ -259,10 +260,19 @@ class TrajectoryCommand(RootArguments):
         from pipelines.inputs.trajectory_source import associate, open_trajectory
         from pipelines.scoring.measurement import pose_figures
 
-        refuse_root(self.root, (self.reference, self.estimate))
-        reference = open_trajectory(self.reference, layout=self.layout, root=self.root)
-        estimate = open_trajectory(self.estimate, layout=self.layout, root=self.root)
-        first, second, how = associate(
+        if self.metric == "ate" and (self.delta != 1 or self.all_pairs):
+            raise OptionError("--delta, --all-pairs: belong to rpe; leave them out")
+        paths = (self.reference, self.estimate)
+        refuse_root(self.root, paths)
+        reference, estimate = (
+            open_trajectory(path, layout=self.layout, root=self.root) for path in paths
+        )
+        tracks = zip(paths, (reference, estimate), strict=True)
+        notes: dict[str, Sequence[str]]
+        notes = {"reading": [f"{path}: {note}" for path, track in tracks for note in track.notes]}
+        for note in notes["reading"]:
+            console.warn(note)
+        first, second, how, notes["association"] = associate(
             reference,
             estimate,
             how=self.associate,
@@ -270,20 +280,16 @@ class TrajectoryCommand(RootArguments):
             offset=self.offset,
         )
         poses = reference.poses[first], estimate.poses[second]
-        refuse = not self.allow_mirrored
-        if self.metric == "ate":
-            errors = absolute_errors(*poses, align=self.align, refuse_mirrored=refuse)
-            auc = pose_auc(*poses) if len(first) <= MOST_FOR_AUC else None
-        else:
-            errors = relative_errors(
-                *poses,
-                align=self.align,
-                delta=self.delta,
-                all_pairs=self.all_pairs,
-                refuse_mirrored=refuse,
-            )
-            auc = None
-        pairs = {"delta": self.delta, "all_pairs": self.all_pairs}
+        notes["conventions"] = wrong_conventions(*poses, align=self.align)
+        for note in (*notes["association"], *notes["conventions"]):
+            console.warn(note)
+        measure, auc = absolute_errors, None
+        if self.metric == "rpe":
+            measure = partial(relative_errors, delta=self.delta, all_pairs=self.all_pairs)
+        elif len(first) <= MOST_FOR_AUC:
+            auc = pose_auc(*poses)
+        errors = measure(*poses, align=self.align, refuse_mirrored=not self.allow_mirrored)
+        pairs = {"delta": self.delta, "delta_unit": "frames", "all_pairs": self.all_pairs}
         figures = {
             "metric": self.metric,
             "align": self.align,
@@ -296,13 +302,7 @@ class TrajectoryCommand(RootArguments):
         }
         if self.metric == "ate" and auc is None:
             figures["notes"]["auc"] = f"not measured over more than {MOST_FOR_AUC} poses"
-        for path, track in ((self.reference, reference), (self.estimate, estimate)):
-            for note in track.notes:
-                console.warn(f"{path}: {note}")
-                figures["notes"].setdefault("reading", []).append(f"{path}: {note}")
-        for note in wrong_conventions(*poses, align=self.align):
-            console.warn(note)
-            figures["notes"].setdefault("conventions", []).append(note)
+        figures["notes"] |= {name: lines for name, lines in notes.items() if lines}
         if self.json_ is not None:
             write_json(self.json_, figures)
         elif errors.ok:
@@ -320,6 +320,9 @@ def _print(figures: dict[str, Any], errors: PoseErrors, console: Console) -> Non
         f"{figures['association']}; {figures['status']}"
         + (f", scale {errors.scale:.6g}" if figures["align"] == "sim3" and errors.scale else "")
     )
+    if figures["metric"] == "rpe":
+        start = "at every frame" if figures["all_pairs"] else "where the last ended"
+        console.line(f"pairs {figures['delta']} frame(s) of these poses apart, starting {start}")
     columns = (*POSE_STATISTICS, "n")
     rows = {
         "translation, scene units": statistics_figures(errors.translation),

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 
     from gvtools.trajectory_files import Trajectory
 
-LAYOUTS = ("auto", "tum", "kitti", "euroc")
-ASSOCIATIONS = ("auto", "time", "name", "index")
+# Share of the time between poses from which pairs that differ by it may be of other moments.
+FAR = 0.25
 
 
 def open_trajectory(path: Path, *, layout: str = "auto", root: Path | None = None) -> Trajectory:
@@ -89,38 +89,51 @@ def associate(
     how: str = "auto",
     max_difference: float,
     offset: float = 0.0,
-) -> tuple[NDArray[np.int64], NDArray[np.int64], str]:
-    """Rows of both trajectories that belong together, and how they were found.
+) -> tuple[NDArray[np.int64], NDArray[np.int64], str, tuple[str, ...]]:
+    """Rows of both trajectories that belong together, how they were found, and what is doubtful.
 
-    With "auto", times go first (pictures' names may be times), then names, then the order.
-    ``offset`` is added to the estimate's times.
+    Args:
+        how: "time" (pictures' names may be times), "name", "index" (the order), or "auto": the
+            first of these that both have.
+        max_difference: of times that belong together, seconds.
+        offset: added to the estimate's times, seconds.
     """
     from gvtools.evaluation.trajectories import by_index, by_name, by_time
 
-    if how not in ASSOCIATIONS:
-        raise OptionError(f"association {how!r}; expected one of {', '.join(ASSOCIATIONS)}")
-    timed = reference.stamps is not None and estimate.stamps is not None
+    timed = [track.stamps is not None for track in (reference, estimate)]
+    named = [bool(track.names) for track in (reference, estimate)]
+    doubts: tuple[str, ...] = ()
     if how == "auto":
-        named = bool(reference.names and estimate.names)
-        how = "time" if timed else "name" if named else "index"
+        how = "time" if all(timed) else "name" if all(named) else "index"
+        if how == "index" and any(timed) and any(named):
+            doubts = (
+                "paired in their order alone, as one has names and the other times: wrong from "
+                "the first pose on that only one of both has",
+            )
     if how == "index":
-        return (*by_index(len(reference), len(estimate)), how)
+        return (*by_index(len(reference), len(estimate)), how, doubts)
     if how == "name":
-        if not (reference.names and estimate.names):
+        if not all(named):
             raise OptionError(
                 "association by name: a TUM, KITTI or EuRoC file has no names; use time or index"
             )
-        return (*by_name(reference.names, estimate.names), how)
+        return (*by_name(reference.names, estimate.names), how, doubts)
     if reference.stamps is None or estimate.stamps is None:
         raise OptionError("association by time: a trajectory has no times; use name or index")
-    times, unit = estimate.stamps, ""
+    times = estimate.stamps
     match = partial(by_time, max_difference=max_difference, offset=offset)
     if found := _other_unit(reference.stamps, times, match):
-        times, unit = (
-            times * found[0],
-            f" (the estimate's stamps are {found[1]} of the reference's)",
+        times = times * found[0]
+        how += f" (the estimate's stamps are {found[1]} of the reference's)"
+    first, second = match(reference.stamps, times)
+    gap = float(np.median(np.abs(reference.stamps[first] - times[second] - offset)))
+    steps = [np.median(np.diff(stamps)) for stamps in (reference.stamps, times) if len(stamps) > 1]
+    if gap > FAR * max(steps, default=np.inf):
+        doubts = (
+            f"times of pairs differ by {gap:.3g} s (median), and poses are {max(steps):.3g} s "
+            "apart: other moments may be paired; give an offset or a smaller largest difference",
         )
-    return (*match(reference.stamps, times), how + unit)
+    return first, second, how, doubts
 
 
 def _other_unit(

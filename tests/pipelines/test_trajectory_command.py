@@ -170,12 +170,65 @@ def test_pictures_named_by_their_time_are_paired_as_stamps(tmp_path, capsys):
         assert figures["rmse"] < 1e-9
 
 
+@pytest.mark.parametrize(
+    ("name", "other"),
+    [
+        # A date, a second apart: no time in microseconds.
+        (lambda i: f"202611271200{i:02d}123.jpg", lambda i: f"202611271201{i:02d}123.jpg"),
+        (lambda i: f"v1.{i}.png", lambda i: f"v2.{i}.png"),
+    ],
+)
+def test_names_that_look_like_times_are_paired_as_names(tmp_path, capsys, name, other):
+    for folder, named in (("a", name), ("b", other)):
+        names = tuple(named(i) for i in range(40))
+        write_colmap(tmp_path / folder, cameras(path(), names))
+    text = refused(capsys, "trajectory", "ate", tmp_path / "a", tmp_path / "b")
+    assert "none of 40 and 40 names is equal" in text
+
+
+@pytest.mark.parametrize(
+    "named", ["rgb_{}.{:09d}.png", "cam0/image-{}-{:09d}.jpg", "{}_{:09d}.png"]
+)
+def test_times_within_names_are_paired_with_a_file_s(tmp_path, capsys, named):
+    stamps = [(1_600_000_000 + i // 10, i % 10 * 10**8) for i in range(40)]
+    write_colmap(tmp_path / "a", cameras(path(), tuple(named.format(*stamp) for stamp in stamps)))
+    values = [row[1:] for row in rows(path())]
+    lines = [",".join([*map(str, stamp), *row]) for stamp, row in zip(stamps, values, strict=True)]
+    file = tmp_path / "b.csv"
+    # Not the first pose, but as many: paired by order, all would be of other moments.
+    file.write_text(
+        "\n".join(['"sec","nsec","x","y","z","qx","qy","qz","qw"', *lines[1:], lines[0]])
+    )
+    figures = measured(tmp_path, "ate", tmp_path / "a", file)
+    assert (figures["association"], figures["associated"]) == ("time", 40)
+    assert figures["rmse"] < 1e-9
+    assert "not in order" in capsys.readouterr().err
+
+
+def test_pairs_of_doubtful_moments_are_warned_of(tmp_path, capsys):
+    names = tuple(f"{i:03d}.png" for i in range(40))
+    write_colmap(tmp_path / "a", cameras(path(), names))
+    files = [tmp_path / "b.txt", tmp_path / "c.txt"]
+    for file, late in zip(files, (0, 0.04), strict=True):
+        lines = [[f"{float(time) + late}", *rest] for time, *rest in rows(path())]
+        file.write_text("\n".join(" ".join(line) for line in lines))
+    assert (
+        "order alone"
+        in measured(tmp_path, "ate", tmp_path / "a", files[0])["notes"]["association"][0]
+    )
+    figures = measured(tmp_path, "ate", *files, "--max-difference", "1")
+    assert "differ by 0.04 s (median)" in figures["notes"]["association"][0]
+    assert capsys.readouterr().err.count("warning") == 2
+
+
 def test_the_table_is_printed_without_json(tmp_path, capsys):
     write_tum(tmp_path / "a.txt", cameras(path()))
     assert main(["trajectory", "ate", str(tmp_path / "a.txt"), str(tmp_path / "a.txt")]) == 0
     text = capsys.readouterr().out
     assert "rotation, degrees" in text
     assert "associated by time" in text
+    assert main(["trajectory", "rpe", *[str(tmp_path / "a.txt")] * 2, "--delta", "5"]) == 0
+    assert "pairs 5 frame(s) of these poses apart" in capsys.readouterr().out
 
 
 def test_wrong_input_ends_in_one_line(tmp_path, capsys):
@@ -187,6 +240,7 @@ def test_wrong_input_ends_in_one_line(tmp_path, capsys):
     assert "no times" in refused(capsys, "trajectory", "ate", a, b, "--associate", "time")
     assert "no names" in refused(capsys, "trajectory", "ate", a, b, "--associate", "name")
     assert "--layout" in refused(capsys, "trajectory", "ate", a, a, "--layout", "ros")
+    assert "belong to rpe" in refused(capsys, "trajectory", "ate", a, a, "--delta", "2")
     assert "expected 1 frame" in refused(capsys, "trajectory", "rpe", a, a, "--delta", "0")
 
 
