@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from gvtools.errors import MemoryFileError
-from gvtools.glb import join_glb, split_glb
+from gvtools.glb import glb_array, join_glb, split_glb
 from gvtools.scans.read import read_scan
 from gvtools.splat_files import READERS, read_splats
 from gvtools.splats import SH, TERMS, TO_RUB, Splats, place_gaussians, turn_gaussians
@@ -127,10 +127,14 @@ def test_spz_is_read_without_gaussforge(tmp_path, monkeypatch):
     np.testing.assert_allclose(read_splats(file).values, one.values, atol=1e-5)
 
 
-def test_a_node_of_a_glb_moves_turns_and_scales_its_gaussians(tmp_path):
+def test_a_glb_shows_linear_colors_and_its_node_moves_turns_and_scales(tmp_path):
     file, given = written(tmp_path, ".glb", some()), some()
     turn = Rotation.from_rotvec([0.3, -1.0, 0.5])
     tree, body = split_glb(file.read_bytes())
+    shown = glb_array(tree, body, tree["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"])
+    bright = given.colors > 0.0404
+    expected = ((given.colors + 0.055) / 1.055) ** 2.4
+    np.testing.assert_allclose(shown[:, :3][bright], expected[bright], atol=1e-5)
     tree["nodes"][0] |= {"rotation": turn.as_quat().tolist(), "scale": [2, 2, 2]}
     moved = np.array(tree["nodes"][0]["translation"])
     file.write_bytes(join_glb(tree, body))

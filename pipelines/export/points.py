@@ -32,7 +32,7 @@ STEPS_PER_VOXEL, MOST_STEPS = 10, 2**31 - 1
 # Bytes of a record in a LAS's head, less its end.
 MOST_WKT = 65_534
 # glTF: a type of numbers, and the extension that shows colours as they are.
-UINT16, UNLIT = 5123, "KHR_materials_unlit"
+FLOAT, UNLIT = 5126, "KHR_materials_unlit"
 # 8 bits to 16: 255 becomes 65535.
 TO_16_BITS = 257
 # Viewers of USD and glTF are slow beyond it.
@@ -132,7 +132,7 @@ def write_usd(source: ExportSource, path: Path, options: ExportOptions) -> str:
     corners = np.stack([local.min(axis=0), local.max(axis=0)]).astype(np.float32)
     cloud.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(corners))
     primvars = UsdGeom.PrimvarsAPI(cloud)
-    colors = _linear(points.colors)
+    colors = linear(points.colors / 255)
     for name, kind, values in (
         ("displayColor", Sdf.ValueTypeNames.Color3fArray, Vt.Vec3fArray.FromNumpy(colors)),
         ("confidence", Sdf.ValueTypeNames.FloatArray,
@@ -187,15 +187,14 @@ def _as_photographed(items: MutableMapping[Any, bytes], tree: dict[str, Any]) ->
             if place is None:
                 continue
             accessor = list(tree["accessors"].values())[place]
-            if accessor["componentType"] == UINT16:
+            if accessor["componentType"] == FLOAT:
                 continue  # one that another part shares
             key = keys[accessor["bufferView"]]
             stored = np.frombuffer(items[key], np.uint8)[: 4 * accessor["count"]].reshape(-1, 4)
-            values = np.empty(stored.shape, "<u2")
-            values[:, :3] = np.rint(65535 * _linear(stored[:, :3]))
-            values[:, 3] = stored[:, 3].astype("<u2") * TO_16_BITS
+            # As floats: programs that take other numbers for bytes are common.
+            values = linear(stored[:, :3] / 255)
             items[key] = values.tobytes()
-            accessor |= {"componentType": UINT16, "normalized": True, "byteOffset": 0}
+            accessor |= {"componentType": FLOAT, "type": "VEC3", "normalized": False}
             accessor |= {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
     for number, material in enumerate(tree.get("materials", [])):
         physical = {"baseColorFactor": [1.0] * 4, "metallicFactor": 0.0, "roughnessFactor": 1.0}
@@ -208,11 +207,10 @@ def _as_photographed(items: MutableMapping[Any, bytes], tree: dict[str, Any]) ->
     tree["extensionsUsed"] = sorted({*tree.get("extensionsUsed", ()), UNLIT})
 
 
-def _linear(colors: np.ndarray) -> np.ndarray:
-    """Bytes of sRGB as the linear light that USD's and glTF's colours are, (N, 3) float32."""
-    share = np.arange(256) / 255
-    table = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
-    return table.astype(np.float32)[colors]
+def linear(colors: NDArray[Any]) -> NDArray[np.float32]:
+    """Colours of sRGB in [0, 1] as the linear light that USD's and glTF's are, little-endian."""
+    light = np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
+    return light.astype("<f4")
 
 
 def write_glb(source: ExportSource, path: Path, options: ExportOptions) -> str:

@@ -26,7 +26,7 @@ from gvtools.ply import write_ply
 from gvtools.splat_files import KHR, RESTS, numbered
 from gvtools.splats import SH, TERMS, TO_RUB, Splats, box_middle, turn_gaussians
 from pipelines.export.formats import ExportOptions
-from pipelines.export.points import FRAME, save_usd, usd_stage
+from pipelines.export.points import FLOAT, FRAME, linear, save_usd, usd_stage
 from pipelines.export.source import ExportSource
 
 # Of SPZ's positions: bits with their sign, the most behind the point, and those that its writers
@@ -37,8 +37,8 @@ FRACTIONAL_AT, FLAGS_AT = 13, 14
 STEPS_PER_SIZE, SMALLEST = 8, 0.05
 # Coefficients of a channel above degree 0, in a PLY; the degree that ksplat's own reader takes.
 REST, KSPLAT_DEGREE = 15, 2
-# glTF's numbers of float and byte, and how wide an item of a type is.
-FLOAT, BYTE, TYPES = 5126, 5121, {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+# glTF's names of items by their width.
+TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 FIELD = "/gvtools/splats"
 
 
@@ -221,10 +221,9 @@ def _write_glb(splats: Splats, path: Path, options: ExportOptions) -> str:
     """
     center = box_middle(splats.positions.astype(np.float64))
     positions = (splats.positions - center).astype(np.float32)
-    colors = np.concatenate([splats.colors, splats.opacities[:, None]], axis=1)
-    parts: dict[str, NDArray[Any]] = {
+    parts: dict[str, NDArray[np.float32]] = {
         "POSITION": positions,
-        "COLOR_0": np.rint(255 * colors).astype(np.uint8),
+        "COLOR_0": np.column_stack([linear(splats.colors), splats.opacities]),
         f"{KHR}:ROTATION": np.roll(splats.quaternions, -1, axis=1),
         f"{KHR}:SCALE": np.exp(splats.log_scales),
         f"{KHR}:OPACITY": splats.opacities[:, None],
@@ -235,12 +234,11 @@ def _write_glb(splats: Splats, path: Path, options: ExportOptions) -> str:
             parts[name] = splats.harmonics[:, degree**2 + term]
     views, accessors, body = list[Any](), list[Any](), bytearray()
     for part in parts.values():
-        whole = part.dtype == np.uint8
-        data = np.ascontiguousarray(part, np.uint8 if whole else "<f4").tobytes()
+        data = np.ascontiguousarray(part, "<f4").tobytes()
         views.append({"buffer": 0, "byteOffset": len(body), "byteLength": len(data)})
         accessors.append(
-            {"bufferView": len(accessors), "componentType": BYTE if whole else FLOAT,
-             "count": len(part), "type": TYPES[part.shape[1]], "normalized": whole}
+            {"bufferView": len(accessors), "componentType": FLOAT,
+             "count": len(part), "type": TYPES[part.shape[1]]}
         )  # fmt: skip
         body += data
     accessors[0] |= {"min": positions.min(axis=0).tolist(), "max": positions.max(axis=0).tolist()}

@@ -163,6 +163,8 @@ def test_glb_is_what_trimesh_reads(memory, saved, tmp_path):
     np.testing.assert_allclose(cloud.vertices, memory.positions[kept.rows], atol=1e-6)
     colors, material = glb_colors(tmp_path / "cloud.glb")
     np.testing.assert_array_equal(colors, memory.columns.colors[kept.rows])
+    linear = 255 * glb_colors(tmp_path / "cloud.glb", linear=True)[0]
+    np.testing.assert_allclose(cloud.colors[:, :3], linear, atol=1)
     assert "KHR_materials_unlit" in material["extensions"]
     assert material["pbrMetallicRoughness"]["metallicFactor"] == 0
 
