@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Mapping, MutableMapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -96,22 +97,31 @@ def write_las(source: ExportSource, path: Path, options: ExportOptions) -> str:
 def _crs(source: ExportSource) -> tuple[str, str]:
     """WKT of the coordinate system of the run's scan where it is the memory's, and what is said."""
     try:
-        scan = load_run(source.path).rounds[0].get("scan") or {}
+        run = source.path if source.path.is_dir() else source.path.parent
+        scan = load_run(run).rounds[0].get("scan") or {}
         crs = str(scan.get("crs") or "")
         placement = np.array(scan["placement"]["world_from_scan"]) if crs else np.eye(4)
     except (GvError, LookupError, TypeError, AttributeError, ValueError):
         return "", ""
     if not np.array_equal(placement, np.eye(4)):
         return "", "; not in the scan's coordinate system (--cloud-placement moved it)"
+    wkt, left_out = crs, f"; the scan's {crs[:60]} is left out: "
     if crs.startswith("EPSG:"):
         try:
-            import pyproj
+            from pyproj import CRS
+            from pyproj.exceptions import CRSError
         except ImportError:
-            return "", f"; the scan's {crs} is left out (WKT of it needs pyproj)"
-        crs = str(pyproj.CRS.from_user_input(crs).to_wkt("WKT1_GDAL"))
-    if len(crs) > MOST_WKT:
-        return "", "; the scan's coordinate system is left out (too long)"
-    return crs, f", in the scan's coordinate system ({crs[:60]})" if crs else ""
+            return "", left_out + "WKT of it needs pyproj (pip install pyproj)"
+        wkt = ""
+        # Numbers of heights are often those of older lists: then the one of the map alone.
+        for code in (crs.partition("+")[0], crs):
+            with suppress(CRSError):
+                wkt = str(CRS.from_user_input(code).to_wkt("WKT1_GDAL"))
+        if not wkt:
+            return "", left_out + "pyproj knows no such number"
+    if len(wkt) > MOST_WKT:
+        return "", left_out + "too long"
+    return wkt, f", in the scan's coordinate system ({wkt[:60]})" if wkt else ""
 
 
 def write_usd(source: ExportSource, path: Path, options: ExportOptions) -> str:

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import json
 import sys
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -197,7 +197,10 @@ NAMED = "the scan's coordinate system"
     [
         (WKT, np.eye(4), WKT, f"in {NAMED}"),
         (WKT, np.diag([2.0, 2, 2, 1]), None, f"not in {NAMED}"),
-        ("EPSG:25832", np.eye(4), None, "EPSG:25832 is left out"),
+        ("EPSG:25832", np.eye(4), None, "EPSG:25832 is left out: WKT of it needs pyproj"),
+        # Of a map, with a number of heights that newer lists have not; one that no list has.
+        ("EPSG:25832+5103", np.eye(4), "map 25832", f"in {NAMED}"),
+        ("EPSG:9999", np.eye(4), None, "pyproj knows no such number"),
         ("", np.eye(4), None, "coordinates in steps"),
     ],
 )
@@ -205,7 +208,17 @@ def test_las_carries_the_coordinate_system_of_a_scan_that_lies_in_it(
     far, tmp_path, monkeypatch, capsys, crs, placement, carried, said
 ):
     laspy = pytest.importorskip("laspy")
-    monkeypatch.setitem(sys.modules, "pyproj", None)
+    exceptions = ModuleType("pyproj.exceptions")
+    exceptions.CRSError = type("CRSError", (RuntimeError,), {})
+
+    def lookup(code):
+        if code != "EPSG:25832":
+            raise exceptions.CRSError(code)
+        return SimpleNamespace(to_wkt=lambda version: "map 25832")
+
+    package = SimpleNamespace(CRS=SimpleNamespace(from_user_input=lookup))
+    monkeypatch.setitem(sys.modules, "pyproj", None if crs == "EPSG:25832" else package)
+    monkeypatch.setitem(sys.modules, "pyproj.exceptions", exceptions)
     write_las(tmp_path / "scan.las", np.eye(4, 3), None, crs=crs)
     placed = {"world_from_scan": placement.tolist()}
     scan = {"crs": read_scan(tmp_path / "scan.las").crs, "placement": placed}
