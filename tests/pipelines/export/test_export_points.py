@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import json
 import sys
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -208,8 +208,7 @@ def test_las_carries_the_coordinate_system_of_a_scan_that_lies_in_it(
     far, tmp_path, monkeypatch, capsys, crs, placement, carried, said
 ):
     laspy = pytest.importorskip("laspy")
-    exceptions = ModuleType("pyproj.exceptions")
-    exceptions.CRSError = type("CRSError", (RuntimeError,), {})
+    exceptions = SimpleNamespace(CRSError=type("CRSError", (RuntimeError,), {}))
 
     def lookup(code):
         if code != "EPSG:25832":
