@@ -111,9 +111,10 @@ class ExportCommand(Arguments, ExportOptions):
                 )
         splats = read_splats(self.memory)
         if form.name == "html":
-            from pipelines.export.html import write_page
+            from pipelines.export.html import page_of, write_page
             from pipelines.viewing.source import ViewSource
 
-            console.line(write_page(ViewSource(self.memory).read(), splats, self.out))
+            page = page_of(ViewSource(self.memory).read(), splats)
+            console.line(write_page(page, splats, self.out))
             return
         console.line(write_file(splats, self.out, self))

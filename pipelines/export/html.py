@@ -45,20 +45,28 @@ def write_html(source: ExportSource, path: Path, options: ExportOptions) -> str:
         most = MAX_POINTS + (0 if fit is None else len(fit.gaussians))
     splats = source.splats(options.model_copy(update={"max_points": most}), exposed=False)
     run = RunView(source.path, memory, cameras=cameras_of(memory, ()))
-    return write_page(run, splats, path, cameras=list(_cameras(source)), fit=fit)
+    return write_page(page_of(run, splats, cameras=list(_cameras(source)), fit=fit), splats, path)
 
 
-def write_page(
+def write_page(page: SharedPage, splats: Splats, path: Path) -> str:
+    """Write the page of Gaussians, of a run or of a file."""
+    with replaced_when_written(path) as temporary:
+        temporary.write_text(page_html(page), encoding="utf-8")
+        size = temporary.stat().st_size / 1e6
+    pictures = sum(camera.picture is not None for camera in page.cameras)
+    return f"{splats.summary()} and {pictures} pictures in {path}, {size:.1f} MB"
+
+
+def page_of(
     run: RunView,
     splats: Splats,
-    path: Path,
     *,
     cameras: Sequence[PageCamera] = (),
     fit: Appearance | None = None,
-) -> str:
-    """Write the page of Gaussians, of a run or of a file."""
+) -> SharedPage:
+    """The page of Gaussians, into which no exposures are baked; ``fit`` tells them."""
     depth = run.typical_depth
-    page = SharedPage(
+    return SharedPage(
         title=run.title,
         summary=f"{len(splats):,} Gaussians",
         groups=list(_groups(splats)),
@@ -72,11 +80,6 @@ def write_page(
         exposures=None if fit is None else fit.exposures,
         exposed_in=None if fit is None else fit.gaussians.frame,
     )
-    with replaced_when_written(path) as temporary:
-        temporary.write_text(page_html(page), encoding="utf-8")
-        size = temporary.stat().st_size / 1e6
-    pictures = sum(camera.picture is not None for camera in cameras)
-    return f"{splats.summary()} and {pictures} pictures in {path}, {size:.1f} MB"
 
 
 def _groups(splats: Splats) -> Iterator[PageGroup]:

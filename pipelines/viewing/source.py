@@ -22,8 +22,8 @@ from gvtools.ply import read_header
 from gvtools.runs.layout import RECORD
 from gvtools.runs.run import Run, count_rounds, load_growing_run, load_memory
 from gvtools.splat_files import READERS, holds_splats, read_splats
-from gvtools.splats import Splats
 from pipelines.export.formats import ExportOptions
+from pipelines.export.html import page_of
 from pipelines.export.source import ExportSource
 from pipelines.viewing.readers import GREY, load_mesh, read_usd
 from viz.viewer.run_view import (
@@ -33,7 +33,6 @@ from viz.viewer.run_view import (
     SPLATS,
     ColoredMesh,
     RunView,
-    ShownGaussians,
     cameras_of,
 )
 
@@ -41,6 +40,7 @@ if TYPE_CHECKING:
     import trimesh
 
     from gvtools.scenes.scene import Frame, Scene
+    from viz.page.page import SharedPage
 
 KEPT_FRAMES = 8
 
@@ -90,15 +90,15 @@ class ViewSource:
     ) -> RunView:
         memory = whole.overview()
 
-        def gaussians_of(most: int) -> ShownGaussians:
-            """Fitted Gaussians, which are always whole, and those of so many points at most."""
+        def page(run: RunView, most: int) -> SharedPage:
             source = ExportSource(self.path, memory)
-            fitted = 0 if source.appearance is None else len(source.appearance.gaussians)
-            return _shown(source.splats(ExportOptions(max_points=fitted + most)))
+            fit = source.appearance
+            options = ExportOptions(max_points=most + (0 if fit is None else len(fit.gaussians)))
+            return page_of(run, source.splats(options, exposed=False), fit=fit)
 
         return RunView(
             self.path, memory, reports, cameras_of(memory, reports), self._frames, planned,
-            (POINTS, SPLATS, RENDERED), gaussians_of,
+            (POINTS, SPLATS, RENDERED), page,
         )  # fmt: skip
 
 
@@ -220,15 +220,12 @@ def _points_view(path: Path, positions: NDArray[Any], colors: NDArray[Any] | Non
 
 def _open_splats(path: Path) -> RunView:
     splats = read_splats(path)
-    gaussians = _shown(splats)
-    memory = _memory(path, gaussians.centers, gaussians.colors)
+    colors = np.rint(255 * splats.colors).astype(np.uint8)
+    memory = _memory(path, splats.positions + splats.origin, colors)
     return RunView(
-        path, memory, looks=(SPLATS, POINTS), gaussians_of=lambda most: gaussians, told_up=splats.up
-    )
-
-
-def _shown(splats: Splats) -> ShownGaussians:
-    return ShownGaussians(splats.values, splats.origin, splats.rounds)
+        path, memory, looks=(SPLATS, POINTS), page_of=lambda run, _: page_of(run, splats),
+        told_up=splats.up,
+    )  # fmt: skip
 
 
 def _memory(path: Path, positions: NDArray[Any], colors: NDArray[Any] | None) -> SpatialMemory:

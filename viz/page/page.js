@@ -274,8 +274,8 @@ function writeAddress() {
 function readAddress() {
   const words = new URLSearchParams(location.hash.slice(1));
   const numbers = (words.get("v") ?? "").split(",").map(Number);
-  const round = Number(words.get("round") ?? scene.rounds.at(-1));
-  if (scene.rounds.includes(round)) shown.round = round;
+  const round = Number(words.get("round") ?? Infinity);
+  if (round >= 0) shown.round = Math.min(Math.floor(round), scene.rounds.at(-1));
   for (const source of SOURCES) shown[source] = words.get(source) !== "0";
   document.body.classList.toggle("bare", words.get("bare") === "1");
   choose();

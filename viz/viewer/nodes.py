@@ -1,4 +1,4 @@
-"""Nodes of the web viewer's scene: points, Gaussians, a mesh, cameras, the rendered view."""
+"""The web viewer's scene: points, a mesh, cameras, and what is drawn behind them."""
 
 from __future__ import annotations
 
@@ -12,18 +12,25 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
 from gvtools.errors import GvError
+from viz.page.page import PageCamera, SharedPage, page_html
 from viz.plots.canvas import RED, rgb_of
 from viz.viewer.colors import KINDS
 from viz.viewer.render import RunRenderer, picture_of
-from viz.viewer.run_view import TRUTH, ColoredMesh, Detail, RunView, ShownCamera, ShownGaussians
+from viz.viewer.run_view import (
+    POINTS,
+    RENDERED,
+    SPLATS,
+    TRUTH,
+    ColoredMesh,
+    Detail,
+    RunView,
+    ShownCamera,
+)
 from viz.viewer.standpoint import TYPICAL, PageFrame
 
 if TYPE_CHECKING:
     import viser
 
-# Covariances go to the page in half precision, whose range is narrow: in units in which the page's
-# has this many, standard deviations from 3e-6 to LARGEST / MAGNIFIED page units keep digits.
-MAGNIFIED, LARGEST = 32.0, 250.0
 # Longer side of the picture in a frustum, pixels.
 THUMBNAIL = 192
 # Depth of a frustum, as a share of the typical depth of what is seen; less where there are many.
@@ -34,40 +41,29 @@ FLIGHT_STEPS, FLIGHT_SECONDS = 20, 0.5
 LONGEST = 960
 # The page's depth maps end there, in its units; what lies behind is drawn there.
 FARTHEST = 167.0
+# What the browser runs when it is told where to look; of HTML that comes later, it runs no others.
+DRAW_PAGE = """
+const frame = document.getElementById('splats') ?? document.createElement('iframe');
+frame.id = 'splats';
+frame.style = 'position: absolute; width: 100%; height: 100%; border: 0';
+if (!this.alt) frame.remove();
+else {
+  if (!frame.parentElement) document.querySelector('canvas').parentElement.prepend(frame);
+  frame.contentWindow.location.replace(this.alt);
+}"""
 NO_SHADOW: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False}
 
 CameraKey = tuple[str, str, int]
 
 
-class RoundNodes:
-    """Nodes of a scene, one a round, the same for all who look."""
+class PointNodes:
+    """The memory's points, a node a round, the same for all who look."""
 
-    def __init__(self, server: viser.ViserServer, frame: PageFrame, *, visible: bool) -> None:
+    def __init__(self, server: viser.ViserServer, frame: PageFrame) -> None:
         self._server = server
         self._frame = frame
         self._nodes: dict[int, Any] = {}
-        self._visible, self._round = visible, 0
-
-    def show(self, number: int) -> None:
-        """Show the rounds up to ``number``."""
-        self._round = number
-        for round, node in self._nodes.items():
-            node.visible = self._shows(round)
-
-    def set_visible(self, visible: bool) -> None:
-        """Show or hide all."""
-        self._visible = visible
-        self.show(self._round)
-
-    def _shows(self, round: int) -> bool:
-        return self._visible and round <= self._round
-
-
-class PointNodes(RoundNodes):
-    """The memory's points."""
-
-    def __init__(self, server: viser.ViserServer, frame: PageFrame) -> None:
-        super().__init__(server, frame, visible=True)
+        self._visible, self._round = True, 0
         # By round, places within ``rows``.
         self._places: dict[int, NDArray[np.int64]] = {}
         self._scale = 1.0
@@ -100,6 +96,20 @@ class PointNodes(RoundNodes):
                 visible=self._shows(key),
             )
 
+    def show(self, number: int) -> None:
+        """Show the rounds up to ``number``."""
+        self._round = number
+        for round, node in self._nodes.items():
+            node.visible = self._shows(round)
+
+    def set_visible(self, visible: bool) -> None:
+        """Show or hide all."""
+        self._visible = visible
+        self.show(self._round)
+
+    def _shows(self, round: int) -> bool:
+        return self._visible and round <= self._round
+
     def recolor(self, rgb: NDArray[np.uint8]) -> None:
         """Other colours (P, 3) of the same points."""
         for key, places in self._places.items():
@@ -122,42 +132,6 @@ class PointNodes(RoundNodes):
     def count(self, number: int) -> int:
         """How many points there are of the rounds up to ``number``."""
         return sum(len(places) for round, places in self._places.items() if round <= number)
-
-
-class GaussianNodes(RoundNodes):
-    """Gaussians, sorted and blended over all rounds by the page."""
-
-    def __init__(self, server: viser.ViserServer, frame: PageFrame) -> None:
-        super().__init__(server, frame, visible=False)
-
-    def set_gaussians(self, gaussians: ShownGaussians) -> None:
-        """Show others."""
-        self.clear()
-        scale = self._frame.scale * MAGNIFIED
-        centers = ((gaussians.centers - self._frame.origin) * scale).astype("f4")
-        covariances = gaussians.covariances(scale, largest=LARGEST)
-        rgb, opacities = gaussians.colors, gaussians.opacities
-        for number in np.unique(gaussians.rounds).tolist():
-            rows = np.flatnonzero(gaussians.rounds == number)
-            self._nodes[number] = self._server.scene.add_gaussian_splats(
-                f"/splats/round_{number:03d}",
-                centers[rows],
-                covariances[rows],
-                rgb[rows],
-                opacities[rows],
-                scale=1 / MAGNIFIED,
-                visible=self._shows(number),
-            )
-
-    def clear(self) -> None:
-        """Show none."""
-        for node in self._nodes.values():
-            node.remove()
-        self._nodes = {}
-
-    def __bool__(self) -> bool:
-        """Whether there are any."""
-        return bool(self._nodes)
 
 
 def add_surface(
@@ -336,39 +310,55 @@ def fly_to(
         time.sleep(FLIGHT_SECONDS / FLIGHT_STEPS)
 
 
-class RenderedLook:
-    """The client's own view, rendered by the project's splatter behind the scene.
+class Backdrop:
+    """Each client's own view behind the scene, for the looks that follow its camera.
 
-    Renders for each client whenever its camera, the round or the colour mode has changed.
+    Rendered by the project's splatter here, or drawn in the browser by the page to share, which
+    ``pages`` then holds for the server, by its address.
     """
 
-    def __init__(self, server: viser.ViserServer, frame: PageFrame) -> None:
-        self._server = server
+    def __init__(
+        self, server: viser.ViserServer, frame: PageFrame, pages: dict[str, bytes]
+    ) -> None:
         self._frame = frame
+        self._pages = pages
         self._renderer: RunRenderer | None = None
-        self._round, self._mode, self._on = 0, "color", False
+        self._page: SharedPage | None = None
+        self._number = 0
+        self._look, self._round, self._mode = POINTS, 0, "color"
         self._asked = threading.Event()
         self._stopped = False
-        self._cleared = True
-        self._seen: dict[int, tuple[object, ...]] = {}
+        self._clients: dict[int, tuple[viser.ClientHandle, viser.GuiHtmlHandle]] = {}
+        self._seen: dict[int, tuple[Any, ...]] = {}
         server.on_client_connect(self._follow)
+        server.on_client_disconnect(self._forget)
         self._worker = threading.Thread(target=self._work, daemon=True)
         self._worker.start()
 
     def set_run(self, run: RunView) -> None:
-        """Render another run, or the same one grown."""
-        self._renderer = RunRenderer(run)
-        self._ask()
+        """Draw another run, or the same one grown."""
+        self._renderer, self._page = RunRenderer(run), None
+        self._asked.set()
 
-    def set_state(self, number: int, mode: str) -> None:
-        """Render the memory after a round, in the colours of a mode."""
-        self._round, self._mode = number, mode
-        self._ask()
+    def set_state(self, look: str, number: int, mode: str) -> None:
+        """Draw the memory after a round, in the colours of a mode, if the look follows cameras."""
+        self._look, self._round, self._mode = look, number, mode
+        self._asked.set()
 
-    def set_on(self, on: bool) -> None:
-        """Begin or end."""
-        self._on = on
-        self._ask()
+    def prepare_page(self, run: RunView, budget: int) -> None:
+        """Make the run's page, unless it is there."""
+        if self._page is None and run.page_of is not None:
+            page = run.page_of(run, budget)
+            content = page_html(page).encode()
+            # Another address, so that no browser takes the one before for it.
+            self._number += 1
+            self._pages.clear()
+            self._pages[self._address] = content
+            self._page = page
+
+    @property
+    def _address(self) -> str:
+        return f"/splats_{self._number}.html"
 
     def stop(self) -> None:
         """End for good."""
@@ -376,38 +366,47 @@ class RenderedLook:
         self._asked.set()
         self._worker.join()
 
-    def _ask(self) -> None:
-        self._seen = {}
+    def _follow(self, client: viser.ClientHandle) -> None:
+        self._clients[client.client_id] = client, client.gui.add_html("")
+        client.camera.on_update(lambda _: self._asked.set())
         self._asked.set()
 
-    def _follow(self, client: viser.ClientHandle) -> None:
-        client.camera.on_update(lambda _: self._asked.set())
+    def _forget(self, client: viser.ClientHandle) -> None:
+        self._clients.pop(client.client_id, None)
 
     def _work(self) -> None:
         while not self._stopped:
             self._asked.wait()
             # Whatever changes from here on is for the next turn.
             self._asked.clear()
-            if self._on:
-                self._cleared = False
-                for client in self._server.get_clients().values():
-                    self._render(client)
-            elif not self._cleared:
-                self._cleared = True
-                for client in self._server.get_clients().values():
-                    client.scene.set_background_image(None)
+            for client, html in list(self._clients.values()):
+                self._draw(client, html)
 
-    def _render(self, client: viser.ClientHandle) -> None:
-        renderer, number, mode = self._renderer, self._round, self._mode
-        if renderer is None:
-            return
-        camera = self._frame.client_camera(client, longest=LONGEST)
-        state = (number, mode, id(renderer), camera.K.tobytes(), camera.cam_from_world.tobytes())
-        if self._seen.get(client.client_id) == state:
+    def _draw(self, client: viser.ClientHandle, html: viser.GuiHtmlHandle) -> None:
+        look, page, rendered = self._look, self._page, self._look == RENDERED
+        camera = self._frame.client_camera(client, longest=LONGEST if rendered else np.inf)
+        drawn = look, self._round, self._mode, self._renderer, page
+        state = (*drawn, camera.K.tobytes(), camera.cam_from_world.tobytes())
+        before = self._seen.get(client.client_id, (look,))
+        if before == state:
             return
         self._seen[client.client_id] = state
+        address = ""
+        if look == SPLATS and page is not None:
+            view = PageCamera(camera).view(page.origin).values()
+            numbers = ",".join(str(number) for part in view for number in part)
+            address = f"{self._address}#v={numbers}&round={self._round}&bare=1"
+        html.content = f'<img src="data:," alt="{address}" onerror="{DRAW_PAGE}" hidden>'
+        if rendered:
+            self._render(client, camera)
+        elif before[0] == RENDERED:
+            client.scene.set_background_image(None)
+
+    def _render(self, client: viser.ClientHandle, camera: Cameras) -> None:
+        if self._renderer is None:
+            return
         try:
-            guidance = renderer.render(camera, round=number, mode=mode)
+            guidance = self._renderer.render(camera, round=self._round, mode=self._mode)
         except GvError as error:
             client.add_notification("Not rendered", str(error), color="red")
             return

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import viser
 
 NO_CAMERA = "none"
-LOOKS_HINT = "splats: as exported; rendered: as gvtools render draws this view"
+LOOKS_HINT = "splats: as the page of gvtools export; rendered: as gvtools render draws this view"
 # Of the panel with the selected camera's pictures, CSS pixels: a little over half of the scene in a
 # window of 1280. It can be moved, made larger and folded away.
 PICTURES_WIDTH = 500

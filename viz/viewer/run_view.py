@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.appearance.splat.project_kernels import HARMONICS, LOG_SCALE, LOGIT, QUATERNION, SH
 from gvtools.cameras import Cameras
 from gvtools.errors import ProjectError
 from gvtools.runs.layout import AFTER, COMPLETION, GUIDANCE, round_folder
@@ -25,15 +24,14 @@ from viz.viewer.standpoint import STRAY, guess_up
 if TYPE_CHECKING:
     from gvtools.memory.spatial_memory import SpatialMemory
     from gvtools.scenes.scene import Frame
+    from viz.page.page import SharedPage
 
 # The pictures that a round leaves of a target, by the title that a viewer gives them.
 PICTURES = {"guidance": GUIDANCE, "completion": COMPLETION, "memory after": AFTER}
 TRUTH = "truth"
-# Looks: points, Gaussians of an export, as the project's own splatter renders it, a file's mesh.
+# Looks: points, Gaussians as the page to share draws them, as the project's own splatter renders
+# it, a file's mesh.
 POINTS, SPLATS, RENDERED, MESH = "points", "splats", "rendered", "mesh"
-# A Gaussian's least standard deviation in shares of its largest: viewers keep covariances in
-# half precision, in which thinner ones would not stay positive definite.
-THINNEST = 1 / 32
 # Bits of a cell's place along an axis: three of them, and two for the source, fit a signed 64-bit
 # key.
 AXIS_BITS = 20
@@ -73,51 +71,6 @@ class Counts:
 
 
 @dataclass(frozen=True, eq=False)
-class ShownGaussians:
-    """N Gaussians with the world's axes, drawn without harmonics."""
-
-    # (N, VALUES), see appearance.splat.project_kernels; positions count from ``origin``.
-    values: NDArray[np.float32]
-    origin: NDArray[np.float64]  # (3,) world frame, scene units
-    rounds: NDArray[np.int32]  # (N,) that each came with
-
-    def __len__(self) -> int:
-        return len(self.values)
-
-    @property
-    def centers(self) -> NDArray[np.float64]:
-        """(N, 3) in the world frame, scene units."""
-        return self.values[:, :LOG_SCALE].astype(np.float64) + self.origin
-
-    @property
-    def opacities(self) -> NDArray[np.float32]:
-        """(N, 1) from 0 to 1."""
-        logits = np.clip(self.values[:, LOGIT : LOGIT + 1], -30, 30)
-        return np.asarray(1 / (1 + np.exp(-logits)), np.float32)
-
-    def covariances(self, scale: float, *, largest: float) -> NDArray[np.float32]:
-        """(N, 3, 3) in units of which a scene unit has ``scale``.
-
-        Standard deviations are at most ``largest`` such units.
-        """
-        from scipy.spatial.transform import Rotation
-
-        w, x, y, z = self.values[:, QUATERNION:LOGIT].astype(np.float64).T
-        axes = Rotation.from_quat(np.stack([x, y, z, w], axis=1)).as_matrix()
-        log_sizes = self.values[:, LOG_SCALE:QUATERNION].astype(np.float64) + np.log(scale)
-        sizes = np.exp(np.minimum(log_sizes, np.log(largest)))
-        sizes = np.maximum(sizes, THINNEST * sizes.max(axis=1, keepdims=True))
-        half = axes * sizes[:, None]
-        return np.asarray(half @ half.transpose(0, 2, 1), np.float32)
-
-    @property
-    def colors(self) -> NDArray[np.uint8]:
-        """(N, 3) uint8: the mean over all directions."""
-        shown = 0.5 + HARMONICS[0] * self.values[:, SH : SH + 3]
-        return np.rint(255 * np.clip(shown, 0, 1)).astype(np.uint8)
-
-
-@dataclass(frozen=True, eq=False)
 class ColoredMesh:
     """Triangles with colours at their vertices."""
 
@@ -139,8 +92,8 @@ class RunView:
     frame_of: Callable[[str], Frame | None] = lambda name: None
     planned: int | None = None  # rounds that the run is to have, the context's included
     looks: tuple[str, ...] = (POINTS, RENDERED)  # that there are; the first to begin with
-    # The Gaussians to draw for SPLATS, so many of the memory's points at most.
-    gaussians_of: Callable[[int], ShownGaussians] | None = None
+    # The page that draws SPLATS, with so many of the memory's points at most beside a fit.
+    page_of: Callable[[RunView, int], SharedPage] | None = None
     surface: ColoredMesh | None = None  # to draw for MESH
     told_up: NDArray[np.float64] | None = None  # (3,) by a file, where there are no cameras
 

@@ -149,7 +149,7 @@ class PageFrame:
         wxyz = np.asarray(SO3.from_matrix(pose[:3, :3]).wxyz, np.float64)
         return wxyz, self.position(pose[:3, 3])
 
-    def client_camera(self, client: viser.ClientHandle, *, longest: int) -> Cameras:
+    def client_camera(self, client: viser.ClientHandle, *, longest: float) -> Cameras:
         """A client's camera in the world's frame: a batch of one of at most ``longest`` pixels."""
         from viser.transforms import SO3
 

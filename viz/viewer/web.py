@@ -7,7 +7,7 @@ import ipaddress
 import re
 import socket
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import redirect_stdout
 from typing import TYPE_CHECKING, Any
 from unittest.mock import patch
@@ -21,21 +21,22 @@ from gvtools.optional import require
 from viz.viewer.camera_path import CameraPath
 from viz.viewer.colors import MODES, Legend
 from viz.viewer.nodes import (
+    Backdrop,
     CameraNodes,
-    GaussianNodes,
     PointNodes,
-    RenderedLook,
     add_surface,
     fly_to,
 )
 from viz.viewer.panel import Panel, shown_pictures
-from viz.viewer.run_view import MESH, POINTS, RENDERED, SPLATS, RunView, ShownCamera, detail
+from viz.viewer.run_view import MESH, POINTS, SPLATS, RunView, ShownCamera, detail
 from viz.viewer.standpoint import FIELD_OF_VIEW, PageFrame, home
 
 if TYPE_CHECKING:
     import viser
 
 LOCAL, PORT = "127.0.0.1", 8080
+# How long a page of splats may take on its way, seconds; websockets itself would cut it off at 10.
+PATIENCE = 600
 # Points of the whole run, 15 bytes each; with all colour modes looked at once, 30 MB.
 BUDGET = 1_000_000
 # Pages that this machine serves itself may read a run, also through a tunnel's port.
@@ -73,14 +74,14 @@ class WebViewer:
         self._selected = 0
         self._flights: dict[int, int] = {}
         self.frame = PageFrame.of(run)
-        self.server = make_server(host, port, run.title)
+        pages: dict[str, bytes] = {}
+        self.server = make_server(host, port, run.title, pages=pages)
         self._points = PointNodes(self.server, self.frame)
         self._cameras = CameraNodes(self.server, self.frame, self._clicked)
-        self._gaussians = GaussianNodes(self.server, self.frame)
         self._mesh = (
             None if run.surface is None else add_surface(self.server, self.frame, run.surface)
         )
-        self._rendered = RenderedLook(self.server, self.frame)
+        self._backdrop = Backdrop(self.server, self.frame, pages)
         self._look = run.looks[0]
         self._panel = Panel(
             self.server,
@@ -118,13 +119,11 @@ class WebViewer:
         with self._lock:
             self.run = run
             chosen = detail(run.memory, self.budget)
-            self._rendered.set_run(run)
+            self._backdrop.set_run(run)
             self._panel.set_run(run, chosen, go_to=go_to)
             self._points.set_points(run, chosen, self._colors(chosen.rows))
             self._panel.set_size(self._points.size)
-            self._gaussians.clear()
             self._show_look(self._look)
-            self._show_round(self._panel.round)
             self._cameras.set_cameras(run)
 
     def set_note(self, text: str) -> None:
@@ -133,7 +132,7 @@ class WebViewer:
 
     def stop(self) -> None:
         """End the server."""
-        self._rendered.stop()
+        self._backdrop.stop()
         self._cameras.stop()
         with redirect_stdout(io.StringIO()):
             self.server.stop()
@@ -147,31 +146,29 @@ class WebViewer:
         with self._lock:
             with self.server.atomic():
                 self._points.show(number)
-                self._gaussians.show(number)
                 self._cameras.show(number)
             self._panel.set_counts(self.run, number, self._points.count(number))
-            self._rendered.set_state(number, self._panel.mode)
+            self._backdrop.set_state(self._look, number, self._panel.mode)
 
     def _show_mode(self, mode: str) -> None:
         with self._lock:
             if mode in MODES:
                 self._panel.set_legend(Legend("..."))
                 self._points.recolor(self._colors(self._points.rows))
-                self._rendered.set_state(self._panel.round, mode)
+                self._backdrop.set_state(self._look, self._panel.round, mode)
 
     def _show_look(self, look: str) -> None:
         with self._lock:
             self._look = look
-            if look == SPLATS and not self._gaussians and self.run.gaussians_of is not None:
+            if look == SPLATS:
                 try:
-                    self._gaussians.set_gaussians(self.run.gaussians_of(self.budget))
+                    self._backdrop.prepare_page(self.run, self.budget)
                 except GvError as error:
                     self._panel.set_note(f"no splats: {error}")
             self._points.set_visible(look == POINTS)
-            self._gaussians.set_visible(look == SPLATS)
-            self._rendered.set_on(look == RENDERED)
             if self._mesh is not None:
                 self._mesh.visible = look == MESH
+            self._show_round(self._panel.round)
 
     def _set_size(self, scale: float) -> None:
         with self._lock:
@@ -213,11 +210,15 @@ class WebViewer:
             )
 
 
-def make_server(host: str, port: int, title: str) -> viser.ViserServer:
-    """A server that refuses WebSockets of pages from elsewhere."""
+def make_server(
+    host: str, port: int, title: str, *, pages: Mapping[str, bytes]
+) -> viser.ViserServer:
+    """A server that refuses WebSockets of pages from elsewhere, with more pages by address."""
     require("viser", extra="web", purpose="the web viewer", instead="or use --open3d")
     import viser
     import websockets.asyncio.server as websockets
+    from websockets.datastructures import Headers
+    from websockets.http11 import Response
 
     class Server(viser.ViserServer):
         """Never publishes itself, whatever a page asks for."""
@@ -241,11 +242,18 @@ def make_server(host: str, port: int, title: str) -> viser.ViserServer:
     def serve(*places: Any, process_request: Callable[..., Any], **options: Any) -> Any:
         def answer(connection: Any, request: Any) -> Any:
             origin, asked = (request.headers.get(key) for key in ("Origin", "Host"))
-            if may_read(origin, asked, host):
+            page = pages.get(request.path)
+            # For a page of its own a browser sends no Origin, but the name that was asked.
+            itself = f"http://{asked}" if page is not None else None
+            if not (may_read(origin, asked, host) and may_read(itself, asked, host)):
+                return connection.respond(403, "a page from elsewhere may not read this run\n")
+            if page is None:
                 return process_request(connection, request)
-            return connection.respond(403, "a page from elsewhere may not read this run\n")
+            connection.close_timeout = PATIENCE
+            kind = {"Content-Type": "text/html; charset=utf-8", "Content-Length": str(len(page))}
+            return Response(200, "OK", Headers({**kind, "Connection": "close"}), page)
 
-        return plain(*places, process_request=answer, **options)
+        return plain(*places, process_request=answer, open_timeout=PATIENCE, **options)
 
     # viser prints where it listens; the command that starts it says more.
     with redirect_stdout(io.StringIO()), patch.object(websockets, "serve", serve):
