@@ -24,6 +24,8 @@ Float64 = NDArray[np.float64]
 
 # A quaternion written with few digits may be this far from unit length; farther, it is none.
 QUATERNION_TOLERANCE = 1e-2
+# Views of a path look so nearly [degrees] where the scene's cameras do; farther off they do not.
+ALIKE, OTHER = 30, 50
 EUROC = 17  # numbers in a line of EuRoC's ground truth
 # Of a matrix, without or with its last row and a number or time of its own in front.
 MATRICES = (12, 13, 16, 17)
@@ -130,6 +132,7 @@ class _Form:
     more: bool = False  # whether there may be more columns
     unit: str = ""  # of the time stamps, as the head names it
     notes: tuple[str, ...] = ()
+    guessed: bool = False  # whether the order of eight numbers is told by nothing but these
 
 
 def _form(path: Path, layout: str) -> tuple[_Form, list[tuple[int, list[str]]]]:
@@ -189,7 +192,7 @@ def _by_numbers(path: Path, rows: list[tuple[int, list[str]]], *, commas: bool) 
             "columns in a first line"
         )
     note = f"columns taken as {_NAMES[order]}; if they are not, give --layout"
-    return _Form(_COLUMNS[order], more, "", (note,) if mixed else ())
+    return _Form(_COLUMNS[order], more, "", (note,) if mixed else (), not more)
 
 
 def unit_of(stamps: Float64) -> str:
@@ -235,7 +238,9 @@ def in_time(track: Trajectory) -> Trajectory:
     return Trajectory(track.poses[rows], names, stamps, tuple(notes))
 
 
-def read_trajectory(path: str | Path, like: Cameras, *, layout: str = "auto") -> Cameras:
+def read_trajectory(
+    path: str | Path, like: Cameras, *, layout: str = "auto", beside: Cameras | None = None
+) -> Cameras:
     """Cameras on the poses of a trajectory file.
 
     Args:
@@ -243,6 +248,7 @@ def read_trajectory(path: str | Path, like: Cameras, *, layout: str = "auto") ->
         like: intrinsics and size: those of the first camera for all, or row by row when there are
             as many cameras as poses.
         layout: as of ``read_poses``.
+        beside: cameras of the scene, which tell the order of quaternions that a file leaves open.
 
     Returns:
         V cameras; the names are the timestamps as written (TUM, EuRoC; a repeated one gets _1, _2,
@@ -253,6 +259,9 @@ def read_trajectory(path: str | Path, like: Cameras, *, layout: str = "auto") ->
     names: list[str] = []
     repeats: dict[str, int] = {}
     form, rows = _form(path, layout)
+    if form.guessed and beside is not None:
+        scalar_last = form.columns == _COLUMNS["tum"]
+        _check_order(path, track.poses, beside=beside, scalar_last=scalar_last)
     for _, words in rows:
         name = words[form.columns[0]] if form.columns else f"{len(names):06d}"
         name = ".".join([name, *(words[column].zfill(9) for column in (form.columns or ())[8:])])
@@ -263,6 +272,30 @@ def read_trajectory(path: str | Path, like: Cameras, *, layout: str = "auto") ->
             name = f"{name}_{repeats[name]}"
         names.append(name)
     return _with_intrinsics(track.poses, like, names, path=path)
+
+
+def _check_order(path: Path, poses: Float64, *, beside: Cameras, scalar_last: bool) -> None:
+    """Refuse quaternions that look where the scene's cameras do in the other order alone."""
+    changed = reordered(poses[:, :3, :3], -1 if scalar_last else 1)
+    apart = []
+    for turns in (poses[:, :3, :3], changed):
+        cosines = np.einsum("nij,vji->nv", turns, beside.cam_from_world[:, :3, :3]) / 2 - 0.5
+        apart.append(np.median(np.degrees(np.arccos(cosines.clip(-1, 1).max(axis=1)))))
+    if apart[1] < ALIKE and apart[0] > OTHER:
+        first, last = ("last", "first") if scalar_last else ("first", "last")
+        raise ProjectError(
+            f"{path}: by quaternions with the scalar {first} it looks {apart[0]:.0f} degrees away "
+            f"from the scene's cameras, with the scalar {last} {apart[1]:.0f}; name the columns in "
+            "a first line, such as '# timestamp tx ty tz qw qx qy qz'"
+        )
+
+
+def reordered(rotations: Float64, places: int) -> Float64:
+    """(..., 3, 3) of the quaternions (x, y, z, w) of rotations, rolled by so many places."""
+    from scipy.spatial.transform import Rotation
+
+    turned = np.roll(Rotation.from_matrix(rotations).as_quat(), places, axis=-1)
+    return np.asarray(Rotation.from_quat(turned).as_matrix())
 
 
 def _rows(

@@ -282,7 +282,7 @@ def _path_cameras(
         return scene.subset(select(scene.names, selection if at else "all")).cameras
     from gvtools.trajectory_files import read_trajectory
 
-    return read_trajectory(Path(place), captured[0])
+    return read_trajectory(Path(place), captured[0], beside=captured)
 
 
 class FilmRenderer:

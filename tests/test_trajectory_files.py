@@ -44,6 +44,21 @@ def test_intrinsics_are_matched_row_by_row_or_taken_from_the_first(tmp_path):
     assert read_trajectory(path, mixed[:2]).K[:, 0, 0].tolist() == [400, 400, 400]
 
 
+def test_the_scenes_cameras_tell_the_order_of_quaternions(tmp_path):
+    cameras = _cameras(12)
+    write_tum(tmp_path / "last.txt", cameras)
+    lines = [line.split() for line in (tmp_path / "last.txt").read_text().splitlines()]
+    rows = [" ".join([*words[:4], words[7], *words[4:7]]) for words in lines if words[0] != "#"]
+    first, named = tmp_path / "first.txt", tmp_path / "named.txt"
+    first.write_text("\n".join(rows))
+    named.write_text("\n".join(["# time tx ty tz qw qx qy qz", *rows]))
+    with pytest.raises(ProjectError, match=r"with the scalar first 0; name the columns"):
+        read_trajectory(first, cameras[0], beside=cameras)
+    for path in (tmp_path / "last.txt", named):
+        read = read_trajectory(path, cameras[0], beside=cameras)
+        np.testing.assert_allclose(read.world_from_cam, cameras.world_from_cam, atol=1e-9)
+
+
 def test_comments_and_blank_lines_are_passed_over(tmp_path):
     path = tmp_path / "path.txt"
     path.write_text("# timestamp tx ty tz qx qy qz qw\n\n1.0 1 2 3 0 0 0 1\n", encoding="ascii")

@@ -2,20 +2,21 @@
 
 Reprojection errors do not tell, as no pixel enters them. A track's detections show one place, so
 that what photographs have there is alike: luminance at the detections of a view, freed of what
-varies slowly, is correlated with the mean of the other views' at the same tracks.
+varies slowly, is correlated with the mean of the other views' at the same tracks. Where a scene has
+no sparse points, recorded depth of a few views tells what they and those after them show.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from functools import cache, partial
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.errors import GvError
-from gvtools.scenes.scene import Finding, Scene
+from gvtools.scenes.scene import Finding, Frame, Scene, SparsePoints
 
 Grey = NDArray[np.float32]
 
@@ -35,6 +36,9 @@ CHANGES: Mapping[str, Callable[[Grey], Grey]] = {
     "turned by a quarter": np.rot90,
     "turned by three quarters": lambda grey: np.rot90(grey, -1),
 }
+# Views whose depth is taken, those so many places after each that it is compared with, pixels of
+# each; how far depth around one may differ, and two views' depth of one place.
+DEPTH_PROBES, DEPTH_GAPS, DEPTH_PIXELS, SMOOTH, SAME_PLACE = 5, (0, 1, 2, 4), 400, 1.05, 0.02
 # Views that a run looks at, that a reason is sought for, and that a finding names.
 PROBES, TRIED, NAMED = 8, 16, 3
 
@@ -43,7 +47,9 @@ class PixelCheck:
     """The luminance at detections, gathered view by view."""
 
     def __init__(self, scene: Scene) -> None:
-        self.scene, self.points = scene, scene.points
+        # Depth is rougher than detections: it judges all photographs together.
+        self.rough = scene.points is None
+        self.scene, self.points = scene, _points_of_depth(scene) if self.rough else scene.points
         self.rows = [] if self.points is None else self.points.rows_of_views(len(scene))
         count = 0 if self.points is None else len(self.points.point_index)
         self.values = np.full(count, np.nan)
@@ -62,38 +68,48 @@ class PixelCheck:
         found[inside] = cv2.blur(grey, (3, 3))[y[inside], x[inside]]
         return found
 
-    def agreements(self) -> dict[int, float]:
-        """Correlation with the others, of each view that has enough tracks in common with them."""
+    def agreements(self, without: Sequence[int] = ()) -> dict[int, float]:
+        """Correlation with the others, of each view that has enough tracks in common with them.
+
+        Views ``without`` are compared, and none is compared with them.
+        """
         if self.points is None:
             return {}
         index, count = self.points.point_index, len(self.points.positions)
         known = np.isfinite(self.values)
-        total = np.bincount(index[known], self.values[known], count)
-        views = np.bincount(index[known], minlength=count)
+        trusted = known & ~np.isin(self.points.view_index, list(without))
+        total = np.bincount(index[trusted], self.values[trusted], count)
+        views = np.bincount(index[trusted], minlength=count)
         found = {}
         for number, rows in enumerate(self.rows):
-            shared = rows[known[rows] & (views[index[rows]] > 1)]
+            own_share = trusted[rows]
+            shared = rows[known[rows] & (views[index[rows]] > own_share)]
             own, at = self.values[shared], index[shared]
             if len(shared) >= TRACKS and own.std() >= CONTRAST:
-                others = (total[at] - own) / (views[at] - 1)
+                counted = trusted[shared]
+                others = (total[at] - own * counted) / (views[at] - counted)
                 found[number] = float(np.corrcoef(own, others)[0, 1])
         return found
 
     def findings(self) -> list[Finding]:
         """A warning where photographs and detections disagree."""
         judged = self.agreements()
-        wrong = sorted((n for n, s in judged.items() if s < AGREE), key=lambda n: judged[n])
-        if not wrong:
+        wrong = [n for n, s in judged.items() if s < AGREE]
+        if not wrong or (self.rough and np.median([*judged.values()]) >= AGREE):
             return []
+        # Right ones that were compared with wrong ones are cleared.
+        judged |= self.agreements(wrong)
+        wrong = sorted((n for n in wrong if judged[n] < AGREE), key=lambda n: judged[n])
         names = ", ".join(
             f"{self.scene.views[number].name} ({judged[number]:.2f})" for number in wrong[:NAMED]
         )
         more = f" and {len(wrong) - NAMED} more" if len(wrong) > NAMED else ""
+        place = "the same places by depth" if self.rough else "detections"
         message = (
             f"{len(wrong)} of {len(judged)} photographs do not show what their cameras saw "
-            f"({len(wrong) / len(judged):.0%}; correlation at detections below {AGREE:g}): {names}"
-            f"{more}{self._reason(wrong)}; renumbered, mirrored, cropped or turned pictures give "
-            "wrong results: give the pictures that the poses were computed from"
+            f"({len(wrong) / len(judged):.0%}; correlation at {place} below {AGREE:g}): "
+            f"{names}{more}{self._reason(wrong)}; renumbered, mirrored, cropped or turned pictures "
+            "give wrong results: give the pictures that the poses were computed from"
         )
         return [Finding("warning", message)]
 
@@ -126,12 +142,61 @@ class PixelCheck:
         return None if found is None or shown is None or found.shape != shown.shape else found
 
     def _detail(self, number: int) -> Grey | None:
-        if not 0 <= number < len(self.rows):
-            return None
-        try:
-            return detail(self.scene.views[number].load().rgb)
-        except GvError:
-            return None
+        frame = _frame(self.scene, number) if 0 <= number < len(self.rows) else None
+        return None if frame is None else detail(frame.rgb)
+
+
+def _frame(scene: Scene, number: int) -> Frame | None:
+    try:
+        return scene.views[number].load()
+    except GvError:  # said elsewhere
+        return None
+
+
+def _points_of_depth(scene: Scene) -> SparsePoints | None:
+    """Places with detail that depth of a few views gives, and where some after them show these."""
+    numbers = [number for number, view in enumerate(scene.views) if view.has_depth]
+    load = cache(partial(_frame, scene))
+    places, count = [np.zeros((0, 3))], 0
+    tracks = list[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]]()
+    last = len(numbers) - 1
+    for at in sorted({*np.linspace(0, last, min(DEPTH_PROBES, last + 1)).astype(int).tolist()}):
+        frame, camera = load(numbers[at]), scene.views[numbers[at]].camera
+        if frame is None or frame.depth is None:
+            continue
+        y, x = _detailed(frame.rgb, frame.depth)
+        pose = camera.world_from_cam[0]
+        local = (frame.depth[..., None] * camera.rays())[y, x]
+        places.append(local @ pose[:3, :3].T + pose[:3, 3])
+        for other in (numbers[at + gap] for gap in DEPTH_GAPS if at + gap < len(numbers)):
+            frame = load(other)
+            if frame is None or frame.depth is None:
+                continue
+            (xy,), (z,) = scene.views[other].camera.project(places[-1])
+            inside = (z > 0) & (xy >= 0).all(1) & (xy < frame.depth.shape[::-1]).all(1)
+            x, y = np.where(inside[:, None], xy, 0).astype(int).T
+            rows = np.flatnonzero(inside & (np.abs(frame.depth[y, x] - z) < SAME_PLACE * z))
+            tracks.append((count + rows, np.full(len(rows), other), xy[rows]))
+        count += len(places[-1])
+    if not tracks:
+        return None
+    point, view, xy = (np.concatenate(part) for part in zip(*tracks, strict=True))
+    colors, errors = np.zeros((count, 3), np.uint8), np.zeros(count, np.float32)
+    point, view = point.astype(np.int32), view.astype(np.int32)
+    return SparsePoints(np.concatenate(places), colors, errors, point, view, xy)
+
+
+def _detailed(
+    rgb: NDArray[np.uint8], depth: NDArray[np.float32]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows and columns of pixels with detail around which depth is smooth, evenly spread."""
+    around = np.ones((5, 5), np.uint8)
+    low, high = cv2.erode(depth, around), cv2.dilate(depth, around)
+    strength = np.abs(detail(rgb)) * ((low > 0) & (high < SMOOTH * low))
+    used = strength[strength > 0]
+    rows, columns = np.nonzero(strength >= (np.quantile(used, 0.75) if used.size else np.inf))
+    chosen = np.linspace(0, len(rows) - 1, min(DEPTH_PIXELS, len(rows))).astype(int)
+    return rows[chosen], columns[chosen]
 
 
 def detail(rgb: NDArray[np.uint8]) -> Grey:

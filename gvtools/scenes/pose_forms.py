@@ -18,6 +18,7 @@ from gvtools.errors import GvError
 from gvtools.features import Features, SiftMatcher
 from gvtools.scenes.calibration import OPENCV_FROM_OPENGL
 from gvtools.scenes.scene import Finding, Scene
+from gvtools.trajectory_files import reordered
 
 Float64 = NDArray[np.float64]
 
@@ -35,13 +36,9 @@ ENOUGH = 0.08
 FLIP = OPENCV_FROM_OPENGL
 
 
-def _reordered(pose: Float64) -> Float64:
-    from scipy.spatial.transform import Rotation
-
-    # As read: w, x, y, z hold what is x, y, z, w.
-    x, y, z, w = np.roll(Rotation.from_matrix(pose[:3, :3]).as_quat(), 1)
+def _reordered(pose: Float64, places: int) -> Float64:
     changed = pose.copy()
-    changed[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix()
+    changed[:3, :3] = reordered(pose[:3, :3], places)
     return changed
 
 
@@ -57,7 +54,12 @@ FORMS: Mapping[str, Callable[[Float64], Float64]] = {
     "the matrices map the other way (invert them), with axes of OpenGL": (
         lambda pose: FLIP @ invert_rigid(pose) @ FLIP
     ),
-    "quaternions have the scalar last, where it is expected first": _reordered,
+    "quaternions have the scalar last, where it is expected first": (
+        lambda pose: _reordered(pose, 1)
+    ),
+    "quaternions have the scalar first, where it is expected last": (
+        lambda pose: invert_rigid(_reordered(invert_rigid(pose), -1))
+    ),
 }
 
 

@@ -159,6 +159,7 @@ class RenderCommand(LensArguments, LpipsArguments, SceneArguments):
         return cameras, scene, poses
 
     def _trajectory(self, memory: SpatialMemory) -> Cameras:
+        from gvtools.cameras import concatenate
         from gvtools.trajectory_files import read_trajectory
 
         if self.memory.suffix.lower() == ".ply":
@@ -169,7 +170,8 @@ class RenderCommand(LensArguments, LpipsArguments, SceneArguments):
         photographed = memory.views.photographed
         if not photographed:
             raise OptionError(f"{self.memory}: no photograph's view; give a project as --cameras")
-        return read_trajectory(self.cameras, photographed[0].camera)
+        captured = concatenate([view.camera for view in photographed])
+        return read_trajectory(self.cameras, captured[0], beside=captured)
 
 
 def splat_options(texts: Sequence[str]) -> SplatOptions:

@@ -163,7 +163,8 @@ def resolve_targets(
             return targets
         from gvtools.trajectory_files import read_trajectory
 
-        cameras = read_trajectory(Path(path), scene.subset(context).cameras[0])
+        captured = scene.subset(context).cameras
+        cameras = read_trajectory(Path(path), captured[0], beside=captured)
         return Targets(cameras, (None,) * len(cameras), "trajectory", (Path(path),))
     try:
         # By name, as the context: what one target adds, the next ones are completed on.

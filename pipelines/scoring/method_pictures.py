@@ -103,9 +103,9 @@ class JudgeReference:
     def _projected(self, cameras: Path) -> list[MeasuredTarget]:
         from gvtools.trajectory_files import read_trajectory
 
-        like = self.run.scenes[0].subset(self.run.context).cameras[0]
+        context = self.run.scenes[0].subset(self.run.context).cameras
         targets = []
-        for camera in read_trajectory(cameras, like):
+        for camera in read_trajectory(cameras, context[0], beside=context):
             seen = self.memory.project(camera)
             picture = PosedPicture(camera.names[0], camera, to_bytes(seen.rgb[0]))
             observed = seen.valid[0] & ~seen.generated[0]

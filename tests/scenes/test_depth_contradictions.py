@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+from collections.abc import Callable
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scenes_workspace import PINHOLE, frame, ramp, save, transforms
@@ -7,27 +10,47 @@ from scenes_workspace import PINHOLE, frame, ramp, save, transforms
 from gvtools.scenes.inspection import inspect
 from gvtools.scenes.transforms import read_transforms
 
-
-def slanted(x: float) -> np.ndarray:
-    """(72, 96) depth of a plane z = 2 + X / 4 seen from (x, 0, 0), scene units."""
-    right = (np.arange(96) + 0.5 - 48) / 90
-    return np.broadcast_to((2 + x / 4) / (1 - right / 4), (72, 96))
+FOCAL = 45
+X, Y = np.meshgrid((np.arange(96) + 0.5 - 48) / FOCAL, (np.arange(72) + 0.5 - 36) / FOCAL)
 
 
-@pytest.mark.parametrize("lacking", [1, 1000, 0.001, 5, 0.2])
-def test_depth_whose_unit_contradicts_the_poses(tmp_path, lacking):
+def slanted(i: int) -> np.ndarray:
+    """(72, 96) depth of a plane z = 2 + X / 4 seen from (i / 5, 0, 0), scene units."""
+    return (2 + i / 20) / (1 - X / 4)
+
+
+def warned(root: Path, depth_of: Callable[[int], np.ndarray]) -> list[str]:
+    """What a check of six views says of their depth."""
     frames = []
     for i in range(6):
-        save(tmp_path / f"images/{i}.png", ramp())
-        np.save(tmp_path / f"{i}.npy", (slanted(0.2 * i) / lacking).astype(np.float32))
+        save(root / f"images/{i}.png", ramp())
+        np.save(root / f"{i}.npy", depth_of(i).astype(np.float32))
         one = frame(f"images/{i}.png", depth_file_path=f"{i}.npy", depth_unit_scale_factor=1.0)
         # The camera looks along +z of the world, right along its x.
         pose = np.diag([1.0, -1, -1, 1])
         pose[0, 3] = 0.2 * i
         frames.append({**one, "transform_matrix": pose.tolist()})
-    found = inspect(read_transforms(transforms(tmp_path, frames, **PINHOLE))).findings
-    warned = [item.message for item in found if "contradicts the poses" in item.message]
-    assert len(warned) == (lacking != 1)
-    if warned:
-        times = float(warned[0].split("if depth were ")[1].split(" times")[0])
+    lens = {**PINHOLE, "fl_x": FOCAL, "fl_y": FOCAL}
+    found = inspect(read_transforms(transforms(root, frames, **lens))).findings
+    return [item.message for item in found if "contradicts the poses" in item.message]
+
+
+@pytest.mark.parametrize("lacking", [1, 1000, 0.001, 5, 0.2])
+def test_depth_whose_unit_contradicts_the_poses(tmp_path, lacking):
+    said = warned(tmp_path, lambda i: slanted(i) / lacking)
+    assert len(said) == (lacking != 1)
+    if said:
+        times = float(said[0].split("if depth were ")[1].split(" times")[0])
         assert times == pytest.approx(lacking, rel=0.15)
+
+
+@pytest.mark.parametrize(
+    ("depth_of", "reason"),
+    [
+        (lambda i: slanted(i)[:, ::-1], "mirrored"),
+        (lambda i: slanted(20 * (i % 3)), "of other frames"),
+        (lambda i: slanted(i) * np.sqrt(1 + X**2 + Y**2), "as distances along the rays"),
+    ],
+)
+def test_depth_of_other_frames_or_cameras(tmp_path, depth_of, reason):
+    assert [reason in line for line in warned(tmp_path, depth_of)] == [True]

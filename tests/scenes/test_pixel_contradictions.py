@@ -54,6 +54,31 @@ def test_right_pictures_are_believed(room):
     assert said(room) == [] and probed(room, room.names) == []
 
 
+def test_depth_tells_where_there_are_no_tracks(room, wall_walk):
+    for step, wrong in ((0, 0), (1, 1)):
+        frames = [
+            Frame(wall_walk[(i + step) % 8].rgb, wall_walk[i].depth.astype(np.float32))
+            for i in range(8)
+        ]
+        views = [
+            replace(view, load=partial(lambda frame: frame, frame), has_depth=True)
+            for view, frame in zip(room.views, frames, strict=True)
+        ]
+        scene = replace(room, views=tuple(views), points=None)
+        assert len(said(scene)) == len(probed(scene, scene.names)) == wrong
+        assert all("same places by depth" in line for line in said(scene))
+
+
+def test_two_swapped_pictures_are_named_alone(room):
+    rgb = [view.load().rgb for view in room]
+    rgb[0], rgb[7] = rgb[7], rgb[0]
+    views = [
+        replace(view, load=partial(Frame, picture))
+        for view, picture in zip(room.views, rgb, strict=True)
+    ]
+    assert "2 of 8 photographs" in said(replace(room, views=tuple(views)))[0]
+
+
 @pytest.mark.parametrize(
     ("change", "reason"),
     [

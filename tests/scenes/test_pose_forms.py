@@ -7,6 +7,7 @@ import os
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from walls import write_project
 
 from gvtools.scenes.inspection import inspect
@@ -14,6 +15,14 @@ from gvtools.scenes.pose_forms import pose_findings
 from gvtools.scenes.project import open_project
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def rolled(pose):
+    """A camera-to-world pose whose quaternion w, x, y, z is read as x, y, z, w."""
+    x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat()
+    changed = pose.copy()
+    changed[:3, :3] = Rotation.from_quat([w, x, y, z]).as_matrix()
+    return changed
 
 
 @pytest.fixture(scope="module")
@@ -29,6 +38,7 @@ def room(wall_walk, tmp_path_factory):
         (lambda pose: pose @ FLIP, "taken for each other"),
         (np.linalg.inv, "invert them"),
         (lambda pose: np.linalg.inv(pose @ FLIP), "invert them"),
+        (lambda pose: rolled(pose @ FLIP) @ FLIP, "have the scalar first"),
     ],
 )
 def test_the_form_of_poses_is_told_by_the_photographs(room, change, reason):
