@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,9 @@ from gvtools.untrusted import other_version, parse_json
 GLB, JSON, BIN, VERSION = b"glTF", b"JSON", b"BIN\0", 2
 # By their number in glTF, and how many make one item.
 TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+NUMBERS = {np.dtype(kind): number for number, kind in TYPES.items()}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+ITEMS = {width: name for name, width in WIDTHS.items()}
 
 
 def split_glb(data: bytes) -> tuple[dict[str, Any], bytes]:
@@ -47,18 +50,93 @@ def join_glb(tree: dict[str, Any], body: bytes) -> bytes:
     return b"".join(parts)
 
 
+def pack_glb(
+    attributes: Mapping[str, NDArray[Any]],
+    *,
+    node: dict[str, Any],
+    primitive: dict[str, Any],
+    indices: NDArray[np.uint32] | None = None,
+    picture: bytes = b"",
+    **tree: Any,
+) -> bytes:
+    """A GLB of one node with one primitive.
+
+    Args:
+        attributes: (N, W) each; whole numbers stand for shares of 1.
+        node, primitive: what they say beside that.
+        indices: (F, 3) of triangles.
+        picture: a PNG, the file's texture 0.
+        tree: what the file says beside that.
+    """
+    arrays = {**attributes}
+    if indices is not None:
+        primitive = {**primitive, "indices": len(arrays)}
+        arrays["indices"] = indices.reshape(-1, 1)
+    views, accessors, body = list[Any](), list[Any](), bytearray()
+    for name, array in arrays.items():
+        whole = array.dtype.kind != "f" and name != "indices"
+        accessors.append(
+            {"bufferView": len(views), "componentType": NUMBERS[array.dtype], "count": len(array),
+             "type": ITEMS[array.shape[1]], "normalized": whole,
+             "min": array.min(axis=0).tolist(), "max": array.max(axis=0).tolist()}
+        )  # fmt: skip
+        views.append({"buffer": 0, "byteOffset": len(body), "byteLength": array.nbytes})
+        body += np.ascontiguousarray(array).tobytes()
+    if picture:
+        tree |= {"textures": [{"source": 0}],
+                 "images": [{"bufferView": len(views), "mimeType": "image/png"}]}  # fmt: skip
+        views.append({"buffer": 0, "byteOffset": len(body), "byteLength": len(picture)})
+        body += picture
+    primitive |= {"attributes": {name: place for place, name in enumerate(attributes)}}
+    tree |= {
+        "asset": {"version": "2.0", "generator": "gvtools"},
+        "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{**node, "mesh": 0}],
+        "meshes": [{"primitives": [primitive]}], "accessors": accessors, "bufferViews": views,
+        "buffers": [{"byteLength": len(body)}],
+    }  # fmt: skip
+    return join_glb(tree, bytes(body))
+
+
 def glb_array(tree: dict[str, Any], body: bytes, place: int) -> NDArray[Any]:
     """(N, W) the array of an accessor as it is stored, no more than there is."""
     accessor = tree["accessors"][place]
-    view = tree["bufferViews"][accessor["bufferView"]]
-    if view.get("buffer", 0) != 0 or "sparse" in accessor:
-        raise ValueError("an array that is sparse, or in another file")
-    kind, width = np.dtype(TYPES[accessor["componentType"]]), WIDTHS[accessor["type"]]
-    start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
-    step = view.get("byteStride") or width * kind.itemsize
-    if not 0 <= start <= len(body) or step < width * kind.itemsize:
+    kind, width, count = _kind(accessor), WIDTHS[accessor["type"]], accessor["count"]
+    if "bufferView" in accessor:
+        array = _stored(tree, body, accessor, kind=kind, shape=(count, width))
+    elif not 0 <= count <= len(body):
+        raise ValueError(f"an array of {count} items")
+    else:
+        array = np.zeros((count, width), kind)
+    if "sparse" in accessor:
+        sparse, array = accessor["sparse"], array.copy()
+        rows, values = sparse["indices"], sparse["values"]
+        shape = (sparse["count"], width)
+        rows = _stored(tree, body, rows, kind=_kind(rows), shape=(sparse["count"], 1))[:, 0]
+        array[rows] = _stored(tree, body, values, kind=kind, shape=shape)
+    return array
+
+
+def _kind(accessor: dict[str, Any]) -> np.dtype[Any]:
+    return np.dtype(TYPES[accessor["componentType"]])
+
+
+def _stored(
+    tree: dict[str, Any],
+    body: bytes,
+    holder: dict[str, Any],
+    *,
+    kind: np.dtype[Any],
+    shape: tuple[int, int],
+) -> NDArray[Any]:
+    """The items that a view holds, from where ``holder`` says."""
+    view = tree["bufferViews"][holder["bufferView"]]
+    if view.get("buffer", 0) != 0:
+        raise ValueError("an array in another file")
+    start = view.get("byteOffset", 0) + holder.get("byteOffset", 0)
+    step = view.get("byteStride") or shape[1] * kind.itemsize
+    if not 0 <= start <= len(body) or step < shape[1] * kind.itemsize:
         raise ValueError("an array outside of the file")
-    return np.ndarray((accessor["count"], width), kind, body, start, (step, kind.itemsize))
+    return np.ndarray(shape, kind, body, start, (step, kind.itemsize))
 
 
 def glb_numbers(tree: dict[str, Any], body: bytes, place: int) -> NDArray[np.float32]:

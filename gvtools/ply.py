@@ -1,4 +1,4 @@
-"""PLY files: the header of any, and the vertices of binary ones, written and read strictly.
+"""PLY files: the header and the vertices of any, and binary ones, written and read strictly.
 
 Open3D's own PLY reader returns the header's number of points for a truncated file, the missing
 ones being whatever the heap held. Here counts have to fit the file's size.
@@ -7,9 +7,10 @@ ones being whatever the heap held. Here counts have to fit the file's size.
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from itertools import chain
+from itertools import chain, islice
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +29,9 @@ TYPES = {
 }  # fmt: skip
 NAMES = {"f4": "float", "f8": "double", "u1": "uchar", "i4": "int"}
 MAX_HEADER = 1 << 16
+# A number as text and what parts it from the next one, at least.
+LEAST_TEXT = 2
+TRIANGLE = np.dtype([("count", "u1"), ("rows", "<i4", 3)])
 
 
 @dataclass
@@ -135,23 +139,43 @@ def point_vertices(path: Path, header: Header) -> Element:
     return vertices
 
 
-def read_ply(path: Path) -> NDArray[np.void]:
-    """The vertices of a little-endian binary PLY of points alone, as a structured array."""
+def read_ply(path: Path, *, strict: bool = True) -> NDArray[np.void]:
+    """The vertices of a PLY as a structured array.
+
+    ``strict`` expects a little-endian binary one of points alone. Otherwise text, the other byte
+    order and elements behind the vertices are read, too; numbers of a text become float64.
+    """
     header = read_header(path)
     vertices = point_vertices(path, header)
-    if header.order != "<" or any(item.count for item in header.elements if item is not vertices):
+    alone = not any(item.count for item in header.elements if item is not vertices)
+    if strict and not (header.order == "<" and alone):
         raise MemoryFileError(
             f"{path}: a PLY as text, of another byte order or with more than points; expected one "
             "vertex element in binary_little_endian 1.0"
         )
     dtype, found = header.dtype(vertices), path.stat().st_size
-    expected = header.offset + vertices.count * dtype.itemsize
-    if expected != found:
+    width = dtype.itemsize if header.order else LEAST_TEXT * len(vertices.columns)
+    expected = header.offset + vertices.count * width
+    if found < expected - (not header.order) or (header.order and alone and found != expected):
         raise MemoryFileError(
             f"{path}: {found} bytes, but its header says {vertices.count} vertices of "
-            f"{dtype.itemsize} bytes, that is {expected}; the file is truncated or damaged"
+            f"{width} bytes, that is {expected}; the file is truncated or damaged"
         )
-    return np.fromfile(path, dtype, vertices.count, offset=header.offset)
+    if header.order:
+        return np.fromfile(path, dtype, vertices.count, offset=header.offset)
+    with path.open("rb") as file:
+        file.seek(header.offset)
+        lines = islice((line for line in file if line.strip()), vertices.count)
+        kinds = [(name, "<f8") for name, _ in vertices.columns]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # no lines at all
+            rows = np.loadtxt(lines, kinds, comments=None, ndmin=1)
+    if len(rows) != vertices.count:
+        raise MemoryFileError(
+            f"{path}: {len(rows)} lines of numbers, but its header says {vertices.count} vertices; "
+            "the file is truncated or damaged"
+        )
+    return np.asarray(rows)
 
 
 def write_ply(
@@ -160,7 +184,8 @@ def write_ply(
     *,
     more: Iterable[NDArray[np.void]] = (),
     count: int | None = None,
-    comments: tuple[str, ...] = (),
+    faces: NDArray[np.int32] | None = None,
+    comments: Iterable[str] = (),
 ) -> None:
     """Write a structured array as the vertices of a little-endian binary PLY.
 
@@ -168,14 +193,24 @@ def write_ply(
         vertices: (N,) the first of them.
         more: further ones, written as they come.
         count: of all; None for N.
+        faces: (F, 3) triangles of them.
     """
     # Comments come last: some readers of Gaussians take the third line for the count.
     lines = ["ply", "format binary_little_endian 1.0"]
     lines.append(f"element vertex {len(vertices) if count is None else count}")
     names = vertices.dtype.names or ()
     lines += [f"property {NAMES[vertices.dtype[name].str[1:]]} {name}" for name in names]
+    behind = np.empty(0 if faces is None else len(faces), TRIANGLE)
+    if faces is not None:
+        behind["count"], behind["rows"] = 3, faces
+        lines += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
     lines += [*(f"comment {c}" for c in comments), "end_header\n"]
     with replaced_when_written(path) as temporary, temporary.open("wb") as file:
         file.write("\n".join(lines).encode("ascii"))
-        for part in chain([vertices], more):
+        for part in chain([vertices], more, [behind]):
             part.tofile(file)
+
+
+def up_comment(up: NDArray[np.float64] | None) -> tuple[str, ...]:
+    """The line of a file's header that tells what is up; none where nothing is known."""
+    return () if up is None else ("up " + " ".join(repr(float(x)) for x in up),)

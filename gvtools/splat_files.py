@@ -18,13 +18,14 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from gvtools.errors import GvError, MemoryFileError, OptionError
 from gvtools.glb import glb_numbers, split_glb
 from gvtools.optional import installed, require
 from gvtools.ply import Header, read_header, read_ply
 from gvtools.sandbox import Item, ReaderError, read_apart
+from gvtools.sog import META, read_sog
 from gvtools.splats import (
     HARMONICS,
     LOG_SCALE,
@@ -51,8 +52,8 @@ SPLAT_ROW = np.dtype([("xyz", "<f4", 3), ("size", "<f4", 3), ("rgba", "u1", 4), 
 KSPLAT_HEAD, KSPLAT_SECTION = 4096, 1024
 # Of harmonics in 8 bits, where the head names none.
 KSPLAT_RANGE = 1.5
-# glTF's extension, whose name the attributes' names begin with.
-KHR = "KHR_gaussian_splatting"
+# glTF's extension, whose name the attributes' names begin with, and its colours that are read.
+KHR, SRGB = "KHR_gaussian_splatting", "srgb_rec709_display"
 # Of a GLB, in which the extensions that it uses are named.
 GLB_HEAD = 1 << 20
 # Of a Gaussian in a glTF, in bytes.
@@ -64,6 +65,7 @@ PACKED, MODES = "packed_position", ("mip", "2dgs")
 
 def read_splats(path: Path) -> Splats:
     """The Gaussians of a file of a format that ``READERS`` has; harmonics end at degree 3."""
+    path = path / META if path.is_dir() else path
     suffix = path.suffix.lower()
     if suffix not in READERS:
         raise OptionError(f"{path}: expected splats, a file that ends with {', '.join(READERS)}")
@@ -81,8 +83,13 @@ def read_splats(path: Path) -> Splats:
 
 
 def holds_splats(path: Path) -> bool:
-    """Whether a file is of splats by its suffix or, where that does not tell, by what it names."""
+    """Whether a file is of splats by its suffix or, where that does not tell, by what it names.
+
+    A folder is where it has the ``meta.json`` of an SOG.
+    """
     suffix = path.suffix.lower()
+    if suffix == ".json" or path.is_dir():
+        return (path / META).is_file() if path.is_dir() else path.name == META
     if suffix == ".ply" and path.is_file():
         header = read_header(path)
         names = {name for element in header.elements for name, _ in element.columns}
@@ -108,11 +115,16 @@ def _splats(
     values: NDArray[np.floating[Any]],
     *,
     origin: NDArray[np.float64] | None = None,
+    center: NDArray[np.float64] | None = None,
     up: NDArray[np.float64] | None = None,
     mode: str = "",
     axes: NDArray[np.float64] | None = None,
 ) -> Splats:
-    """Rows of a file without those that are no numbers, turned to where its axes are ``axes``."""
+    """Rows of a file without those that are no numbers, turned to where its axes are ``axes``.
+
+    Positions count from ``center``, which is told as an origin where float32 needs it, and both
+    from ``origin``, which the file tells.
+    """
     values = values[:, : SH + 3 * TERMS[-1]].astype(np.float32)
     values[:, LOGIT] = np.clip(values[:, LOGIT], -99, 99)
     sound = np.isfinite(values).all(axis=1) & values[:, QUATERNION:LOGIT].any(axis=1)
@@ -127,6 +139,9 @@ def _splats(
     if axes is not None:
         kept = turn_gaussians(kept, axes)
     origin = np.zeros(3) if origin is None else origin
+    if center is not None:
+        kept, shift = near_origin(kept, center)
+        origin = origin + shift
     rounds, generated = np.zeros(len(kept), np.int32), np.zeros(len(kept), np.bool_)
     dropped = len(values) - len(kept)
     return Splats(kept, origin, None, 0, rounds, generated, up, mode, dropped)
@@ -159,13 +174,18 @@ def _logarithms(sizes: Any) -> NDArray[np.float64]:
 
 def _read_ply(path: Path) -> Splats:
     header = read_header(path)
+    told = _told(header)
     if any(PACKED in dict(item.columns) for item in header.elements):
-        return _splats(_unpacked(path, form="compressed.ply"), **_told(header))
-    return _splats(_ply_values(path), **_told(header))
+        return _splats(_unpacked(path, form="compressed.ply"), **told)
+    rows = read_ply(path, strict=False)
+    if rows.dtype["x"].itemsize == 8 and len(rows):
+        # Doubles may be far from 0: any place among them is near.
+        first = np.array([rows[axis][0] for axis in "xyz"])
+        told["center"] = np.round(np.nan_to_num(first, posinf=0, neginf=0))
+    return _splats(_ply_values(rows, told.get("center", 0)), **told)
 
 
-def _ply_values(path: Path) -> NDArray[np.float32]:
-    rows = read_ply(path)
+def _ply_values(rows: NDArray[np.void], center: ArrayLike = 0) -> NDArray[np.float32]:
     names = rows.dtype.names or ()
     if not is_splat(names):
         raise MemoryFileError("a PLY without Gaussians; expected f_dc_0, scale_0, rot_0")
@@ -184,8 +204,9 @@ def _ply_values(path: Path) -> NDArray[np.float32]:
     if terms:
         rest = columns(numbered("f_rest", count)).reshape(len(rows), 3, terms)
         sh = np.concatenate([sh, rest.transpose(0, 2, 1)], axis=1)
+    positions = np.stack([rows[axis] for axis in "xyz"], axis=1) - np.asarray(center)
     return _rows(
-        columns(("x", "y", "z")), columns(numbered("scale", 3)), columns(numbered("rot", 4)),
+        positions, columns(numbered("scale", 3)), columns(numbered("rot", 4)),
         logits=rows["opacity"], sh=sh,
     )  # fmt: skip
 
@@ -229,6 +250,15 @@ def _read_splat(path: Path) -> Splats:
     return _splats(
         _rows(rows["xyz"], _logarithms(rows["size"]), turns, logits=logits, sh=_dc(colors[:, :3]))
     )
+
+
+def _read_sog(path: Path) -> Splats:
+    meta, parts = read_sog(path)
+    logits = parts["logits"] if "logits" in parts else _logits(parts["opacities"])
+    values = _rows(
+        parts["positions"], parts["log_scales"], parts["quaternions"], logits=logits, sh=parts["sh"]
+    )
+    return _splats(values, up=_unit(meta.get("up")), mode="mip" if meta.get("antialias") else "")
 
 
 def _read_ksplat(path: Path) -> Splats:
@@ -318,7 +348,7 @@ def unpacked(path: Path, *, form: str) -> Iterator[Item]:
         file = Path(folder) / "unpacked.ply"
         file.write_bytes(told["data"])
         del told
-        yield from _sent(_ply_values(file))
+        yield from _sent(_ply_values(read_ply(file)))
 
 
 def spz(path: Path, *, form: str) -> Iterator[Item]:
@@ -386,11 +416,8 @@ def _joined(
 
 def _read_glb(path: Path) -> Splats:
     tree, body = split_glb(read_bytes(path))
-    nodes, parts = tree.get("nodes", []), []
-    parents = {child: number for number, node in enumerate(nodes)
-               for child in node.get("children", ())}  # fmt: skip
-    up = np.array([0.0, 1, 0])
-    for number, node in enumerate(nodes):
+    parts, up = [], np.array([0.0, 1, 0])
+    for node, matrix in _drawn_nodes(tree):
         for part in tree["meshes"][node["mesh"]]["primitives"] if "mesh" in node else ():
             extension = part.get("extensions", {}).get(KHR)
             if extension is None:
@@ -400,15 +427,40 @@ def _read_glb(path: Path) -> Splats:
                     f"Gaussians that are compressed or no ellipsoids ({str(extension)[:80]}); "
                     f"expected plain {KHR}; save it without compression"
                 )
-            up = node.get("extras", {}).get("up", up)
-            values = _glb_rows(tree, body, part["attributes"])
-            if extension.get("colorSpace", "srgb_rec709_display") != "srgb_rec709_display":
-                raise MemoryFileError(f"colours in {extension['colorSpace']}; expected sRGB")
-            parts.append(place_gaussians(values, _glb_matrix(nodes, parents, number)))
+            if extension.get("colorSpace", SRGB) != SRGB:
+                raise MemoryFileError(
+                    f"colours in {extension['colorSpace']!r:.40}; expected {SRGB}; save it in sRGB"
+                )
+            if "up" in node.get("extras", {}):
+                up = matrix[:3, :3] @ np.asarray(node["extras"]["up"], np.float64)
+            parts.append(place_gaussians(_glb_rows(tree, body, part["attributes"]), matrix))
             if sum(len(values) for values, _ in parts) * LEAST_BYTES > len(body):
                 raise ValueError("nodes that draw a set several times")
-    values, origin = near_origin(*_joined(parts))
-    return _splats(values, origin=origin, up=_unit(up))
+    values, center = _joined(parts)
+    return _splats(values, center=center, up=_unit(up))
+
+
+def _drawn_nodes(tree: dict[str, Any]) -> Iterator[tuple[dict[str, Any], NDArray[np.float64]]]:
+    """The nodes of the scene, and (4, 4) from the frame of each to the scene's."""
+    from scipy.spatial.transform import Rotation
+
+    nodes, scenes = tree.get("nodes", []), tree.get("scenes")
+    inner = {child for node in nodes for child in node.get("children", ())}
+    outer = sorted({*range(len(nodes))} - inner)
+    first = scenes[tree.get("scene", 0)].get("nodes", ()) if scenes else outer
+    rest = [(number, np.eye(4)) for number in first]
+    for number, above in rest:
+        node, own = nodes[number], np.eye(4)
+        if "matrix" in node:
+            own = np.array(node["matrix"], np.float64).reshape(4, 4).T
+        else:
+            turn = Rotation.from_quat(node.get("rotation", (0, 0, 0, 1))).as_matrix()
+            own[:3, :3] = turn * np.asarray(node.get("scale", (1, 1, 1)), np.float64)
+            own[:3, 3] = node.get("translation", (0, 0, 0))
+        yield node, above @ own
+        rest += [(child, above @ own) for child in node.get("children", ())]
+        if len(rest) > len(nodes):
+            raise ValueError("a node in several places")
 
 
 def _glb_rows(
@@ -432,27 +484,6 @@ def _glb_rows(
     )  # fmt: skip
 
 
-def _glb_matrix(
-    nodes: list[dict[str, Any]], parents: Mapping[int, int], number: int | None
-) -> NDArray[np.float64]:
-    """(4, 4) from a node's frame to the scene's."""
-    from scipy.spatial.transform import Rotation
-
-    matrix = np.eye(4)
-    for _ in nodes:
-        if number is None:
-            break
-        node, own = nodes[number], np.eye(4)
-        if "matrix" in node:
-            own = np.array(node["matrix"], np.float64).reshape(4, 4).T
-        else:
-            turn = Rotation.from_quat(node.get("rotation", (0, 0, 0, 1))).as_matrix()
-            own[:3, :3] = turn * np.asarray(node.get("scale", (1, 1, 1)), np.float64)
-            own[:3, 3] = node.get("translation", (0, 0, 0))
-        matrix, number = own @ matrix, parents.get(number)
-    return matrix
-
-
 def _read_usd(path: Path) -> Splats:
     require("pxr", extra="export", purpose=f"{path}: {path.suffix}")
     parts, up = [], None
@@ -460,8 +491,8 @@ def _read_usd(path: Path) -> Splats:
         up = facts.get("up", up)
         if "values" in arrays:
             parts.append(place_gaussians(arrays["values"], arrays["matrix"]))
-    values, origin = near_origin(*_joined(parts))
-    return _splats(values, origin=origin, up=_unit(up))
+    values, center = _joined(parts)
+    return _splats(values, center=center, up=_unit(up))
 
 
 def usd(path: Path) -> Iterator[Item]:
@@ -500,7 +531,8 @@ def usd(path: Path) -> Iterator[Item]:
 READERS: Mapping[str, Callable[[Path], Splats]] = {
     ".ply": _read_ply,
     ".spz": _read_spz,
-    ".sog": lambda path: _splats(_unpacked(path, form="sog")),
+    ".sog": _read_sog,
+    ".json": _read_sog,
     ".splat": _read_splat,
     ".ksplat": _read_ksplat,
     ".glb": _read_glb,

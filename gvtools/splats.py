@@ -171,7 +171,10 @@ def place_gaussians(
     axes, origin = matrix[:3, :3], matrix[:3, 3]
     size = float(np.cbrt(np.linalg.det(axes)))
     if not size > 0 or np.abs(axes @ axes.T / size**2 - np.eye(3)).max() > SKEW:
-        raise ShapeError("a frame that is mirrored, sheared or scaled differently along its axes")
+        raise ShapeError(
+            "a frame that is mirrored, sheared or scaled differently along its axes; expected one "
+            "scale; apply the others in the program that wrote it"
+        )
     if np.array_equal(axes, np.eye(3)):
         return values, origin
     out = turn_gaussians(values, axes / size)

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import importlib
+import json
 from dataclasses import replace
+from typing import Any
+from zipfile import ZipFile
 
 import numpy as np
 import pytest
 from command_line import refused, run_command
+from PIL import Image
+from plyfile import PlyData, PlyElement
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from gvtools.errors import MemoryFileError
+from gvtools.errors import GvError, MemoryFileError
 from gvtools.glb import glb_array, join_glb, split_glb
 from gvtools.scans.read import read_scan
 from gvtools.splat_files import READERS, read_splats
@@ -77,7 +82,7 @@ def check_alike(found, given, errors):
 
 def test_every_format_is_read_and_written():
     assert {*ERRORS} == {*WRITERS}
-    assert {f".{end.split('.')[-1]}" for end in WRITERS} | {".usd"} == {*READERS}
+    assert {f".{end.split('.')[-1]}" for end in WRITERS} | {".usd", ".json"} == {*READERS}
 
 
 @pytest.mark.parametrize("end", ERRORS)
@@ -147,10 +152,106 @@ def test_a_glb_shows_linear_colors_and_its_node_moves_turns_and_scales(tmp_path)
     check_alike(found, replace(given, values=values, origin=moved), (1e-5, 1e-5, 1e-5, 1e-5, 1e-4))
 
 
-@pytest.mark.parametrize(("end", "mode"), [(".ply", "mip"), (".ply", "2dgs"), (".spz", "mip"),
-                                           (".compressed.ply", "mip")])  # fmt: skip
+def test_sparse_arrays_of_a_glb_and_what_no_scene_shows(tmp_path):
+    file, given = written(tmp_path, ".glb", some(1)), some(1)
+    tree, body = split_glb(file.read_bytes())
+    # Positions from 0, of which each is told; a second node that the scene leaves out.
+    accessor = tree["accessors"][0]
+    tree["bufferViews"].append({"buffer": 0, "byteOffset": len(body), "byteLength": 2 * COUNT})
+    body += np.arange(COUNT, dtype="<u2").tobytes()
+    rows = {"bufferView": len(tree["bufferViews"]) - 1, "componentType": 5123}
+    values = {"bufferView": accessor.pop("bufferView")}
+    accessor["sparse"] = {"count": COUNT, "indices": rows, "values": values}
+    tree["nodes"].append({"mesh": 0, "translation": [50, 0, 0]})
+    file.write_bytes(join_glb(tree, body))
+    check_alike(read_splats(file), given, ERRORS[".glb"])
+    tree["nodes"][0]["children"] = [0]
+    file.write_bytes(join_glb(tree, body))
+    with pytest.raises(MemoryFileError, match="a node in several places"):
+        read_splats(file)
+
+
+@pytest.mark.parametrize(
+    ("end", "mode"),
+    [(".ply", "mip"), (".ply", "2dgs"), (".spz", "mip"), (".compressed.ply", "mip"),
+     (".sog", "mip")],
+)  # fmt: skip
 def test_how_to_draw_them_is_kept(tmp_path, end, mode):
     assert read_splats(written(tmp_path, end, replace(some(1), mode=mode))).mode == mode
+
+
+@pytest.mark.parametrize(("order", "text"), [("<", False), (">", False), ("<", True)])
+def test_a_ply_of_another_writer(tmp_path, order, text):
+    """Doubles far from 0, its properties sorted, either byte order or text, cameras behind."""
+    file, given, far = written(tmp_path, ".ply", some()), some(), np.array([4e5, 5e6, 100])
+    rows = PlyData.read(file)["vertex"].data
+    table = np.empty(COUNT, [(name, "f8") for name in sorted(rows.dtype.names)])
+    for name in rows.dtype.names:
+        table[name] = rows[name] + (far["xyz".index(name)] if name in "xyz" else 0)
+    camera = np.ones(2, [("fx", "f4")])
+    parts = [PlyElement.describe(table, "vertex"), PlyElement.describe(camera, "camera")]
+    PlyData(parts, text=text, byte_order=order).write(tmp_path / "b.ply")
+    found = read_splats(tmp_path / "b.ply")
+    check_alike(found, replace(given, origin=far), (2e-6, 1e-6, 1e-6, 1e-6, 1e-6))
+    if text:
+        data = (tmp_path / "b.ply").read_bytes().rpartition(b"\n1")[0].rpartition(b"\n")[0]
+        (tmp_path / "c.ply").write_bytes(data.rpartition(b"\n")[0])
+        with pytest.raises(MemoryFileError, match=f"{COUNT - 1} lines of numbers, but"):
+            read_splats(tmp_path / "c.ply")
+
+
+def write_first_sog(folder, given):
+    """SOG of version 1, as the package sogs wrote it: ranges instead of codebooks."""
+    side = 20
+    meta: dict[str, dict[str, Any]] = {part: {} for part in ("quats", "scales", "sh0", "shN")}
+    meta["means"] = {"shape": [COUNT, 3]}
+
+    def save(part, name, stored):
+        picture = np.zeros((side * side, stored.shape[1]), np.uint8)
+        picture[:COUNT] = stored
+        Image.fromarray(picture.reshape(side, side, -1)).save(folder / name, lossless=True, exact=1)
+        meta[part]["files"] = [*meta[part].get("files", ()), name]
+
+    def stored(part, values, most=255):
+        low, high = (values.min(axis=0), values.max(axis=0))
+        meta[part] |= {"mins": low.tolist(), "maxs": high.tolist()}
+        return np.rint((values - low) / (high - low) * most).astype(int)
+
+    means = stored("means", np.sign(given.positions) * np.log1p(np.abs(given.positions)), 65535)
+    save("means", "means_l.webp", means & 255)
+    save("means", "means_u.webp", means >> 8)
+    save("scales", "scales.webp", stored("scales", given.log_scales))
+    colors = np.concatenate([given.harmonics[:, 0], given.logits[:, None]], axis=1)
+    save("sh0", "sh0.webp", stored("sh0", colors))
+    q = given.quaternions
+    place = np.abs(q).argmax(axis=1)
+    q = q * np.sign(q[np.arange(COUNT), place])[:, None]
+    rest = q[np.arange(4) != place[:, None]].reshape(-1, 3) * np.sqrt(0.5) + 0.5
+    save("quats", "quats.webp", np.column_stack([np.rint(rest * 255), 252 + place]))
+    low, high = float(given.harmonics[:, 1:].min()), float(given.harmonics[:, 1:].max())
+    meta["shN"] |= {"mins": low, "maxs": high, "files": ["c.webp"]}
+    palette = np.zeros((320, 15, 3), np.uint8)
+    palette[:COUNT] = np.rint((given.harmonics[:, 1:] - low) / (high - low) * 255)
+    Image.fromarray(palette.reshape(5, -1, 3)).save(folder / "c.webp", lossless=True)
+    save("shN", "l.webp", np.stack((*np.divmod(np.arange(COUNT), 256)[::-1], 0 * place), axis=1))
+    (folder / "meta.json").write_text(json.dumps(meta))
+
+
+def test_sog_of_version_1_in_a_folder_and_zipped(tmp_path):
+    given = some()
+    write_first_sog(tmp_path, given)
+    with ZipFile(tmp_path / "a.sog", "w") as out:
+        for file in tmp_path.glob("*.[wj]*"):
+            out.write(file, file.name)
+    for path in (tmp_path, tmp_path / "meta.json", tmp_path / "a.sog"):
+        found = read_splats(path)
+        check_alike(found, given, (1e-4, 0.02, 0.01, 0.005, 0.01))
+        assert found.degree == 3
+    meta = json.loads((tmp_path / "meta.json").read_text())
+    meta["means"]["files"][0] = "../a.webp"
+    (tmp_path / "meta.json").write_text(json.dumps(meta))
+    with pytest.raises(GvError, match="lies outside of"):
+        read_splats(tmp_path)
 
 
 def test_a_file_is_converted_and_the_suffix_tells_the_format(tmp_path, capsys):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from gvtools.errors import MemoryFileError, OptionError
 from gvtools.memory.store.store import Store
 from gvtools.memory.thinning import thin
-from gvtools.ply import read_ply, write_ply
+from gvtools.ply import read_ply, up_comment, write_ply
 
 if TYPE_CHECKING:
     import open3d as o3d
@@ -39,16 +39,22 @@ def read_point_cloud(path: Path) -> o3d.t.geometry.PointCloud:
 
 
 def export_memory_ply(
-    memory: Store, path: Path, *, max_points: int | None = None, observed: bool = False
+    memory: Store,
+    path: Path,
+    *,
+    max_points: int | None = None,
+    observed: bool = False,
+    up: NDArray[np.float64] | None = None,
 ) -> tuple[int, float]:
     """Write the observations with colour, confidence, spacing, round, view, generated and scanned.
 
     x, y, z are in the input's world frame: float, or double where the origin is so far away that
     float would lose a tenth of a voxel. ``max_points`` thins to one point per voxel (the most
     confident), of voxels as much larger than the memory's as it takes; None keeps every
-    observation. Returns the points written, and the voxel edge they were thinned to (0 when all
-    were kept).
+    observation. A comment tells what is ``up`` (3,). Returns the points written, and the voxel edge
+    they were thinned to (0 when all were kept).
     """
+    comments = ("gvtools memory, input world frame, scene units", *up_comment(up))
     count = len(memory) - (memory.generated_count if observed else 0)
     if observed and not count:
         raise OptionError(f"{path}: the memory holds nothing that was observed")
@@ -56,7 +62,7 @@ def export_memory_ply(
         points = thin(memory, max_points, among=~memory.generated if observed else None)
         columns = {name: getattr(memory.columns, name)[points.rows] for name in _COLUMNS}
         kind = _vertex_type(memory, _reach(memory, columns["positions"]))
-        write_ply(path, _vertices(memory, columns, kind), comments=_COMMENTS)
+        write_ply(path, _vertices(memory, columns, kind), comments=comments)
         return len(points.rows), points.edge
 
     def columns_of(tile: Tile) -> dict[str, NDArray[Any]]:
@@ -74,12 +80,11 @@ def export_memory_ply(
         reach = max(_reach(memory, columns_of(tile)["positions"]) for tile in tiles)
         kind = _vertex_type(memory, reach)
     parts = (_vertices(memory, columns_of(tile), kind) for tile in memory.tiles.each())
-    write_ply(path, np.empty(0, kind), more=parts, count=count, comments=_COMMENTS)
+    write_ply(path, np.empty(0, kind), more=parts, count=count, comments=comments)
     return count, 0.0
 
 
 _COLUMNS = ("positions", "colors", "confidence", "spacing", "view")
-_COMMENTS = ("gvtools memory, input world frame, scene units",)
 
 
 def _reach(memory: Store, positions: NDArray[np.float32]) -> float:

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, Field, PrivateAttr, ValidationError
 
 from gvtools.cameras import Cameras, invert_rigid, rigid_transform
@@ -250,6 +251,7 @@ def write_transforms(
     *,
     image_paths: Sequence[str | Path],
     generated: Collection[str] = (),
+    up: NDArray[np.float64] | None = None,
 ) -> None:
     """Write cameras as a ``transforms.json`` that nerfstudio, instant-ngp and this project read.
 
@@ -257,6 +259,7 @@ def write_transforms(
         cameras: V cameras; K without skew.
         image_paths: V pictures, absolute or relative to the file's folder.
         generated: names of the cameras whose pictures a completer made.
+        up: (3,) unit vector, world frame, which the file is to tell.
     """
     frames = []
     for i, image in enumerate(image_paths):
@@ -275,6 +278,7 @@ def write_transforms(
             frame["generated"] = True
         frames.append(frame)
     data = {"exported_by": EXPORTER, "camera_model": "PINHOLE", "frames": frames}
+    data |= {} if up is None else {"up": up.tolist()}
     write_text(path, json.dumps(data, indent=2))
 
 

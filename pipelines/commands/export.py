@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from gvtools.errors import OptionError
@@ -48,7 +51,7 @@ class ExportCommand(Arguments, ExportOptions):
         from gvtools.splat_files import holds_splats
         from pipelines.export.source import ExportSource
 
-        splats = holds_splats(self.memory) and not self.memory.is_dir()
+        splats = holds_splats(self.memory)
         form = FORMATS["splat"] if splats and self.format is None else self._form()
         for name in (name for name in ExportOptions.model_fields if name in self.model_fields_set):
             if name not in form.options:
@@ -78,7 +81,8 @@ class ExportCommand(Arguments, ExportOptions):
                     "stand for them"
                 )
             memory = shown
-        console.line(write(ExportSource(self.memory, memory, self.round), self.out, self))
+        source = ExportSource(self.memory, memory, self.round, self._told_up())
+        console.line(write(source, self.out, self) + _said(source.up))
         made = memory.generated_count / len(memory)
         if made and "observed" in form.options and not self.observed:
             console.line(
@@ -110,11 +114,26 @@ class ExportCommand(Arguments, ExportOptions):
                     f"{self.key(name)}: {self.memory} is a file of splats; leave it out"
                 )
         splats = read_splats(self.memory)
+        splats = replace(splats, up=splats.up if self.up is None else self._told_up())
         if form.name == "html":
             from pipelines.export.html import page_of, write_page
             from pipelines.viewing.source import ViewSource
 
-            page = page_of(ViewSource(self.memory).read(), splats)
-            console.line(write_page(page, splats, self.out))
+            run = replace(ViewSource(self.memory).read(), told_up=splats.up)
+            console.line(write_page(page_of(run, splats), splats, self.out) + _said(splats.up))
             return
-        console.line(write_file(splats, self.out, self))
+        console.line(write_file(splats, self.out, self) + _said(splats.up))
+
+    def _told_up(self) -> NDArray[np.float64] | None:
+        """(3,) unit vector of --up."""
+        if self.up is None:
+            return None
+        length = float(np.linalg.norm(self.up))
+        if not 0 < length < np.inf:
+            told = " ".join(f"{x:g}" for x in self.up)
+            raise OptionError(f"--up {told}; expected three finite numbers, not all 0")
+        return np.array(self.up) / length
+
+
+def _said(up: NDArray[np.float64] | None) -> str:
+    return "" if up is None else "; up is " + " ".join(f"{x:.3g}" for x in up)

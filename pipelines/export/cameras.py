@@ -97,7 +97,8 @@ def write_transforms(source: ExportSource, path: Path, options: ExportOptions) -
         if isinstance(picture, Path) and not picture.is_file():
             absent.append(name)
         paths.append(place)
-    write_frames(file, distinct.cameras, image_paths=paths, generated=distinct.generated.keys())
+    generated = distinct.generated.keys()
+    write_frames(file, distinct.cameras, image_paths=paths, generated=generated, up=source.up)
     # Readers look nowhere else: pictures from elsewhere get a second name, by a link or a copy.
     for target, picture in elsewhere.items():
         target.parent.mkdir(parents=True, exist_ok=True)

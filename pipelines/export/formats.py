@@ -25,9 +25,9 @@ from gvtools.settings import Settings
 # How files of SPZ begin, of version 4 and older, and what is read of a file to know its format.
 SPZ, HEAD_BYTES = (b"NGSP", b"\x1f\x8b"), 64
 # What every point format takes, and what a mesh takes beside it.
-POINTS = ("max_points", "observed")
+POINTS = ("max_points", "observed", "up")
 SPLATS = (*POINTS, "spz_version")
-MESH = ("observed", "method", "voxel", "least_piece", "max_triangles", "texture")
+MESH = ("observed", "up", "method", "voxel", "least_piece", "max_triangles", "texture")
 FormatName = Literal[
     "ply", "splat", "spz", "html", "mesh", "las", "usd", "rrd", "glb", "colmap", "transforms"
 ]
@@ -41,6 +41,9 @@ class ExportOptions(Settings):
     million; glb, usd: 2 million; otherwise the memory's voxels). [N]"""
     observed: bool = False
     """Leave out what a completer made."""
+    up: tuple[float, float, float] | None = None
+    """What is up in the world frame, for files to tell (from the photographs or the file).
+    [X Y Z]"""
     method: Literal["tsdf", "poisson"] = "tsdf"
     """Mesh: how it is made."""
     voxel: float | None = Field(None, gt=0)
@@ -119,18 +122,18 @@ _ALL = (
     ExportFormat("html", "html.write_html", "one page to share, which draws the 3D Gaussians",
                  {".html": b"<!DOCTYPE html>\n<!-- gvtools export -->"}, POINTS),
     ExportFormat("mesh", "mesh.write_mesh", "triangles with vertex colours or a texture",
-                 {".ply": b"ply", ".glb": b"glTF", ".obj": b"# gvtools"}, MESH, ("trimesh",)),
+                 {".ply": b"ply", ".glb": b"glTF", ".obj": b"# gvtools"}, MESH),
     ExportFormat("las", "points.write_las", "point cloud for GIS",
                  {".las": b"LASF", ".laz": b"LASF"}, POINTS, ("laspy", "lazrs")),
     ExportFormat("usd", "points.write_usd", "point cloud for Omniverse, Blender, Houdini",
                  {".usdc": b"PXR-USDC", ".usda": b"#usda"}, POINTS, ("pxr",)),
     ExportFormat("rrd", "rrd.write_rrd", "recording of the whole run for rerun",
-                 {".rrd": b"RRF2"}, ("max_points",), ("rerun",)),
+                 {".rrd": b"RRF2"}, ("max_points", "up"), ("rerun",)),
     ExportFormat("glb", "points.write_glb", "point cloud for web viewers",
-                 {".glb": b"glTF"}, POINTS, ("trimesh",)),
+                 {".glb": b"glTF"}, POINTS),
     ExportFormat("colmap", "cameras.write_colmap", "COLMAP model",
                  options=("max_points",), foreign="cameras.foreign_model"),
     ExportFormat("transforms", "cameras.write_transforms", "cameras as transforms.json",
-                 options=("images",), foreign="cameras.foreign_transforms"),
+                 options=("images", "up"), foreign="cameras.foreign_transforms"),
 )  # fmt: skip
 FORMATS: Mapping[str, ExportFormat] = {each.name: each for each in _ALL}

@@ -44,7 +44,7 @@ def write_html(source: ExportSource, path: Path, options: ExportOptions) -> str:
     if most is None:
         most = MAX_POINTS + (0 if fit is None else len(fit.gaussians))
     splats = source.splats(options.model_copy(update={"max_points": most}), exposed=False)
-    run = RunView(source.path, memory, cameras=cameras_of(memory, ()))
+    run = RunView(source.path, memory, cameras=cameras_of(memory, ()), told_up=source.up)
     return write_page(page_of(run, splats, cameras=list(_cameras(source)), fit=fit), splats, path)
 
 

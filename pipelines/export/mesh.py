@@ -9,14 +9,15 @@ wanted, vertices are merged in cells before.
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from gvtools.cameras import Cameras
 from gvtools.errors import DegenerateError, OptionError
@@ -24,17 +25,19 @@ from gvtools.files import replaced_when_written, write_text
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.store.local_frame import LocalFrame
 from gvtools.memory.thinning import thin
+from gvtools.optional import require
+from gvtools.ply import up_comment, write_ply
 from gvtools.runs.layout import RECORD
 from gvtools.runs.run import load_run
 from pipelines.export.formats import ExportOptions
-from pipelines.export.points import write_glb_scene
+from pipelines.export.points import UNLIT, glb_of, linear, unlit
 from pipelines.export.source import ExportSource
 from pipelines.export.texture import TEXELS, Texture, texture_of
 
 if TYPE_CHECKING:
     import open3d as o3d
 
-
+Up = NDArray[np.float64] | None
 # The edge of a mesh's voxels is at least PER_VOXEL edges of the memory's finest voxels, and
 # PER_FOOTPRINT times the quantile MOST of its observations' spacing.
 PER_VOXEL, PER_FOOTPRINT, MOST = 2.0, 1.0, 0.9
@@ -215,7 +218,8 @@ def _checked(mesh: o3d.t.geometry.TriangleMesh, method: str) -> o3d.t.geometry.T
 
 
 METHODS = {"tsdf": tsdf_mesh, "poisson": poisson_mesh}
-NODE = "gvtools_mesh"
+NODE, HEADER = "gvtools_mesh", "gvtools mesh, input world frame, scene units"
+CHANNELS = ("red", "green", "blue")
 # Decimation starts from at most so many times the triangles that are wanted.
 RATIO = 8
 # Cells grow by so much until they leave few enough.
@@ -262,7 +266,7 @@ def write_mesh(source: ExportSource, path: Path, options: ExportOptions) -> str:
         mesh = simplify(mesh, most)
     texture = None if size is None else texture_of(mesh, _photographs(source), size)
     triangles = Triangles.of(mesh, memory.frame, texture)
-    SAVERS[path.suffix.lower()](triangles, path)
+    SAVERS[path.suffix.lower()](triangles, path, source.up)
     count = len(triangles.faces)
     fewer = f", simplified from {made}" if count < made else ""
     fewer += f", without {islands} small pieces (--least-piece)" if islands else ""
@@ -315,32 +319,52 @@ def _photographs(source: ExportSource) -> Iterator[tuple[Cameras, NDArray[np.uin
         yield camera.resized(picture.shape[1], picture.shape[0]), picture
 
 
-def _save_ply(triangles: Triangles, path: Path) -> None:
-    from gvtools.o3d import o3d
-
-    mesh = o3d.geometry.TriangleMesh(
-        o3d.utility.Vector3dVector(triangles.vertices), o3d.utility.Vector3iVector(triangles.faces)
-    )
-    mesh.vertex_colors = o3d.utility.Vector3dVector(triangles.colors / 255.0)
-    with replaced_when_written(path, suffix=".ply") as temporary:
-        if not o3d.io.write_triangle_mesh(str(temporary), mesh):
-            raise OSError("Open3D wrote no file")
+def _save_ply(triangles: Triangles, path: Path, up: Up) -> None:
+    kind = [*((axis, "<f8") for axis in "xyz"), *((name, "u1") for name in CHANNELS)]
+    rows = np.empty(len(triangles.vertices), kind)
+    for axis, name, column, color in zip(
+        "xyz", CHANNELS, triangles.vertices.T, triangles.colors.T, strict=True
+    ):
+        rows[axis], rows[name] = column, color
+    write_ply(path, rows, faces=triangles.faces, comments=(HEADER, *up_comment(up)))
 
 
-def _save_glb(triangles: Triangles, path: Path) -> None:
-    write_glb_scene(partial(_trimesh, triangles), triangles.vertices, path, node=NODE)
+def _save_glb(triangles: Triangles, path: Path, up: Up) -> None:
+    texture, png = triangles.texture, io.BytesIO()
+    if texture is None:
+        attributes, material = {"COLOR_0": linear(triangles.colors / 255)}, unlit()
+    else:
+        # From the upper left corner.
+        uv = texture.corners.reshape(-1, 2) / len(texture.image)
+        attributes = {"TEXCOORD_0": uv.astype(np.float32)}
+        material = unlit(baseColorTexture={"index": 0})
+        Image.fromarray(texture.image).save(png, "PNG")
+    packed = glb_of(
+        triangles.vertices, attributes, name=NODE, up=up, primitive={"material": 0},
+        indices=triangles.faces.astype(np.uint32), picture=png.getvalue(),
+        materials=[material], extensionsUsed=[UNLIT],
+    )  # fmt: skip
+    with replaced_when_written(path) as temporary:
+        temporary.write_bytes(packed)
 
 
-def _save_obj(triangles: Triangles, path: Path) -> None:
-    from trimesh.exchange.obj import export_obj
-
-    header = "gvtools mesh, input world frame, scene units"
-    name = _material(path)
-    mesh = _trimesh(triangles, triangles.vertices, material=name)
-    if triangles.texture is None:
-        write_text(path, export_obj(mesh, header=header))
-        return
-    text, beside = export_obj(mesh, header=header, return_texture=True, mtl_name=f"{name}.mtl")
+def _save_obj(triangles: Triangles, path: Path, up: Up) -> None:
+    trimesh = require("trimesh", extra="export", purpose=f"--out {path}")
+    name, texture = _material(path), triangles.texture
+    if texture is None:
+        colors: dict[str, Any] = {"vertex_colors": triangles.colors}
+    else:
+        picture = Image.fromarray(texture.image)
+        material = trimesh.visual.material.PBRMaterial(
+            name=name, baseColorTexture=picture, metallicFactor=0.0, roughnessFactor=1.0
+        )
+        uv = texture.uv.reshape(-1, 2)
+        colors = {"visual": trimesh.visual.TextureVisuals(uv=uv, material=material)}
+    mesh = trimesh.Trimesh(triangles.vertices, triangles.faces, process=False, **colors)
+    text, beside = trimesh.exchange.obj.export_obj(
+        mesh, header="\n# ".join([HEADER, *up_comment(up)]), return_texture=True,
+        mtl_name=f"{name}.mtl",
+    )  # fmt: skip
     for name, content in beside.items():
         with replaced_when_written(path.with_name(name)) as temporary:
             temporary.write_bytes(content)
@@ -350,29 +374,6 @@ def _save_obj(triangles: Triangles, path: Path) -> None:
 def _material(path: Path) -> str:
     """Name of an OBJ's material and of the files beside it; OBJ ends names at a space."""
     return "_".join(path.stem.split())
-
-
-def _trimesh(
-    triangles: Triangles, vertices: NDArray[np.floating], *, material: str = NODE
-) -> object:
-    import trimesh
-
-    if triangles.texture is None:
-        return trimesh.Trimesh(
-            vertices, triangles.faces, vertex_colors=triangles.colors, process=False
-        )
-    from PIL import Image
-
-    visuals = trimesh.visual.TextureVisuals(
-        uv=triangles.texture.uv.reshape(-1, 2),
-        material=trimesh.visual.material.PBRMaterial(
-            name=material,
-            baseColorTexture=Image.fromarray(triangles.texture.image),
-            metallicFactor=0.0,
-            roughnessFactor=1.0,
-        ),
-    )
-    return trimesh.Trimesh(vertices, triangles.faces, visual=visuals, process=False)
 
 
 def simplify(mesh: o3d.t.geometry.TriangleMesh, max_triangles: int) -> o3d.t.geometry.TriangleMesh:

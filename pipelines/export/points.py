@@ -2,15 +2,14 @@
 
 Positions keep their precision in georeferenced scenes: LAS has whole multiples of a step from an
 offset; USD and glTF have float32 around the middle of the cloud, which the parent's translation, or
-the node's matrix, moves to the input's world frame for readers that compute in double. Axes are the
+the node's, moves to the input's world frame for readers that compute in double. Axes are the
 input's: glTF calls y up, an input's up is its own affair, and a turned cloud would no longer lie on
 the other exports.
 """
 
 from __future__ import annotations
 
-import io
-from collections.abc import Callable, Mapping, MutableMapping
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,9 @@ from numpy.typing import NDArray
 
 from gvtools.errors import GvError
 from gvtools.files import replaced_when_written
+from gvtools.glb import pack_glb
 from gvtools.memory.ply import export_memory_ply
+from gvtools.ply import up_comment
 from gvtools.runs.run import load_run
 from gvtools.splats import box_middle
 from pipelines.export.formats import ExportOptions
@@ -32,8 +33,8 @@ POINT_FORMAT, VERSION = 7, "1.4"
 STEPS_PER_VOXEL, MOST_STEPS = 10, 2**31 - 1
 # Bytes of a record in a LAS's head, less its end.
 MOST_WKT = 65_534
-# glTF: a type of numbers, and the extension that shows colours as they are.
-FLOAT, UNLIT = 5126, "KHR_materials_unlit"
+# glTF's extension that shows colours as they are.
+UNLIT = "KHR_materials_unlit"
 # 8 bits to 16: 255 becomes 65535.
 TO_16_BITS = 257
 # Viewers of USD and glTF are slow beyond it.
@@ -46,7 +47,9 @@ FRAME = "input world frame, scene units, axes as in the input (not turned to y u
 def write_ply(source: ExportSource, path: Path, options: ExportOptions) -> str:
     """Write every observation, or one a voxel where a number of points is given."""
     memory, observed = source.memory, options.observed
-    points, edge = export_memory_ply(memory, path, max_points=options.max_points, observed=observed)
+    points, edge = export_memory_ply(
+        memory, path, max_points=options.max_points, observed=observed, up=source.up
+    )
     thinned = f", thinned to voxels of {edge:.4g}" if edge else ""
     return f"{points} of {len(memory)} observations{thinned} in {path}"
 
@@ -65,6 +68,8 @@ def write_las(source: ExportSource, path: Path, options: ExportOptions) -> str:
     crs, told = _crs(source)
     if crs:
         header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(crs))
+    for line in up_comment(source.up):
+        header.vlrs.append(laspy.VLR("gvtools", 1, "what is up: x y z", line.encode()))
     header.offsets = np.round(points.middle)
     reach = float(np.abs(points.positions - header.offsets).max())
     # A power of ten, as other software writes it.
@@ -185,38 +190,6 @@ def save_usd(stage: Any, path: Path) -> None:
         raise OSError("USD wrote no file")
 
 
-def _as_photographed(items: MutableMapping[Any, bytes], tree: dict[str, Any]) -> None:
-    """Vertex colours as glTF has them, linear, and materials that no light shines on."""
-    keys = list(items)
-    for mesh in tree["meshes"]:
-        for part in mesh["primitives"]:
-            if "material" not in part:
-                part["material"] = len(tree.setdefault("materials", []))
-                tree["materials"].append({})
-            place = part["attributes"].get("COLOR_0")
-            if place is None:
-                continue
-            accessor = list(tree["accessors"].values())[place]
-            if accessor["componentType"] == FLOAT:
-                continue  # one that another part shares
-            key = keys[accessor["bufferView"]]
-            stored = np.frombuffer(items[key], np.uint8)[: 4 * accessor["count"]].reshape(-1, 4)
-            # As floats: programs that take other numbers for bytes are common.
-            values = linear(stored[:, :3] / 255)
-            items[key] = values.tobytes()
-            accessor |= {"componentType": FLOAT, "type": "VEC3", "normalized": False}
-            accessor |= {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
-    for number, material in enumerate(tree.get("materials", [])):
-        physical = {"baseColorFactor": [1.0] * 4, "metallicFactor": 0.0, "roughnessFactor": 1.0}
-        texture = material.get("pbrMetallicRoughness", {}).get("baseColorTexture")
-        physical |= {} if texture is None else {"baseColorTexture": texture}
-        named = {"name": material["name"]} if "name" in material else {}
-        tree["materials"][number] = {
-            **named, "pbrMetallicRoughness": physical, "extensions": {UNLIT: {}},
-        }  # fmt: skip
-    tree["extensionsUsed"] = sorted({*tree.get("extensionsUsed", ()), UNLIT})
-
-
 def linear(colors: NDArray[Any]) -> NDArray[np.float32]:
     """Colours of sRGB in [0, 1] as the linear light that USD's and glTF's are, little-endian."""
     light = np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
@@ -224,46 +197,41 @@ def linear(colors: NDArray[Any]) -> NDArray[np.float32]:
 
 
 def write_glb(source: ExportSource, path: Path, options: ExportOptions) -> str:
-    """Write one point a voxel with its colour; the node's extras tell origin and frame."""
-    import trimesh
-
+    """Write one point a voxel with its colour; the node's extras tell origin, frame and up."""
     points = source.points(options, most=MAX_POINTS)
-    write_glb_scene(
-        lambda positions: trimesh.PointCloud(positions, colors=points.colors),
+    packed = glb_of(
         points.positions,
-        path,
-        node=NODE,
-        extras={"voxel": points.edge},
-    )
+        {"COLOR_0": linear(points.colors / 255)},
+        name=NODE, up=source.up, extras={"voxel": points.edge},
+        primitive={"mode": 0, "material": 0}, materials=[unlit()], extensionsUsed=[UNLIT],
+    )  # fmt: skip
+    with replaced_when_written(path) as temporary:
+        temporary.write_bytes(packed)
     return f"{source.points_summary(points)} in {path}, in the input's axes"
 
 
-def write_glb_scene(
-    geometry: Callable[[NDArray[np.float32]], Any],
-    positions: NDArray[np.float64],
-    path: Path,
+def glb_of(
+    positions: NDArray[np.floating[Any]],
+    attributes: Mapping[str, NDArray[Any]],
     *,
-    node: str,
+    name: str,
+    up: NDArray[np.float64] | None,
     extras: Mapping[str, Any] | None = None,
-) -> None:
-    """Write a scene of one node.
+    **rest: Any,
+) -> bytes:
+    """A GLB whose node moves positions (N, 3) around 0 to where they are, see ``pack_glb``.
 
-    ``geometry`` makes trimesh's of positions (N, 3) around the node's origin; ``extras`` are what
-    the node says beside that and its frame.
+    Its extras tell that move, the frame, and what is up.
     """
-    import trimesh
+    center = box_middle(positions.astype(np.float64))
+    told = {"origin": center.tolist(), "frame": FRAME, **(extras or {})}
+    told |= {} if up is None else {"up": up.tolist()}
+    node = {"name": name, "translation": center.tolist(), "extras": told}
+    local = (positions - center).astype(np.float32)
+    return pack_glb({"POSITION": local, **attributes}, node=node, **rest)
 
-    center = box_middle(positions)
-    move = np.eye(4)
-    move[:3, 3] = center
-    scene = trimesh.Scene()
-    scene.add_geometry(
-        geometry((positions - center).astype(np.float32)),
-        node_name=node,
-        geom_name=node,
-        transform=move,
-        metadata={"origin": center.tolist(), "frame": FRAME, **(extras or {})},
-    )
-    buffer = io.BytesIO(scene.export(file_type="glb", buffer_postprocessor=_as_photographed))
-    with replaced_when_written(path) as temporary:
-        temporary.write_bytes(buffer.getbuffer())
+
+def unlit(**physical: Any) -> dict[str, Any]:
+    """A material that no light shines on."""
+    physical |= {"metallicFactor": 0.0, "roughnessFactor": 1.0}
+    return {"pbrMetallicRoughness": physical, "extensions": {UNLIT: {}}}

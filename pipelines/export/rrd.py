@@ -67,6 +67,11 @@ def write_rrd(source: ExportSource, path: Path, options: ExportOptions) -> str:
         recording = rerun.RecordingStream("gvtools")
         recording.save(temporary)
         recording.send_recording_name(name)
+        if source.up is not None:
+            axis = int(np.abs(source.up).argmax())
+            way = "UP" if source.up[axis] > 0 else "DOWN"
+            nearest = getattr(rerun.ViewCoordinates, f"RIGHT_HAND_{'XYZ'[axis]}_{way}")
+            recording.log("/", nearest, static=True)
         rounds, made = memory.columns.round[points.rows], memory.generated[points.rows]
         scanned = memory.scanned[points.rows]
         sources = {"observed": ~(made | scanned), "scanned": scanned, "generated": made}

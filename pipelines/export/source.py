@@ -26,6 +26,7 @@ from gvtools.memory.thinning import thin
 from gvtools.runs.run import load_appearance
 from gvtools.runs.target_files import completed_picture
 from gvtools.splats import LOG_SCALE, LOGIT, SH, Splats, box_middle, near_origin, turn_gaussians
+from gvtools.trajectories import level_up
 from pipelines.export.formats import ExportOptions
 
 if TYPE_CHECKING:
@@ -38,8 +39,6 @@ SPREAD = 0.6
 LEAST_OPACITY, MOST_OPACITY = 0.7, 0.99
 # Confidence at which the opacity is half-way between them.
 HALFWAY = 0.5
-# Share of the cameras that agree on what is up, at least.
-LEAST_UP = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +74,7 @@ class ExportSource:
     path: Path  # a run's folder, or a memory file
     memory: SpatialMemory  # with at least one observation
     up_to: int | None = None  # round that the memory ends with; None for the last one
+    told_up: NDArray[np.float64] | None = None  # (3,) unit vector, by the user
 
     @cached_property
     def appearance(self) -> Appearance | None:
@@ -83,11 +83,12 @@ class ExportSource:
 
     @property
     def up(self) -> NDArray[np.float64] | None:
-        """(3,) unit vector, world frame: the photographs' mean; None where they tell none."""
-        seen = [view.camera.cam_from_world[0, 1, :3] for view in self.memory.views.photographed]
-        total = -np.sum(seen, axis=0) if seen else np.zeros(3)
-        length = float(np.linalg.norm(total))
-        return total / length if length > LEAST_UP * len(seen) else None
+        """(3,) unit vector, world frame: told, or the photographs'; None where they tell none."""
+        cameras = [view.camera for view in self.memory.views.photographed]
+        if self.told_up is not None or not cameras:
+            return self.told_up
+        up = level_up(concatenate(cameras))
+        return up if up.any() else None
 
     def points(
         self,

@@ -9,24 +9,28 @@ Open3D; SOG, ``.ksplat``, compressed PLY and SPZ of version 2 by gaussforge; USD
 from __future__ import annotations
 
 import gzip
+import json
 import struct
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
+from zipfile import ZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gvtools.errors import OptionError
 from gvtools.files import replaced_when_written
-from gvtools.glb import join_glb
 from gvtools.optional import installed, require
-from gvtools.ply import write_ply
-from gvtools.splat_files import KHR, RESTS, numbered
+from gvtools.ply import up_comment, write_ply
+from gvtools.sog import META
+from gvtools.splat_files import KHR, RESTS, SRGB, numbered
 from gvtools.splats import SH, TERMS, TO_RUB, Splats, box_middle, turn_gaussians
 from pipelines.export.formats import ExportOptions
-from pipelines.export.points import FLOAT, FRAME, linear, save_usd, usd_stage
+from pipelines.export.points import glb_of, linear, save_usd, usd_stage
 from pipelines.export.source import ExportSource
 
 # Of SPZ's positions: bits with their sign, the most behind the point, and those that its writers
@@ -37,9 +41,9 @@ FRACTIONAL_AT, FLAGS_AT = 13, 14
 STEPS_PER_SIZE, SMALLEST = 8, 0.05
 # Coefficients of a channel above degree 0, in a PLY; the degree that ksplat's own reader takes.
 REST, KSPLAT_DEGREE = 15, 2
-# glTF's names of items by their width.
-TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 FIELD = "/gvtools/splats"
+# What says nothing of what is up.
+SILENT = (".spz", ".splat", ".ksplat")
 
 
 def write_splats(source: ExportSource, path: Path, options: ExportOptions) -> str:
@@ -49,6 +53,8 @@ def write_splats(source: ExportSource, path: Path, options: ExportOptions) -> st
 
 def write_file(splats: Splats, path: Path, options: ExportOptions) -> str:
     """Write Gaussians, and say how many and how."""
+    if options.up is not None and path.suffix.lower() in SILENT:
+        raise OptionError(f"--up: a {path.suffix} has no place for it; leave it out")
     with replaced_when_written(path, suffix="".join(path.suffixes[-2:]).lower()) as temporary:
         note = writer_of(path)(splats, temporary, options)
     return f"{splats.summary()} in {path}{note}"
@@ -67,9 +73,9 @@ def _write_ply(splats: Splats, path: Path, options: ExportOptions) -> str:
 
 def _comments(splats: Splats) -> tuple[str, ...]:
     lines = ["3D Gaussians by gvtools, axes of the input's world frame, scene units"]
-    for name, vector in (("origin", splats.origin), ("up", splats.up)):
-        if vector is not None and vector.any():
-            lines.append(f"{name} " + " ".join(repr(float(x)) for x in vector))
+    if splats.origin.any():
+        lines.append("origin " + " ".join(repr(float(x)) for x in splats.origin))
+    lines += up_comment(splats.up)
     if splats.mode:
         lines.append(f"SplatRenderMode: {splats.mode}")
     return tuple(lines)
@@ -159,8 +165,20 @@ def _write_by_open3d(splats: Splats, path: Path, options: ExportOptions) -> str:
 
 
 def _write_sog(splats: Splats, path: Path, options: ExportOptions) -> str:
-    path.write_bytes(_by_gaussforge(splats, "sog"))
+    packed = BytesIO(_by_gaussforge(splats, "sog"))
+    with ZipFile(packed) as members, ZipFile(path, "w") as out:
+        for item in members.infolist():
+            content = members.read(item)
+            if item.filename == META:
+                content = json.dumps({**json.loads(content), **told_of(splats)}).encode()
+            out.writestr(item, content)
     return ""
+
+
+def told_of(splats: Splats) -> dict[str, Any]:
+    """What an SOG's ``meta.json`` says beside the Gaussians."""
+    up = {} if splats.up is None else {"up": splats.up.tolist()}
+    return {"antialias": splats.mode == "mip", **up}
 
 
 def _write_compressed(splats: Splats, path: Path, options: ExportOptions) -> str:
@@ -219,10 +237,7 @@ def _write_glb(splats: Splats, path: Path, options: ExportOptions) -> str:
 
     Viewers without the extension draw points of the colours.
     """
-    center = box_middle(splats.positions.astype(np.float64))
-    positions = (splats.positions - center).astype(np.float32)
     parts: dict[str, NDArray[np.float32]] = {
-        "POSITION": positions,
         "COLOR_0": np.column_stack([linear(splats.colors), splats.opacities]),
         f"{KHR}:ROTATION": np.roll(splats.quaternions, -1, axis=1),
         f"{KHR}:SCALE": np.exp(splats.log_scales),
@@ -232,31 +247,12 @@ def _write_glb(splats: Splats, path: Path, options: ExportOptions) -> str:
         for term in range(2 * degree + 1):
             name = f"{KHR}:SH_DEGREE_{degree}_COEF_{term}"
             parts[name] = splats.harmonics[:, degree**2 + term]
-    views, accessors, body = list[Any](), list[Any](), bytearray()
-    for part in parts.values():
-        data = np.ascontiguousarray(part, "<f4").tobytes()
-        views.append({"buffer": 0, "byteOffset": len(body), "byteLength": len(data)})
-        accessors.append(
-            {"bufferView": len(accessors), "componentType": FLOAT,
-             "count": len(part), "type": TYPES[part.shape[1]]}
-        )  # fmt: skip
-        body += data
-    accessors[0] |= {"min": positions.min(axis=0).tolist(), "max": positions.max(axis=0).tolist()}
-    extension = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
-    extras: dict[str, Any] = {"frame": FRAME}
-    if splats.up is not None:
-        extras["up"] = splats.up.tolist()
-    node = {"mesh": 0, "name": "gvtools_splats", "extras": extras,
-            "translation": (center + splats.origin).tolist()}  # fmt: skip
-    tree = {
-        "asset": {"version": "2.0", "generator": "gvtools"},
-        "extensionsUsed": [KHR], "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [node],
-        "meshes": [{"primitives": [{
-            "mode": 0, "attributes": {name: place for place, name in enumerate(parts)},
-            "extensions": {KHR: extension}}]}],
-        "accessors": accessors, "bufferViews": views, "buffers": [{"byteLength": len(body)}],
-    }  # fmt: skip
-    path.write_bytes(join_glb(tree, bytes(body)))
+    extension = {KHR: {"kernel": "ellipse", "colorSpace": SRGB}}
+    packed = glb_of(
+        splats.positions + splats.origin, parts, name="gvtools_splats", up=splats.up,
+        primitive={"mode": 0, "extensions": extension}, extensionsUsed=[KHR],
+    )  # fmt: skip
+    path.write_bytes(packed)
     return ", in the input's axes"
 
 

@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.cameras import Cameras
+from gvtools.cameras import Cameras, concatenate
 from gvtools.errors import ProjectError
 from gvtools.runs.layout import AFTER, COMPLETION, GUIDANCE, round_folder
 from gvtools.runs.target_files import entry_camera, read_picture
+from gvtools.trajectories import level_up
 from viz.viewer.colors import CONTEXT, TARGET, PointColors, point_colors, view_counts
 from viz.viewer.standpoint import STRAY, guess_up
 
@@ -95,7 +96,7 @@ class RunView:
     # The page that draws SPLATS, with so many of the memory's points at most beside a fit.
     page_of: Callable[[RunView, int], SharedPage] | None = None
     surface: ColoredMesh | None = None  # to draw for MESH
-    told_up: NDArray[np.float64] | None = None  # (3,) by a file, where there are no cameras
+    told_up: NDArray[np.float64] | None = None  # (3,) unit vector, by a file or the user
 
     @property
     def title(self) -> str:
@@ -169,14 +170,12 @@ class RunView:
         return None if frame is None else frame.depth
 
     def up(self) -> NDArray[np.float64]:
-        """(3,) unit vector, world frame: the cameras' mean, or what the file says, or a guess."""
-        chosen = [c for c in self.cameras if c.kind == CONTEXT] or list(self.cameras)
-        if not chosen:
-            return self._guessed_up if self.told_up is None else self.told_up
-        # Image rows run downwards.
-        total = -np.sum([c.camera.cam_from_world[0, 1, :3] for c in chosen], axis=0)
-        length = float(np.linalg.norm(total))
-        return total / length if length > 1e-6 else -chosen[0].camera.cam_from_world[0, 1, :3]
+        """(3,) unit vector, world frame: what is told, or the cameras' vertical, or a guess."""
+        if self.told_up is not None:
+            return self.told_up
+        chosen = [c for c in self.cameras if c.kind == CONTEXT] or self.cameras
+        up = level_up(concatenate([c.camera for c in chosen])) if chosen else np.zeros(3)
+        return up if up.any() else self._guessed_up
 
     @cached_property
     def _view_counts(self) -> NDArray[np.int64]:

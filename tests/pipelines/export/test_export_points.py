@@ -103,7 +103,7 @@ def far_usd(path):
 
 
 def far_glb(path):
-    """Likewise the node's matrix, which its extras repeat."""
+    """Likewise the node's translation, which its extras repeat."""
     loaded = pytest.importorskip("trimesh").load_scene(path)
     matrix, name = loaded.graph[loaded.graph.nodes_geometry[0]]
     local = np.asarray(loaded.geometry[name].vertices)
@@ -111,7 +111,7 @@ def far_glb(path):
     data = path.read_bytes()
     header = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
     (node,) = (node for node in header["nodes"] if "mesh" in node)
-    assert node["extras"]["origin"] == node["matrix"][12:15] == matrix[:3, 3].tolist()
+    assert node["extras"]["origin"] == node["translation"] == matrix[:3, 3].tolist()
     return local @ matrix[:3, :3].T + matrix[:3, 3]
 
 
@@ -186,6 +186,58 @@ def test_thinning_some_observations_counts_no_others(bare_run):
     assert among[kept.rows].all() and 10 < len(kept.rows) <= 100
     np.testing.assert_array_equal(kept.group >= 0, among)
     np.testing.assert_array_equal(kept.group[kept.rows], np.arange(len(kept.rows)))
+
+
+def told_in(path):
+    """The line of a text, or of a header, that begins with "up"."""
+    lines = path.read_bytes()[:4096].decode("latin1").splitlines()
+    (words,) = (line.split() for line in lines if {"up"} & {*line.split()[:2]})
+    return [float(word) for word in words[-3:]]
+
+
+def told_in_las(path):
+    records = pytest.importorskip("laspy").read(path).header.vlrs
+    (record,) = (each for each in records if each.user_id == "gvtools")
+    return [float(word) for word in record.record_data.split()[1:]]
+
+
+def told_in_usd(path):
+    usd = pytest.importorskip("pxr.Usd")
+    stage = usd.Stage.Open(str(path))
+    assert stage.GetMetadata("upAxis") == "Y"
+    return [*stage.GetRootLayer().customLayerData["up"]]
+
+
+def told_in_rrd(path):
+    """The axis that is nearest, as rerun codes it."""
+    from rerun.chunk import RrdReader
+
+    pytest.importorskip("rerun")
+    batches = [chunk.to_record_batch() for chunk in RrdReader(path).store().stream()]
+    name = "ViewCoordinates:xyz"
+    (codes,) = (batch.column(name)[0].as_py() for batch in batches if name in batch.schema.names)
+    return [{1: 1, 2: -1}.get(code, 0) for code in codes[0]]
+
+
+@pytest.mark.parametrize(
+    ("form", "name", "told"),
+    [("ply", "a.ply", told_in), ("splat", "a.ply", told_in), ("mesh", "a.ply", told_in),
+     ("mesh", "a.obj", told_in), ("las", "a.las", told_in_las), ("usd", "a.usdc", told_in_usd),
+     ("rrd", "a.rrd", told_in_rrd),
+     *((form, name, None) for form, name in
+       [("glb", "a.glb"), ("mesh", "a.glb"), ("splat", "a.glb"), ("transforms", "a.json")])],
+)  # fmt: skip
+def test_every_format_tells_what_is_up(bare_run, tmp_path, capsys, form, name, told):
+    out = tmp_path / name
+    run_command("export", bare_run.folder, "--format", form, "--out", out, "--up", 0, -2, 0)
+    assert "; up is 0 -1 0\n" in capsys.readouterr().out
+    if told is None:
+        data = out.read_bytes()
+        tree = json.loads(data if form == "transforms" else data[20:].partition(b"BIN\0")[0][:-4])
+        found = tree["up"] if form == "transforms" else tree["nodes"][0]["extras"]["up"]
+    else:
+        found = told(out)
+    assert found == [0, -1, 0]
 
 
 WKT = 'LOCAL_CS["site",UNIT["metre",1]]'
