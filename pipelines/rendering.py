@@ -34,8 +34,8 @@ from gvtools.memory.splat.api import SplatOptions
 from gvtools.optional import require
 from gvtools.runs.run import at_run_poses, load_appearance, load_memory
 from gvtools.runs.target_files import to_bytes, write_png
-from gvtools.scenes.layout import holds_views
 from gvtools.scenes.scene import Frame
+from gvtools.scenes.transforms import read_camera_path
 from gvtools.trajectories import PATHS, named_path
 from pipelines.reconstruction.rounds import CachedProjection, Clock, complete_targets
 from pipelines.reconstruction.settings import RunSettings
@@ -194,7 +194,7 @@ FRAMES = 120
 FORMS = (
     f"{', '.join(f'{name}:N' for name in PATHS)}, {CAPTURED} (the captured views in order), a "
     "trajectory file (TUM or KITTI), a transforms.json such as 'gvtools view' saves, or a project, "
-    "the last two as PATH or PATH@SELECTION"
+    "these as PATH or PATH@SELECTION"
 )
 # memory: the whole memory. observed: without completers' points. completed: the memory, holes
 # filled by ``inpaint``. depth: of the memory, near is red, far is blue.
@@ -233,14 +233,9 @@ def film_cameras(
     columns, rows = int(first.width[0]), int(first.height[0])
     if (cameras.width != columns).any() or (cameras.height != rows).any():
         # A film has one size: all frames take the first camera's intrinsics and size.
-        count = len(cameras)
-        cameras = Cameras(
-            np.repeat(first.K, count, axis=0), cameras.cam_from_world,
-            np.full(count, columns), np.full(count, rows), cameras.names,
-        )  # fmt: skip
+        K = np.repeat(first.K, len(cameras), axis=0)
+        cameras = replace(cameras, K=K, width=np.array(columns), height=np.array(rows))
     if width is not None:
-        if width < 16:
-            raise OptionError(f"--width {width}; expected 16 or more")
         columns, rows = width, max(16, round(rows * width / columns))
         cameras = cameras.resized(columns, rows)
     return cameras.cropped(0, 0, width=columns // 2 * 2, height=rows // 2 * 2)
@@ -267,22 +262,16 @@ def _path_cameras(
     place, at, selection = path.partition("@")
     if not Path(place).exists():
         raise OptionError(f"--path {path!r}; expected {FORMS}")
+    from gvtools.scenes.project import open_project
     from gvtools.scenes.selection import select
 
-    if Path(place).suffix.lower() == ".json":
-        from gvtools.scenes.transforms import read_transforms_cameras
-
-        cameras = read_transforms_cameras(Path(place))
-        return cameras[list(map(cameras.names.index, select(cameras.names, selection or "all")))]
-    if holds_views(place):
-        from gvtools.scenes.project import open_project
-
+    selection = selection if at else "all"
+    cameras = read_camera_path(Path(place), captured, selection=selection)
+    if cameras is None:
         scene = open_project(Path(place))
         scene = scene if run is None else at_run_poses(scene, run)[0]
-        return scene.subset(select(scene.names, selection if at else "all")).cameras
-    from gvtools.trajectory_files import read_trajectory
-
-    return read_trajectory(Path(place), captured[0], beside=captured)
+        cameras = scene.subset(select(scene.names, selection)).cameras
+    return cameras
 
 
 class FilmRenderer:

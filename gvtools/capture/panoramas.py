@@ -19,15 +19,13 @@ from PIL import Image
 
 from gvtools.capture.photographs import JPEG_QUALITY, CapturedPhotograph
 from gvtools.errors import OptionError
-from gvtools.scenes.faces import PANORAMA, Face, face_name, panorama_faces
+from gvtools.scenes.faces import FACE_DEGREES, PANORAMA, Face, face_name, panorama_faces
 from gvtools.scenes.images import read_image, read_mask
 
 if TYPE_CHECKING:
     import pycolmap
 
 LENSES = ("auto", "perspective", "equirectangular", "fisheye")
-# Field of view of a panorama's faces, so that neighbours share a margin. [degrees]
-FACE_DEGREES = 100.0
 # XMP of Google's photo sphere schema, near the beginning of a file.
 XMP_KEY, XMP_VALUE, XMP_WITHIN = b"ProjectionType", b"equirectangular", 1 << 18
 # A 2:1 picture is a panorama if its left and right borders continue each other: the mean difference

@@ -1,7 +1,7 @@
 """Position, orientation and scale of a model in the world, which mapping leaves undetermined.
 
-With GPS the world is metric, with x east, y north and z up. Otherwise z is the mean up direction of
-the cameras, x and y are arbitrary, and so is the scale unless a distance is given.
+With GPS the world is metric, with x east, y north and z up. Otherwise z is up as the cameras were
+held, see ``level_up``, x and y are arbitrary, and so is the scale unless a distance is given.
 """
 
 from __future__ import annotations
@@ -13,9 +13,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from gvtools.cameras import Cameras
 from gvtools.errors import OptionError
 from gvtools.scenes.faces import face_name
 from gvtools.scenes.scene import Finding
+from gvtools.trajectories import level_up
 
 if TYPE_CHECKING:
     import pycolmap
@@ -33,7 +35,7 @@ class WorldPlacement:
     """How a model was placed."""
 
     metric: bool  # whether its units are metres
-    by: str  # "GPS", "distance" (scale only) or "cameras" (mean up direction only)
+    by: str  # "GPS", "distance" (scale only) or "cameras" (which way is up only)
     # Latitude, longitude [degrees] and height [m] of its origin; None without GPS.
     origin: tuple[float, float, float] | None = None
 
@@ -121,19 +123,16 @@ def _by_gps(
 
 
 def _level(model: pycolmap.Reconstruction) -> None:
-    """Rotate the cameras' mean up vector to +z, and move their mean centre to the origin."""
+    """Rotate the vertical, as the cameras were held, to +z, and move their mean centre to 0."""
     from scipy.spatial.transform import Rotation
 
     from gvtools.colmap import pycolmap
 
     images = [image for image in model.images.values() if image.has_pose]
-    rotations = np.stack([image.cam_from_world().rotation.matrix() for image in images])
-    centres = np.stack([image.projection_center() for image in images])
-    # Row 1 of cam_from_world is the camera's y axis, which points down. In upper and lower faces
-    # of a panorama it is horizontal, and the two cancel.
-    up = -rotations[:, 1].mean(axis=0)
-    if np.linalg.norm(up) < 1e-3:
-        return
-    turn = Rotation.align_vectors([[0.0, 0.0, 1.0]], [up / np.linalg.norm(up)])[0]
-    shift = -turn.apply(centres.mean(axis=0))
+    poses = np.tile(np.eye(4), (len(images), 1, 1))
+    poses[:, :3] = [image.cam_from_world().matrix() for image in images]
+    one = np.array(1)
+    cameras = Cameras(np.tile(np.eye(3), (len(images), 1, 1)), poses, one, one, ())
+    turn = Rotation.align_vectors([[0.0, 0.0, 1.0]], [level_up(cameras)])[0]
+    shift = -turn.apply(cameras.centers.mean(axis=0))
     model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(turn.as_quat()), shift))

@@ -7,7 +7,6 @@ refines them, and the network's points move with the cameras that see them.
 
 from __future__ import annotations
 
-import shutil
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
@@ -123,8 +122,6 @@ def capture_posed(
         model.extract_colors_for_all_images(str(work / IMAGES))
         locations = {item.name: item.location for item in kept if item.location}
         placement, placed = place(model, locations=locations, distance=distance)
-        shutil.rmtree(work / MODEL)
-        (work / MODEL).mkdir(parents=True)
         model.write_binary(str(work / MODEL))
         errors = tracks.reprojection_errors(adjusted, adjusted.cam_from_world)
         report = CaptureReport(

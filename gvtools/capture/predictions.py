@@ -80,22 +80,22 @@ def _fullest(path: Path) -> Arrays:
     frames = [file for file in files if file.parent == path / "camera"]
     if frames:
         return _of_frames(path, [file.stem for file in frames])
-    fullest: Arrays = {}
-    for folder in sorted({file.parent for file in files}):
-        alone = [file for file in files if file.parent == folder and file.stem in EVERY]
-        arrays = {file.stem: load_array(file) for file in alone if file.suffix == ".npy"}
-        fullest = max(fullest, arrays, key=len)
+    held: dict[Path, set[str]] = {}
     for file in files:
-        if file.suffix not in (".npy", ".npz") and file.is_file():
-            raise ValueError(LACKS.get(file.suffix.lower(), f"of the kind {file.suffix!r}"))
-        if file.suffix != ".npy":
+        if file.suffix == ".npy":
+            held.setdefault(file.parent, set()).update({file.stem} & EVERY)
+        elif file.suffix == ".npz" or not file.is_file():
             with archive(file) as opened:
-                held = {name.removesuffix(".npy") for name in opened.namelist()} & EVERY
-            # Of points that depth tells as well, VGGT's would take gigabytes.
-            held -= {*POINTS} if held & {*DEPTH} else set()
-            if len(held) > len(fullest):
-                fullest = load_arrays(file, *sorted(held))
-    return fullest
+                held[file] = {name.removesuffix(".npy") for name in opened.namelist()} & EVERY
+        else:
+            raise ValueError(LACKS.get(file.suffix.lower(), f"of the kind {file.suffix!r}"))
+    place = max(held, key=lambda place: len(held[place]), default=path)
+    names = held.get(place, set())
+    # Of points that depth tells as well, VGGT's would take gigabytes.
+    names -= {*POINTS} if names & {*DEPTH} else set()
+    if place.is_dir():
+        return {name: load_array(place / f"{name}.npy") for name in names}
+    return load_arrays(place, *sorted(names)) if names else {}
 
 
 def _of_frames(path: Path, names: Sequence[str]) -> Arrays:

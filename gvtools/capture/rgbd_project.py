@@ -39,6 +39,7 @@ from gvtools.scenes.rgbd import (
     rgbd_scene,
 )
 from gvtools.scenes.scene import Finding, Scene
+from gvtools.trajectories import level_up
 from gvtools.untrusted import open_picture
 
 Float64 = NDArray[np.float64]
@@ -263,28 +264,23 @@ def _report(
 def points_from_above(scene: Scene, keyframes: Sequence[str]) -> tuple[Cameras, Float64]:
     """Cameras and (N, 3) points of a captured project, turned so that z is up, for its picture.
 
-    Keyframes give points, of many DRAWN; up is against the mean of the cameras' y axes.
+    Keyframes give points, of many DRAWN.
     """
     cameras = scene.cameras
-    down = cameras.world_from_cam[:, :3, 1].mean(axis=0)
-    turn = np.eye(4)
-    turn[:3, :3] = Rotation.align_vectors([[0, 0, -1]], [down])[0].as_matrix()
+    turn = Rotation.align_vectors([[0, 0, 1]], [level_up(cameras)])[0]
+    whole = np.eye(4)
+    whole[:3, :3] = turn.as_matrix()
     shown = [name for name in keyframes if name in set(scene.names)]
     points = []
     for name in shown[:: max(1, len(shown) // DRAWN)]:
         view = scene[name]
         depth = view.load().depth
         assert depth is not None
-        line, column = np.mgrid[0 : depth.shape[0] : 12, 0 : depth.shape[1] : 12]
-        z = depth[line, column]
-        line, column, z = line[z > 0], column[z > 0], z[z > 0].astype(np.float64)
-        rays = np.stack([column + 0.5, line + 0.5, np.ones(len(z))]) * z
-        points.append(
-            (turn @ view.camera.world_from_cam[0])[:3]
-            @ np.vstack([np.linalg.inv(view.camera.K[0]) @ rays, np.ones(len(z))])
-        )
-    turned = replace(cameras, cam_from_world=cameras.cam_from_world @ turn.T)
-    return turned, np.concatenate(points, axis=1).T if points else np.zeros((0, 3))
+        local = (view.camera.rays() * depth[..., None])[::12, ::12]
+        pose = view.camera.world_from_cam[0]
+        points.append(turn.apply(local[local[..., 2] > 0] @ pose[:3, :3].T + pose[:3, 3]))
+    turned = replace(cameras, cam_from_world=cameras.cam_from_world @ whole.T)
+    return turned, np.concatenate([np.zeros((0, 3)), *points])
 
 
 def _summary(rows: Float64) -> dict[str, float] | None:

@@ -22,7 +22,7 @@ from pydantic import Field
 
 from gvtools.cameras import Cameras, concatenate, invert_rigid
 from gvtools.guidance import IMAGES, Guidance
-from gvtools.scenes.faces import PANORAMA, Face, face_name, panorama_faces, picture_of
+from gvtools.scenes.faces import FACE_DEGREES, PANORAMA, Face, face_name, panorama_faces, picture_of
 from gvtools.scenes.undistort import camera_of
 from gvtools.settings import Settings
 from gvtools.trajectories import level_up, look_at
@@ -31,8 +31,6 @@ Float32 = NDArray[np.float32]
 
 # What a guidance holds that is no yes or no, beside colours.
 AMOUNTS = ("depth", "confidence")
-# Field of view of a face, so that neighbours share a margin. [degrees]
-FACE_DEGREES = 100.0
 # Width of a picture unless told otherwise: as fine as the cameras, at most so much. [px]
 WIDEST_STILL, WIDEST_FRAME = 4096, 2048
 

@@ -53,6 +53,8 @@ DIRECTIONS = {
     "down": (0, -90),
 }
 FACE_NAME = re.compile(rf"^(.*)@(?:{'|'.join(DIRECTIONS)})(\.[^./@]+)?$")
+# Field of view of a panorama's faces that overlap, so that neighbours share a margin. [degrees]
+FACE_DEGREES = 100.0
 # A face that sees less than this share of itself is left out.
 LEAST_SEEN = 0.05
 # Beyond this angle, the corners of a picture are taken for the dark outside of the image circle,

@@ -33,10 +33,13 @@ from gvtools.scenes.calibration import (
 )
 from gvtools.scenes.faces import PANORAMA, perspective_views
 from gvtools.scenes.images import read_depth, read_header
+from gvtools.scenes.layout import holds_views
 from gvtools.scenes.matching import find_renamed, given_folder, named
 from gvtools.scenes.photographs import PosedFrame, posed_scene
 from gvtools.scenes.scene import Finding, Scene, natural_key
+from gvtools.scenes.selection import select
 from gvtools.scenes.undistort import LensParameters, Undistortion
+from gvtools.trajectory_files import read_trajectory
 from gvtools.untrusted import is_file, read_json, reading
 
 FILE = "transforms.json"
@@ -227,8 +230,27 @@ def transforms_frames(
     return frames
 
 
+def read_camera_path(
+    path: Path, captured: Cameras | None, *, selection: str = "all"
+) -> Cameras | None:
+    """Cameras of a file without pictures, of which some are selected; None for a project.
+
+    That is a trajectory, which takes size and intrinsics from the first of the captured views, or a
+    ``transforms.json`` of which no picture is there, as viewers save paths.
+    """
+    if captured is not None and not holds_views(path):
+        cameras = read_trajectory(path, captured[0], beside=captured)
+    elif path.is_file() and path.suffix.lower() == ".json":
+        if any(item.file.is_file() for item in _listed(path)[0]):
+            return None
+        cameras = read_transforms_cameras(path)
+    else:
+        return None
+    return cameras[list(map(cameras.names.index, select(cameras.names, selection)))]
+
+
 def read_transforms_cameras(path: Path) -> Cameras:
-    """The cameras of a ``transforms.json`` alone, as a path has them: no picture has to be there.
+    """The cameras of a ``transforms.json`` alone: no picture has to be there.
 
     Views and their order are those of ``read_transforms``.
     """

@@ -43,8 +43,8 @@ class RenderCommand(LensArguments, LpipsArguments, SceneArguments):
     memory: Path
     """A memory.npz or a run. [MEMORY_OR_RUN]"""
     cameras: Path
-    """A project whose cameras to take, or a TUM or KITTI trajectory (camera as the memory's first
-    view). [PROJECT]"""
+    """A project whose cameras to take, a transforms.json such as 'gvtools view' saves, or a TUM or
+    KITTI trajectory (camera as the memory's first view). [PROJECT]"""
     views: str = "all"
     """Which. [SPEC]"""
     out: Path | None = None
@@ -129,14 +129,15 @@ class RenderCommand(LensArguments, LpipsArguments, SceneArguments):
 
     def _cameras(self, memory: SpatialMemory) -> tuple[Cameras, Scene | None, str]:
         """The chosen cameras, their project, if it is one, and what is said of its poses."""
+        import numpy as np
+
         from gvtools.cameras import concatenate
         from gvtools.runs.run import at_run_poses
         from gvtools.scenes.selection import select
 
         scene, poses = None, ""
-        if self.cameras.is_file() and self.cameras.suffix.lower() != ".json":
-            cameras = self._trajectory(memory)
-        else:
+        cameras = self._path(memory) if self.cameras.is_file() else None
+        if cameras is None:
             scene, poses = at_run_poses(self.open_scene(self.cameras), self.memory)
             cameras = scene.cameras
         if self.against_images:
@@ -152,26 +153,28 @@ class RenderCommand(LensArguments, LpipsArguments, SceneArguments):
                 )
         cameras = cameras[list(map(cameras.names.index, select(cameras.names, self.views)))]
         if self.lens == "perspective" and self.width:
-            width, shares = self.width, self.width / cameras.width
-            heights = [max(1, round(height)) for height in cameras.height * shares]
-            pairs = zip(cameras, heights, strict=True)
-            cameras = concatenate([camera.resized(width, height) for camera, height in pairs])
+            heights = np.maximum(np.rint(cameras.height * self.width / cameras.width), 1)
+            pairs = zip(cameras, heights.astype(int).tolist(), strict=True)
+            cameras = concatenate([camera.resized(self.width, height) for camera, height in pairs])
         return cameras, scene, poses
 
-    def _trajectory(self, memory: SpatialMemory) -> Cameras:
+    def _path(self, memory: SpatialMemory) -> Cameras | None:
+        """The cameras of a file without pictures; None for a project."""
         from gvtools.cameras import concatenate
-        from gvtools.trajectory_files import read_trajectory
+        from gvtools.scenes.layout import holds_views
+        from gvtools.scenes.transforms import read_camera_path
 
-        if self.memory.suffix.lower() == ".ply":
+        # A PLY's view has no camera of its own.
+        from_ply = self.memory.suffix.lower() == ".ply"
+        photographed = () if from_ply else memory.views.photographed
+        if not photographed and not holds_views(self.cameras):
             raise OptionError(
                 f"--cameras {self.cameras}: a trajectory takes its camera from the memory's views, "
-                f"and {self.memory} is a PLY without any; give the run or its memory.npz"
+                f"and {self.memory} has none of a photograph; give a run, its memory.npz, or a "
+                "project as --cameras"
             )
-        photographed = memory.views.photographed
-        if not photographed:
-            raise OptionError(f"{self.memory}: no photograph's view; give a project as --cameras")
-        captured = concatenate([view.camera for view in photographed])
-        return read_trajectory(self.cameras, captured[0], beside=captured)
+        captured = concatenate([view.camera for view in photographed]) if photographed else None
+        return read_camera_path(self.cameras, captured)
 
 
 def splat_options(texts: Sequence[str]) -> SplatOptions:
@@ -201,8 +204,8 @@ class FilmCommand(LensArguments):
     """A run or a memory.npz. [RUN_OR_MEMORY]"""
     path: str = "interpolate"
     """orbit:N, spiral:N, interpolate:N (N frames, 120 by default), cameras (the captured views), a
-    TUM or KITTI file, a transforms.json such as 'gvtools view' saves, or a project (the last two
-    also PATH@SELECTION). [PATH]"""
+    TUM or KITTI file, a transforms.json such as 'gvtools view' saves, or a project (these also
+    PATH@SELECTION). [PATH]"""
     out: Path
     """FILE.mp4, FILE.gif or FILE.webp. [FILE]"""
     fps: float = Field(24.0, gt=0, le=240)

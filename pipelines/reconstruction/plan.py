@@ -18,13 +18,14 @@ from gvtools.memory.panoramas import WIDEST_FRAME, LensOptions, Rig, picture_cam
 from gvtools.runs.digests import array_digest, fingerprint
 from gvtools.runs.poses import RunPoses, posed, with_poses
 from gvtools.scenes.depth_contradictions import unit_findings
-from gvtools.scenes.layout import holds_views, is_address
+from gvtools.scenes.layout import is_address
 from gvtools.scenes.matching import natural
 from gvtools.scenes.pixel_contradictions import probed
 from gvtools.scenes.pose_forms import pose_findings
 from gvtools.scenes.resized import reduced
 from gvtools.scenes.scene import Scene, View
 from gvtools.scenes.selection import check_disjoint, select
+from gvtools.scenes.transforms import read_camera_path
 from gvtools.settings import changes
 from gvtools.trajectories import PATHS, named_path
 from gvtools.view_selection import evenly_spread
@@ -46,7 +47,8 @@ SWEPT, SWEPT_SMALL, RECORDED, LIFTED, COMPLETED, START = 2.2, 0.7, 0.5, 1.0, 2.0
 # What --targets takes.
 FORMS = (
     "a selection of the project's views, interpolate:N, orbit:N, spiral:N, a trajectory file "
-    "(TUM or KITTI), or another project as PATH, spec:NAME:SCENE or either with @SELECTION"
+    "(TUM or KITTI), a transforms.json such as 'gvtools view' saves, or another project as PATH or "
+    "spec:NAME:SCENE, all with or without @SELECTION"
 )
 
 
@@ -156,16 +158,15 @@ def resolve_targets(
         return _path(scene, context, name, count=int(count))
     path, at, selection = spec.partition("@")
     if path and (is_address(path) or _exists(path)) and spec not in scene.names:
-        if holds_views(path):
-            targets = _project(path, selection if at else "all", scene, max_side=max_side)
-            if not allow_overlap:
-                _check_pictures(scene, context, targets)
-            return targets
-        from gvtools.trajectory_files import read_trajectory
-
+        selection = selection if at else "all"
         captured = scene.subset(context).cameras
-        cameras = read_trajectory(Path(path), captured[0], beside=captured)
-        return Targets(cameras, (None,) * len(cameras), "trajectory", (Path(path),))
+        cameras = read_camera_path(Path(path), captured, selection=selection)
+        if cameras is not None:
+            return Targets(cameras, (None,) * len(cameras), "trajectory", (Path(path),))
+        targets = _project(path, selection, scene, max_side=max_side)
+        if not allow_overlap:
+            _check_pictures(scene, context, targets)
+        return targets
     try:
         # By name, as the context: what one target adds, the next ones are completed on.
         chosen = natural(select(scene.names, spec))

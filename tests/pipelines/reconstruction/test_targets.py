@@ -8,6 +8,7 @@ from trajectory_writers import write_tum
 from gvtools.errors import OptionError
 from gvtools.runs.layout import target_stems
 from gvtools.scenes.project import open_project
+from gvtools.scenes.transforms import read_camera_path, write_transforms
 from pipelines.reconstruction.plan import make_schedule, resolve_targets
 from pipelines.reconstruction.prepare import make_plan
 from pipelines.reconstruction.settings import RunSettings
@@ -43,6 +44,21 @@ def test_paths_have_as_many_cameras_as_asked(scene, name):
 def test_bad_specifications_are_refused(scene, spec):
     with pytest.raises(OptionError):
         resolve_targets(scene, scene.names, spec)
+
+
+def test_a_file_of_cameras_without_pictures_gives_them_all_or_some(scene, tmp_path):
+    """As the viewer saves paths; a project's own file stays a project."""
+    path = tmp_path / "path.json"
+    cameras = scene.cameras[:3]
+    write_transforms(path, cameras, image_paths=[tmp_path / name for name in cameras.names])
+    targets = resolve_targets(scene, scene.names, f"{path}@last:2")
+    assert (targets.kind, targets.truth, targets.project) == ("trajectory", (None, None), None)
+    np.testing.assert_allclose(targets.cameras.cam_from_world, cameras.cam_from_world[1:])
+    (tmp_path / cameras.names[1]).write_bytes(b"a picture")
+    assert read_camera_path(path, scene.cameras) is None
+    write_tum(tmp_path / "path.txt", cameras)
+    chosen = resolve_targets(scene, scene.names, f"{tmp_path / 'path.txt'}@first:1")
+    assert len(chosen.cameras) == 1
 
 
 def test_a_trajectory_file_gives_the_poses(scene, tmp_path):
