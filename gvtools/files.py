@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 import shutil
+import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -21,15 +22,23 @@ ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
 def replaced_when_written(path: Path, *, suffix: str = "", flush: bool = True) -> Iterator[Path]:
     """Gives a temporary name beside ``path``; on success it is flushed and takes that name.
 
+    Devices, pipes and the like (``/dev/stdout``) stay what they are: they get the bytes instead.
+
     Args:
         suffix: that the temporary name ends with, for writers that tell the format by it.
         flush: False leaves it to the system when the bytes reach the disk, for files that need not
             outlast the process.
     """
-    temporary = path.with_name(f".{path.name}.part{suffix}")
+    stream = _is_stream(path)
+    folder = Path(tempfile.mkdtemp()) if stream else path.parent
+    temporary = folder / f".{path.name}.part{suffix}"
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
         yield temporary
+        if stream:
+            with temporary.open("rb") as source, path.open("ab") as target:
+                shutil.copyfileobj(source, target)
+            return
         if flush:
             flush_file(temporary)
         temporary.replace(path)
@@ -42,6 +51,17 @@ def replaced_when_written(path: Path, *, suffix: str = "", flush: bool = True) -
     except BaseException:
         _discard(temporary)
         raise
+    finally:
+        if stream:
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def _is_stream(path: Path) -> bool:
+    """Whether a path is a device or a pipe, or what a process has open (``/dev/stdout``)."""
+    whole = path.parent.resolve() / path.name
+    opened = [str(whole), os.readlink(whole) if whole.is_symlink() else ""]
+    special = whole.exists() and not (whole.is_file() or whole.is_dir())
+    return special or any(name.startswith("/proc/") for name in opened)
 
 
 def flush_file(path: Path) -> None:

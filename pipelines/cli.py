@@ -99,7 +99,11 @@ def main(argv: Sequence[str] | None = None, *, modules: Mapping[str, str] = COMM
     """
     # Waiting threads that spin would take the cores that other programs need, and with them ours.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    for stream in (sys.stdout, sys.stderr):
+    for name in ("stdin", "stdout", "stderr"):
+        # Closed ones: else files of ours would get their numbers, which libraries print to.
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "r" if name == "stdin" else "w"))  # noqa: SIM115
+        stream = getattr(sys, name)
         if isinstance(stream, io.TextIOWrapper):
             # What a console's encoding lacks is escaped: no work is lost for a name's sake.
             stream.reconfigure(errors="backslashreplace")

@@ -1,13 +1,14 @@
 from __future__ import annotations
 
 import os
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
 from gvtools import files
 from gvtools.errors import ProjectError
-from gvtools.files import folder_replaced_when_written, recover_folder
+from gvtools.files import folder_replaced_when_written, recover_folder, write_text
 
 
 @pytest.fixture
@@ -73,3 +74,17 @@ def test_a_kill_at_any_rename_leaves_one_of_both_whole(folder, monkeypatch, mome
     replace_it(folder)
     assert contents(folder) == {"round_000/memory": "new", "notes.txt": "mine"}
     assert os.listdir(folder.parent) == ["run"]
+
+
+def test_pipes_and_open_files_get_the_bytes_and_stay_what_they_are(tmp_path):
+    pipe, file = tmp_path / "pipe", tmp_path / "file"
+    os.mkfifo(pipe)
+    with file.open("w") as opened, ThreadPoolExecutor(1) as pool:
+        read = pool.submit(pipe.read_text)
+        write_text(pipe, "a")
+        write_text(Path(f"/proc/self/fd/{opened.fileno()}"), "b")
+        assert (read.result(timeout=20), file.read_text()) == ("a", "b")
+    assert pipe.is_fifo() and sorted(tmp_path.iterdir()) == [file, pipe]
+    with pytest.raises(ProjectError, match="No space left"):
+        write_text(Path("/dev/full"), "c")
+    assert Path("/dev/full").is_char_device()

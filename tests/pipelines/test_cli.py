@@ -188,3 +188,10 @@ def test_open3d_takes_as_many_threads_as_other_libraries():
     limited = {**os.environ, "OMP_NUM_THREADS": "1"}
     run = subprocess.run([sys.executable, "-c", code], env=limited, capture_output=True, text=True)
     assert run.stdout.split() == ["1"], run.stderr
+
+
+def test_closed_streams_are_no_reason_to_fail(monkeypatch):
+    for name in ("stdin", "stdout", "stderr"):
+        monkeypatch.setattr(sys, name, None)
+    assert main(["completers"]) == 0
+    assert main(["completers", "--json", "/"]) == 2
