@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
@@ -12,10 +14,12 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TextIO
 
-from gvtools.errors import ProjectError
+from gvtools.errors import GvError, ProjectError
 
 # Members of a zip carry a time stamp; this one keeps equal content equal files.
 ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
+# Bytes free on a full disk at most.
+ALMOST_NONE = 1 << 16
 
 
 @contextmanager
@@ -42,18 +46,29 @@ def replaced_when_written(path: Path, *, suffix: str = "", flush: bool = True) -
         if flush:
             flush_file(temporary)
         temporary.replace(path)
-    except OSError as error:
-        _discard(temporary)
+    except Exception as error:
+        # Libraries have errors of their own for a full disk.
+        reason = "" if isinstance(error, GvError) else full_disk(folder)
+        if isinstance(error, OSError):
+            reason = error.strerror or reason or str(error)
+        if not reason:
+            raise
+        # A writer's own temporary name says nothing to the user.
+        name = path.with_name(re.sub(r"^\.(.+)\.part(\.\w+)*$", r"\1", path.name))
         raise ProjectError(
-            f"{path}: cannot be written ({error.strerror or error}); free some space or choose "
-            "another folder; what was there before is intact"
+            f"{name}: cannot be written ({reason}); free some space or choose another folder; what "
+            "was there before is intact"
         ) from error
-    except BaseException:
-        _discard(temporary)
-        raise
     finally:
+        _discard(temporary)
         if stream:
             shutil.rmtree(folder, ignore_errors=True)
+
+
+def full_disk(folder: Path) -> str:
+    """What the system says of a full disk, where the folder's is one; else ""."""
+    full = folder.is_dir() and shutil.disk_usage(folder).free < ALMOST_NONE
+    return os.strerror(errno.ENOSPC) if full else ""
 
 
 def _is_stream(path: Path) -> bool:

@@ -8,7 +8,12 @@ import pytest
 
 from gvtools import files
 from gvtools.errors import ProjectError
-from gvtools.files import folder_replaced_when_written, recover_folder, write_text
+from gvtools.files import (
+    folder_replaced_when_written,
+    recover_folder,
+    replaced_when_written,
+    write_text,
+)
 
 
 @pytest.fixture
@@ -88,3 +93,20 @@ def test_pipes_and_open_files_get_the_bytes_and_stay_what_they_are(tmp_path):
     with pytest.raises(ProjectError, match="No space left"):
         write_text(Path("/dev/full"), "c")
     assert Path("/dev/full").is_char_device()
+
+
+def test_an_error_of_a_library_on_a_full_disk_is_told_as_that(tmp_path, monkeypatch):
+    def write() -> None:
+        with (
+            replaced_when_written(tmp_path / "a.las") as outer,
+            replaced_when_written(outer) as inner,
+        ):
+            inner.write_text("half")
+            raise RuntimeError("IoError")
+
+    with pytest.raises(RuntimeError):
+        write()
+    monkeypatch.setattr(files, "ALMOST_NONE", 1 << 62)
+    with pytest.raises(ProjectError, match=r"/a\.las: cannot be written \(No space left"):
+        write()
+    assert list(tmp_path.iterdir()) == []

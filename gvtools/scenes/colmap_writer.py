@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
 from gvtools.errors import ProjectError, ShapeError
+from gvtools.files import full_disk
 from gvtools.scenes.colmap_model import CAMERAS, model_files
 
 if TYPE_CHECKING:
@@ -60,8 +61,9 @@ def write_colmap(
         (folder / CAMERAS).unlink(missing_ok=True)
         for file in sorted(partial.iterdir(), key=lambda file: (file.name == CAMERAS, file.name)):
             os.replace(file, folder / file.name)
-    except OSError as error:
-        raise ProjectError(f"{folder}: the model could not be written ({error})") from None
+    except (OSError, ProjectError) as error:
+        reason = full_disk(folder) or error
+        raise ProjectError(f"{folder}: the model could not be written ({reason})") from None
     finally:
         shutil.rmtree(partial, ignore_errors=True)
 
