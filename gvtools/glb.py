@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -95,6 +95,29 @@ def pack_glb(
         "buffers": [{"byteLength": len(body)}],
     }  # fmt: skip
     return join_glb(tree, bytes(body))
+
+
+def drawn_nodes(tree: dict[str, Any]) -> Iterator[tuple[dict[str, Any], NDArray[np.float64]]]:
+    """The nodes of the scene, and (4, 4) from the frame of each to the scene's."""
+    from scipy.spatial.transform import Rotation
+
+    nodes, scenes = tree.get("nodes", []), tree.get("scenes")
+    inner = {child for node in nodes for child in node.get("children", ())}
+    outer = sorted({*range(len(nodes))} - inner)
+    first = scenes[tree.get("scene", 0)].get("nodes", ()) if scenes else outer
+    rest = [(number, np.eye(4)) for number in first]
+    for number, above in rest:
+        node, own = nodes[number], np.eye(4)
+        if "matrix" in node:
+            own = np.array(node["matrix"], np.float64).reshape(4, 4).T
+        else:
+            turn = Rotation.from_quat(node.get("rotation", (0, 0, 0, 1))).as_matrix()
+            own[:3, :3] = turn * np.asarray(node.get("scale", (1, 1, 1)), np.float64)
+            own[:3, 3] = node.get("translation", (0, 0, 0))
+        yield node, above @ own
+        rest += [(child, above @ own) for child in node.get("children", ())]
+        if len(rest) > len(nodes):
+            raise ValueError("a node in several places")
 
 
 def glb_array(tree: dict[str, Any], body: bytes, place: int) -> NDArray[Any]:

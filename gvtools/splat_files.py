@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from gvtools.errors import GvError, MemoryFileError, OptionError
-from gvtools.glb import glb_numbers, split_glb
+from gvtools.glb import drawn_nodes, glb_numbers, split_glb
 from gvtools.optional import installed, require
 from gvtools.ply import Header, read_header, read_ply
 from gvtools.sandbox import Item, ReaderError, read_apart
@@ -417,7 +417,7 @@ def _joined(
 def _read_glb(path: Path) -> Splats:
     tree, body = split_glb(read_bytes(path))
     parts, up = [], np.array([0.0, 1, 0])
-    for node, matrix in _drawn_nodes(tree):
+    for node, matrix in drawn_nodes(tree):
         for part in tree["meshes"][node["mesh"]]["primitives"] if "mesh" in node else ():
             extension = part.get("extensions", {}).get(KHR)
             if extension is None:
@@ -438,29 +438,6 @@ def _read_glb(path: Path) -> Splats:
                 raise ValueError("nodes that draw a set several times")
     values, center = _joined(parts)
     return _splats(values, center=center, up=_unit(up))
-
-
-def _drawn_nodes(tree: dict[str, Any]) -> Iterator[tuple[dict[str, Any], NDArray[np.float64]]]:
-    """The nodes of the scene, and (4, 4) from the frame of each to the scene's."""
-    from scipy.spatial.transform import Rotation
-
-    nodes, scenes = tree.get("nodes", []), tree.get("scenes")
-    inner = {child for node in nodes for child in node.get("children", ())}
-    outer = sorted({*range(len(nodes))} - inner)
-    first = scenes[tree.get("scene", 0)].get("nodes", ()) if scenes else outer
-    rest = [(number, np.eye(4)) for number in first]
-    for number, above in rest:
-        node, own = nodes[number], np.eye(4)
-        if "matrix" in node:
-            own = np.array(node["matrix"], np.float64).reshape(4, 4).T
-        else:
-            turn = Rotation.from_quat(node.get("rotation", (0, 0, 0, 1))).as_matrix()
-            own[:3, :3] = turn * np.asarray(node.get("scale", (1, 1, 1)), np.float64)
-            own[:3, 3] = node.get("translation", (0, 0, 0))
-        yield node, above @ own
-        rest += [(child, above @ own) for child in node.get("children", ())]
-        if len(rest) > len(nodes):
-            raise ValueError("a node in several places")
 
 
 def _glb_rows(

@@ -2,7 +2,8 @@
 
 VGGT (``predictions.npz``, ``sparse``), Depth Anything 3 (``exports/npz``, ``mini_npz``, COLMAP),
 MapAnything (``predictions.npz``, ``sparse``), DUSt3R and MASt3R (poses, focal lengths, ``pts3d``),
-Pi3 (``predictions.npz``: points alone tell the focal lengths), CUT3R (files of each picture).
+Pi3 (``predictions.npz``: points alone tell the focal lengths), CUT3R (files of each picture). For
+scenes of DUSt3R and MASt3R in .glb see ``drawn_cameras``.
 """
 
 from __future__ import annotations
@@ -16,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras, invert_rigid, rigid_transform
-from gvtools.errors import ProjectError, ShapeError
+from gvtools.capture.drawn_cameras import read_drawn_cameras
+from gvtools.errors import MemoryFileError, ProjectError, ShapeError
 from gvtools.scenes.colmap_model import find_model, load_model
 from gvtools.scenes.images import read_image
 from gvtools.scenes.matching import named
@@ -41,11 +43,10 @@ MOST_POINTS = 50_000
 EXPECTED = (
     "expected poses (extrinsics, extrinsic, camera_poses, cam2world) and intrinsics in .npz or "
     ".npy, or a COLMAP model, as VGGT, Depth Anything 3, MapAnything, DUSt3R, MASt3R, Pi3 or CUT3R "
-    "save them"
+    "save them, or a .glb of DUSt3R or MASt3R"
 )
 # What files of other kinds lack.
 LACKS = {
-    ".glb": "a scene to look at: cameras are drawn in it, without intrinsics or names of pictures",
     ".ply": "points without cameras",
     **dict.fromkeys((".pt", ".pth", ".pkl", ".pickle"), "it needs pickle, which may hold code"),
 }
@@ -70,7 +71,10 @@ def read_predictions(path: Path) -> Predictions:
     model = find_model(path) if path.is_dir() else None
     if model is not None:
         return _from_colmap(model)
-    with reading(f"--poses {path}", EXPECTED, also=(ShapeError,)):
+    with reading(f"--poses {path}", EXPECTED, also=(ShapeError, MemoryFileError)):
+        if path.suffix.lower() == ".glb" and path.is_file():
+            cameras, pictures, seen = read_drawn_cameras(path, most=MOST_POINTS)
+            return Predictions(cameras, False, pictures, False, *seen)
         return _from_arrays(_fullest(path))
 
 

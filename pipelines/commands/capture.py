@@ -70,8 +70,8 @@ class CaptureCommand(RecordingArguments):
     """Of the pictures (auto: recognised from them); panoramas are cut into faces."""
     poses: Path | None = None
     """What VGGT, Depth Anything 3, MapAnything, DUSt3R, MASt3R, Pi3 or CUT3R saved for the
-    photographs: .npz, .npy or a COLMAP model, refined where features match; or a folder of Depth
-    Anything 3's weights. [FILE|DIR]"""
+    photographs: .npz, .npy, .glb or a COLMAP model, refined where features match; or a folder of
+    Depth Anything 3's weights. [FILE|DIR]"""
 
     def run(self, console: Console) -> None:
         given = {

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 from command_line import refused
 from numpy.testing import assert_allclose
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from gvtools.cameras import Cameras
@@ -83,6 +86,55 @@ def test_points_alone_tell_pi3s_focal_lengths(cameras, depth, tmp_path):
     assert_same(read_predictions(tmp_path), cameras)
 
 
+def draw_camera(scene, pose, picture, focal):
+    """As DUSt3R's ``add_scene_cam``: the picture on the base of a pyramid, and that pyramid."""
+    trimesh = pytest.importorskip("trimesh")
+    height, width = picture.shape[:2]
+    deep, side = 0.1 * focal / height, 0.1 * width / height
+    base = np.array([[-side, -0.1, 0], [side, -0.1, 0], [side, 0.1, 0], [-side, 0.1, 0]]) / 2
+    base[:, 2] = -deep
+    turned = pose @ np.diag([1.0, -1, -1, 1])
+    corners = base @ turned[:3, :3].T + turned[:3, 3]
+    quad = trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
+    uv = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
+    quad.visual = trimesh.visual.TextureVisuals(uv, image=Image.fromarray(picture))
+    tip = turned[:3, 3]
+    inner = 0.95 * tip + 0.05 * corners.mean(axis=0)
+    faces = [[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 5]]
+    pyramid = trimesh.Trimesh(np.vstack([corners, tip, inner]), faces, process=False)
+    pyramid.visual.face_colors[:, :3] = 255, 0, 0
+    scene.add_geometry(quad)
+    scene.add_geometry(pyramid)
+
+
+@pytest.mark.parametrize("drawn", [True, False])
+def test_cameras_that_dust3r_and_mast3r_draw(cameras, depth, room, tmp_path, capsys, drawn):
+    trimesh = pytest.importorskip("trimesh")
+    square = replace(cameras, K=np.where(cameras.K == 44, 40, cameras.K))
+    pictures = np.random.default_rng(2).integers(0, 256, (V, HEIGHT, WIDTH, 3), np.uint8)
+    scene, points = trimesh.Scene(), world_points(square, depth)
+    scene.add_geometry(trimesh.PointCloud(points.reshape(-1, 3), colors=pictures.reshape(-1, 3)))
+    for row in range(V if drawn else 0):
+        draw_camera(scene, square.world_from_cam[row], pictures[row], 40.0)
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_euler("xyz", [1, 2, 3]).as_matrix()
+    scene.apply_transform(turn)
+    scene.export(str(tmp_path / "scene.glb"))
+    if not drawn:
+        line = refused(capsys, "capture", room / "images", "--poses", tmp_path / "scene.glb",
+                       "--out", tmp_path / "out")  # fmt: skip
+        assert "no cameras are drawn with their pictures" in line
+        return
+    found = read_predictions(tmp_path / "scene.glb")
+    assert_allclose(found.cameras.K, square.K, rtol=1e-4)
+    assert_allclose(found.cameras.cam_from_world @ turn, square.cam_from_world, atol=1e-4)
+    np.testing.assert_array_equal(found.pictures, pictures)
+    # Random colours hardly ever agree by chance.
+    x, y = np.floor(found.xy).astype(int).T
+    assert len(found.view) > 0.98 * depth.size
+    assert_allclose(found.points @ turn[:3, :3], points[found.view, y, x], atol=1e-3)
+
+
 @pytest.mark.parametrize("K", [(3, 3), (1, 3, 3)])
 def test_one_k_is_of_all_pictures(cameras, tmp_path, K):
     np.savez(
@@ -93,7 +145,7 @@ def test_one_k_is_of_all_pictures(cameras, tmp_path, K):
 
 @pytest.mark.parametrize(
     ("name", "reason"),
-    [("scene.glb", "without intrinsics"), ("model.pt", "needs pickle"), ("x.txt", "'.txt'"),
+    [("scene.glb", "ends early"), ("model.pt", "needs pickle"), ("x.txt", "'.txt'"),
      ("points.ply", "without cameras"), ("nan.npz", "nan.npz: unreadable (pose 1")],
 )  # fmt: skip
 def test_other_files_are_refused_for_what_they_lack(cameras, room, tmp_path, capsys, name, reason):
