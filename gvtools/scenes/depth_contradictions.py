@@ -20,12 +20,11 @@ FACTORS, SAME = 10 ** (np.arange(-96, 97) / 24), 0.01
 # Views that are compared with those so many places after them, and pixels of each.
 PROBES, GAPS, PIXELS = 4, (1, 4, 16), 800
 # Depth is wrong when another factor makes so many agree, and it has less than the share of that.
-AGREE, SHARE, FAR = 0.2, 0.7, 1.3
-WRONG_SHARE = 0.8  # where it is known to be wrong
-# Of so many pixels of a pair, so few that are nearly alike in one pair, or two, tell of maps that
-# are not of their cameras. On four recordings it is 0.92 at the least; mirrored, or those of other
-# frames, 0.1; along the rays 0.5.
-NEARLY, LEAST, ONE_PAIR, TWO_PAIRS = 0.05, 100, 0.4, 0.65
+AGREE, SHARE, FAR = 0.2, 0.8, 1.3
+# Of so many pixels that a second view does not hide, so few that are nearly alike in one pair, or
+# two, tell of maps that are not of their cameras. On seven recordings it is 0.92 at the least;
+# mirrored, or those of other frames, 0.2; along the rays 0.75.
+NEARLY, LEAST, ONE_PAIR, TWO_PAIRS = 0.05, 100, 0.5, 0.8
 
 Pair = tuple[Depth, Depth, tuple[Cameras, Cameras]]
 
@@ -49,10 +48,10 @@ def unit_findings(scene: Scene) -> list[Finding]:
     now, agreeing = (_agreeing(compared, at)[0].mean(0) for at in (np.ones(1), FACTORS))
     best, factor = agreeing.max(), float(FACTORS[agreeing.argmax()])
     shares = _nearly(compared)
-    share = WRONG_SHARE if _wrong(shares) else SHARE
     straight = [(_of_rays(one, a), _of_rays(other, b), (a, b)) for one, other, (a, b) in compared]
-    by_rays = _wrong(shares) and _agreeing(straight, np.ones(1))[0].mean() > best
-    if not by_rays and now < share * best >= share * AGREE and max(factor, 1 / factor) > FAR:
+    by_rays = _wrong(shares) and not _wrong(_nearly(straight))
+    by_rays = by_rays and _agreeing(straight, np.ones(1))[0].mean() > best
+    if not by_rays and now < SHARE * best >= SHARE * AGREE and max(factor, 1 / factor) > FAR:
         times = f"{float(f'{factor:.2g}'):g}"
         line = (
             f"recorded depth contradicts the poses: {now[0]:.0%} of neighbouring views' depth "
@@ -66,10 +65,10 @@ def unit_findings(scene: Scene) -> list[Finding]:
     worst = int(np.nanargmin(shares))
     reason = "; it fits as distances along the rays" if by_rays else ""
     line = (
-        f"recorded depth contradicts the poses: {shares[worst]:.0%} of what {names[worst]} share "
-        f"agrees within {NEARLY:.0%}{reason}; expected z-depth in one unit, of the frame and the "
-        "camera that it is named after: look for maps that are mirrored, of other frames or of "
-        "another byte order"
+        f"recorded depth contradicts the poses: {shares[worst]:.0%} of the places that "
+        f"{names[worst]} show agrees within {NEARLY:.0%}{reason}; expected z-depth in one unit, of "
+        "the frame and the camera that it is named after: look for maps that are mirrored, of "
+        "other frames or of another byte order"
     )
     return [Finding("warning", line)]
 
@@ -90,7 +89,7 @@ def _of_rays(depth: Depth, camera: Cameras) -> Depth:
 
 
 def _nearly(pairs: Sequence[Pair]) -> Float64:
-    """(P,) of what both views of a pair show, the share that agrees nearly; NaN of too little."""
+    """(P,) of what the second view of a pair shows, what agrees nearly; NaN of too little."""
     agreed, shared = (part[:, 0] for part in _agreeing(pairs, np.ones(1), same=NEARLY))
     return np.where(shared * PIXELS < LEAST, np.nan, agreed / np.maximum(shared, 1e-9))
 
@@ -103,7 +102,7 @@ def _wrong(shares: Float64) -> bool:
 def _agreeing(
     pairs: Sequence[Pair], factors: Float64, *, same: float = SAME
 ) -> tuple[Float64, Float64]:
-    """(P, F) shares of each first view's pixels that agree at each factor, and that both show."""
+    """(P, F) shares of first views' pixels that agree at each factor, and that seconds show."""
     agreed, shared = np.zeros((2, len(pairs), len(factors)))
     for row, (one, other, cameras) in enumerate(pairs):
         rows, columns = np.nonzero(one > 0)
@@ -119,7 +118,8 @@ def _agreeing(
             inside = (z > 0) & (xy >= 0).all(-1) & (xy < other.shape[::-1]).all(-1)
         x, y = np.moveaxis(np.where(inside[..., None], xy, 0).astype(int), -1, 0)
         expected = factors[:, None] * other[y, x]
-        inside &= expected > 0
+        # What is hidden tells nothing.
+        inside &= expected * (1 + same) > z
         shared[row] = inside.sum(1) / max(len(rows), 1)
         agreed[row] = (inside & (np.abs(z - expected) < same * expected)).sum(1) / max(len(rows), 1)
     return agreed, shared
