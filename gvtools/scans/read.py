@@ -210,7 +210,7 @@ def _colors(held: dict[str, NDArray[Any]]) -> tuple[NDArray[np.uint8], str, str]
     colors, said = held["colors"], ""
     if colors.any():
         white = white_of(colors, tops=OF_CLOUDS, outliers=CLOUD_OUTLIERS)
-        rgb, by, said = to_bytes(colors, white), "colour", said_of(colors.dtype, white)
+        rgb, by, said = to_bytes(colors, white), "colour", said_of(colors, white)
         if held["with_color"].all():
             return rgb, by, said
     else:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from gvtools.errors import MemoryFileError
 from gvtools.kernels import compiled
 from gvtools.ply import point_vertices, read_header
-from gvtools.ranges import color_names
+from gvtools.ranges import color_names, intensity_names, packed_names
 from gvtools.scans.points import CHUNK, GENERATED, Chunk, ScanFile, Station
 from gvtools.splat_files import PACKED, read_splats
 
@@ -24,19 +24,15 @@ LEAST_TEXT, MOST_TEXT = 2, 64
 CHUNK_BYTES = 1 << 26
 Columns = Mapping[str, NDArray[Any]]
 
-# Names that programs give to how much light came back, the usual first.
-INTENSITIES = ("intensity", "scalar_Intensity", "scalar_intensity", "reflectance")
-
 MAX_HEADER = 1 << 13
 KEYS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS",
         "DATA")  # fmt: skip
 KINDS = {"F": "f", "U": "u", "I": "i"}
 SIZES = ("1", "2", "4", "8")
-# What is read of a compressed file's fields, and how much they unpack to at most: LZF makes no more
-# than 88 bytes of one, and of points about two.
-READ = ("x", "y", "z", "rgb", "rgba", "intensity")
 # What Gaussians have for a colour, less 0.5 and over the factor, and for how opaque they are.
 SPLATS, HARMONIC = ("f_dc_0", "f_dc_1", "f_dc_2", "opacity"), 0.28209479177387814
+# What compressed points unpack to at most: LZF makes no more than 88 bytes of one, and of points
+# about two.
 MOST_RATIO, MOST_BYTES = 88, 1 << 31
 
 
@@ -143,7 +139,7 @@ def open_ply(path: Path) -> ScanFile:
     table = ScanTable(header.dtype(vertices), vertices.count, layout, header.offset, last)
     table.check(path)
     kinds = {name: np.dtype(kind) for name, kind in vertices.columns}
-    chunks = (_ply_chunk(columns, kinds) for columns in table.chunks(path))
+    chunks = (_chunk(columns, kinds) for columns in table.chunks(path))
     return ScanFile(path, table.count, (Station(path.stem),), chunks)
 
 
@@ -155,12 +151,14 @@ def open_splats(path: Path) -> ScanFile:
     return ScanFile(path, len(splats), (Station(path.stem),), iter([_splat_chunk(columns)]))
 
 
-def _ply_chunk(columns: Columns, kinds: Mapping[str, np.dtype[Any]]) -> Chunk:
+def _chunk(columns: Columns, kinds: Mapping[str, np.dtype[Any]]) -> Chunk:
     if {*SPLATS} <= {*columns}:
         return _splat_chunk(columns)
     colors = _stored_colors(columns, kinds)
-    intensity = next((columns[n].astype(np.float32) for n in INTENSITIES if n in columns), None)
-    chunk = Chunk(_positions(columns), colors, intensity)
+    for name in packed_names(columns)[:1]:
+        colors = _unpacked_colors(columns[name], kinds[name])
+    intensities = [columns[name].astype(np.float32) for name in intensity_names(columns)]
+    chunk = Chunk(_positions(columns), colors, next(iter(intensities), None))
     return chunk.without(columns[GENERATED] != 0, GENERATED) if GENERATED in columns else chunk
 
 
@@ -182,9 +180,21 @@ def _stored_colors(columns: Columns, kinds: Mapping[str, np.dtype[Any]]) -> NDAr
     if kind.kind == "f":
         return rgb.astype(np.float32)
     whole = np.nan_to_num(rgb).astype(np.int64)
-    if kind.itemsize == 1:  # bytes may be declared as signed
-        return (whole & 255).astype(np.uint8)
-    return whole.clip(0, 65535).astype(np.uint16) if kind.itemsize == 2 else whole
+    # Unsigned numbers may be declared as signed; of shorts without negative ones the half is white.
+    if kind.itemsize > 2 or (kind.str[1:] == "i2" and whole.min(initial=0) >= 0):
+        return whole.astype(np.int16) if kind.itemsize == 2 else whole
+    return whole.astype(f"u{kind.itemsize}")
+
+
+def _unpacked_colors(packed: NDArray[Any], kind: np.dtype[Any]) -> NDArray[np.uint8]:
+    """(N, 3) of one number a point, 0xRRGGBB; as float, its bits are meant."""
+    # In text some programs write the whole number, though they say float; bits are tiny or huge.
+    whole = packed.dtype == np.float64 and ((packed == 0) | (packed >= 1)).all()
+    if kind.kind == "f" and not (whole and (packed < 1 << 32).all()):
+        bits = packed.astype(np.float32).view(np.uint32)
+    else:
+        bits = packed.astype(np.int64).astype(np.uint32)
+    return np.stack([(bits >> shift) & 255 for shift in (16, 8, 0)], axis=1).astype(np.uint8)
 
 
 def _positions(columns: Columns) -> NDArray[np.float64]:
@@ -198,31 +208,12 @@ def open_pcd(path: Path) -> ScanFile:
         _check_compressed(path, table)
     else:
         table.check(path)
-    chunks = (_pcd_chunk(columns, table.dtype) for columns in table.chunks(path))
+    kinds = {name: table.dtype[name] for name in table.dtype.names or ()}
+    chunks = (_chunk(columns, kinds) for columns in table.chunks(path))
     moved = f"VIEWPOINT {' '.join(viewpoint)} is not applied: points are taken as they stand"
     return ScanFile(
         path, table.count, (Station(path.stem),), chunks, notes=(moved,) if viewpoint else ()
     )
-
-
-def _pcd_chunk(columns: Columns, dtype: np.dtype[np.void]) -> Chunk:
-    colors = None
-    name = next((name for name in ("rgb", "rgba") if name in columns), None)
-    if name is not None:
-        # One number each, 0xRRGGBB; as float, its bits are meant.
-        packed = columns[name]
-        # In text some programs write the whole number, though they say F; bits are tiny or huge.
-        whole = packed.dtype == np.float64 and ((packed == 0) | (packed >= 1)).all()
-        if dtype[name].kind == "f" and not (whole and (packed < 1 << 32).all()):
-            bits = packed.astype(np.float32).view(np.uint32)
-        else:
-            bits = packed.astype(np.int64).astype(np.uint32)
-        rgb = np.stack([(bits >> shift) & 255 for shift in (16, 8, 0)], axis=1)
-        colors = rgb.astype(np.uint8)
-    else:
-        colors = _stored_colors(columns, {name: dtype[name] for name in dtype.names or ()})
-    intensity = columns["intensity"].astype(np.float32) if "intensity" in columns else None
-    return Chunk(_positions(columns), colors, intensity)
 
 
 def _pcd_header(path: Path) -> tuple[ScanTable, list[str]]:
@@ -260,7 +251,7 @@ def _pcd_table(given: Mapping[str, list[str]], offset: int) -> ScanTable:
     counts = [int(count) for count in given.get("COUNT", ["1"] * len(names))]
     columns: list[tuple[Any, ...]] = []
     for name, kind, size, count in zip(names, given["TYPE"], given["SIZE"], counts, strict=True):
-        if count == 0 and name not in READ:
+        if count == 0 and name not in _used(names):
             continue
         if not 1 <= count <= 4096 or size not in SIZES:
             raise ValueError(f"COUNT {count}, SIZE {size[:9]}")
@@ -271,7 +262,7 @@ def _pcd_table(given: Mapping[str, list[str]], offset: int) -> ScanTable:
     dtype = np.dtype(columns)
     if not {"x", "y", "z"} <= set(names):
         raise ValueError("no x, y, z")
-    several = [name for name in READ if name in names and dtype[name].shape]
+    several = [name for name in _used(names) if name in names and dtype[name].shape]
     if several:
         raise ValueError(f"{several[0]} of several numbers")
     whole = int(given["WIDTH"][0]) * int(given["HEIGHT"][0])
@@ -280,6 +271,12 @@ def _pcd_table(given: Mapping[str, list[str]], offset: int) -> ScanTable:
         raise ValueError(f"{count} points")
     layouts = {"ascii": "text", "binary": "rows", "binary_compressed": "columns"}
     return ScanTable(dtype, count, layouts[given["DATA"][0].lower()], offset)
+
+
+def _used(names: Iterable[str]) -> tuple[str, ...]:
+    """Fields that are read of a file's."""
+    found = [*names]
+    return ("x", "y", "z", *packed_names(found), *intensity_names(found), *color_names(found))
 
 
 def _check_compressed(path: Path, table: ScanTable) -> None:
@@ -311,7 +308,7 @@ def _unpack(path: Path, table: ScanTable) -> dict[str, NDArray[Any]]:
         )
     columns = {}
     names = table.dtype.names or ()
-    for name in (*READ, *color_names(names)):
+    for name in _used(names):
         if name in names:
             kind, start = table.dtype.fields[name][:2]  # type: ignore[index]
             columns[name] = np.frombuffer(out, kind, table.count, offset=table.count * start)

@@ -45,7 +45,8 @@ DEPTH_SATURATED = 65535  # "no reading" of Kinect-like 16-bit depth, besides 0
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".ppm")
 # Pillow's layouts of pixels with an alpha channel.
 WITH_ALPHA = ("RGBA", "LA", "PA", "RGBa", "La")
-SAMPLED = 8  # pictures that tell the range of a project's
+# Pictures that tell the range of a project's, of so many that are opened.
+SAMPLED, LOOKED_AT = 8, 100
 LOSSY = ("JPEG", "MPO", "JPEG2000")
 # What becomes of it, and what findings say of that.
 ALPHA = {"mask": "read as a mask", "ignore": "ignored", "white": "laid on white",
@@ -118,7 +119,9 @@ def _has_alpha(image: Image.Image) -> bool:
 
 def _is_deep(image: Image.Image) -> bool:
     """Whether a picture has 16 bits a channel, of which Pillow's layout keeps eight in colour."""
-    return image.mode.startswith("I;16") or ";16" in str(getattr(image, "tile", ""))
+    tile: Any = getattr(image, "tile", None)
+    wide = bool(tile) and tile[0][0] == "ppm" and tile[0][3][1] > WHOLE[0]
+    return image.mode.startswith("I;16") or ";16" in str(tile) or wide
 
 
 def _levels(path: Path, image: Image.Image) -> NDArray[np.uint16]:
@@ -136,12 +139,14 @@ def _levels(path: Path, image: Image.Image) -> NDArray[np.uint16]:
 
 def white_of_pictures(paths: Sequence[Path]) -> float:
     """Full brightness of a project's pictures of 16 bits a channel, from a few of them."""
-    seen = []
-    for path in paths[:: -(-len(paths) // SAMPLED) or 1]:
+    seen = list[NDArray[np.uint16]]()
+    for path in paths[:: -(-len(paths) // LOOKED_AT) or 1]:
+        if len(seen) == SAMPLED:
+            break
         try:
             with _picture(path) as image:
-                if not _is_deep(image):
-                    return WHOLE[-1]
+                if not _is_deep(image):  # others may be
+                    continue
                 levels = _levels(path, image)
         except ProjectError:
             continue

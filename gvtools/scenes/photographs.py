@@ -60,7 +60,7 @@ OTHER_ASPECT = "have a picture of another aspect than their camera"
 BAD_POSE = "have an impossible pose"
 BAD_CAMERA = "have an impossible camera"
 # Pictures that may have 16 bits a channel, and what is done with them.
-DEEP, UPPER = (".png", ".tif", ".tiff"), "the upper eight bits are used"
+DEEP, UPPER = (".png", ".tif", ".tiff", ".ppm"), "the upper eight bits are used"
 # A principal point is expected within so much of the middle, in sides of the picture.
 CENTER = 0.25
 

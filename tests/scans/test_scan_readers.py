@@ -343,7 +343,10 @@ def test_unknown_suffixes_missing_files_and_missing_packages_are_named(tmp_path,
         open_scan(path)
 
 
-KINDS = {"u1": "uchar", "i1": "char", "u2": "ushort", "i4": "int", "f4": "float", "f8": "double"}
+KINDS = {
+    "u1": "uchar", "i1": "char", "u2": "ushort", "i2": "short", "i4": "int", "u4": "uint",
+    "f4": "float", "f8": "double",
+}  # fmt: skip
 RED = ("red", "green", "blue")
 
 
@@ -352,7 +355,9 @@ def write_channels(path, positions, colors, *, names=RED, text=False):
     kind = colors.dtype.str[1:]
     table = np.zeros(len(positions), [(axis, "f8") for axis in "xyz"] + [(n, kind) for n in names])
     for k in range(3):
-        table["xyz"[k]], table[names[k]] = positions[:, k], colors[:, k]
+        table["xyz"[k]] = positions[:, k]
+    for k, name in enumerate(names):
+        table[name] = colors[:, k]
     count, size, letter = len(table), kind[1], kind[0].upper()
     if path.suffix == ".ply":
         form = "ascii" if text else "binary_little_endian"
@@ -363,8 +368,9 @@ def write_channels(path, positions, colors, *, names=RED, text=False):
         ]  # fmt: skip
     else:
         head = [
-            "VERSION 0.7", f"FIELDS x y z {' '.join(names)}", f"SIZE 8 8 8 {size} {size} {size}",
-            f"TYPE F F F {letter} {letter} {letter}", "COUNT 1 1 1 1 1 1", f"WIDTH {count}",
+            "VERSION 0.7", f"FIELDS x y z {' '.join(names)}", "SIZE 8 8 8" + f" {size}" * len(names),
+            "TYPE F F F" + f" {letter}" * len(names), "COUNT 1 1 1" + " 1" * len(names),
+            f"WIDTH {count}",
             "HEIGHT 1", "VIEWPOINT 0 0 0 1 0 0 0", f"POINTS {count}",
             f"DATA {'ascii' if text else 'binary'}",
         ]  # fmt: skip
@@ -384,8 +390,9 @@ def write_channels(path, positions, colors, *, names=RED, text=False):
         ("u2", 1, RED),
         ("u2", 16, RED),
         ("u2", 257, ("r", "g", "b")),
-        ("i4", 1, RED),
+        ("i2", 128, RED),  # their half is white
         ("i4", 257, RED),
+        ("f4", 4095 / 255, RED),
         ("f4", 1, ("diffuse_red", "diffuse_green", "diffuse_blue")),
         ("f4", 1 / 255, ("R", "G", "B")),
         ("f8", 257, ("scalar_Red", "scalar_Green", "scalar_Blue")),
@@ -397,7 +404,7 @@ def test_colours_of_every_type_range_and_name(
 ):
     positions, colors = surface(500)
     stored = (colors * np.float64(factor)).astype("u1" if kind == "i1" else kind).astype(kind)
-    if kind not in ("u1", "i1"):
+    if kind not in ("u1", "i1", "i2"):
         stored[:outliers] = np.nan if outliers and kind[0] == "f" else 65535
         stored[outliers // 2 : outliers] = 65535
     path = write_channels(tmp_path / f"scan{suffix}", positions, stored, names=names, text=text)
@@ -405,6 +412,26 @@ def test_colours_of_every_type_range_and_name(
     np.testing.assert_allclose(scan.colors[outliers:].astype(int), colors[outliers:], atol=1)
     usual = kind in ("u1", "i1") or (kind, factor) in (("u2", 257), ("f4", 1 / 255))
     assert bool(scan.color_range) != usual
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".pcd"])
+def test_colours_in_one_number_or_grey_and_fractions_that_were_cut(tmp_path, suffix):
+    positions, colors = surface(500)
+    packed = (colors.astype(np.uint32) << np.array([16, 8, 0], np.uint32)).sum(
+        axis=1, dtype=np.uint32
+    )
+    for name, stored in (("RGB", packed.view(np.float32)), ("rgba", packed | 0xFF000000)):
+        path = write_channels(tmp_path / f"a{suffix}", positions, stored[:, None], names=(name,))
+        assert np.array_equal(read_scan(path).colors, colors)
+    for name in ("Intensity", "scalar_Reflectance", "gray"):
+        grey = colors[:, :1].astype(np.float32)
+        path = write_channels(tmp_path / f"a{suffix}", positions, grey, names=(name,))
+        assert read_scan(path).colored_by == "intensity"
+    path = write_channels(tmp_path / f"a{suffix}", positions, colors // 128, names=RED)
+    scan = read_scan(path)
+    assert np.array_equal(scan.colors, colors // 128 * 255) and "from 0 to 1" in scan.color_range
+    path = write_channels(tmp_path / f"a{suffix}", positions, colors / 127.5 - 1, names=RED)
+    assert "are below 0: cut off" in read_scan(path).color_range
 
 
 @pytest.mark.parametrize("factor", [16, 256])
