@@ -40,9 +40,9 @@ FEW_COLORS = 4
 # Pictures are judged at this height, and one whose sharpness is below this share of the median's is
 # called blurred. [pixels]
 JUDGED_HEIGHT, BLURRED = 480, 0.15
-# Pictures at this size show the same where they differ by less on average [pixels, grey levels] and
-# their aspects by less than this share.
-THUMBNAIL, SAME, SAME_ASPECT = (32, 32), 1.5, 0.02
+# Pictures at this size [pixels] show the same where they correlate by more; those of a series,
+# which may be alike, by more; others, too, that differ by less on average [grey levels].
+THUMBNAIL, SAME, EXACT, NEAR = (32, 32), 0.9985, 0.9999, 1.5
 # Where the median itself is below this, all are called soft (photographs in focus: 100 and more).
 SOFT = 10.0
 
@@ -96,8 +96,8 @@ def find_photographs(folder: Path) -> tuple[list[CapturedPhotograph], list[Findi
     found = [item for item in shown if not item.deep]
     found = found if len(found) > 1 else shown
     depth = [item.name for item in shown if item not in found]
-    reduced = _reduced_copies(found)
-    found = [item for item in found if item.name not in reduced]
+    again = _copies(found)
+    found = [item for item in found if item.name not in again]
     warnings = [
         f"{len(some)} of {total} pictures {reason}: left out ({named(some)})"
         for some, reason in (
@@ -105,7 +105,7 @@ def find_photographs(folder: Path) -> tuple[list[CapturedPhotograph], list[Findi
             (copies, "are copies of others"),
             (masks, f"have at most {FEW_COLORS} colours, as masks (give these with --masks)"),
             (depth, "are grey of 16 bits beside others of 8, as depth maps"),
-            (reduced, "are others again, in another size or format"),
+            (again, "are others again: reduced, turned, edited or saved once more"),
         )
         if some
     ]
@@ -137,25 +137,33 @@ def find_photographs(folder: Path) -> tuple[list[CapturedPhotograph], list[Findi
     return found, [*(Finding("warning", text) for text in warnings), *_oddities(found)]
 
 
-def _reduced_copies(found: Sequence[CapturedPhotograph]) -> list[str]:
-    """Names of pictures that larger ones, or equally large ones of other formats, show alike."""
-    order = sorted(found, key=lambda item: -item.size[0] * item.size[1])
-    thumbnails = np.array([item.thumbnail for item in order], np.float32)
+def _copies(found: Sequence[CapturedPhotograph]) -> list[str]:
+    """Names of pictures that show what larger ones, or as large ones of shorter names, show."""
+    order = sorted(found, key=lambda item: (-item.size[0] * item.size[1], len(item.name)))
+    grey = np.array([item.thumbnail for item in order], np.float32).reshape(-1, *THUMBNAIL)
+    # As they stand, turned and mirrored.
+    ways = [np.rot90(side, k, (1, 2)) for side in (grey, grey[:, :, ::-1]) for k in range(4)]
+    flat = [way.reshape(len(order), THUMBNAIL[0] * THUMBNAIL[1]) for way in ways]
+    flat = [way - way.mean(axis=1, keepdims=True) for way in flat]
+    units = [way / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-6) for way in flat]
     copies: list[str] = []
     kept: list[int] = []
     for number, item in enumerate(order):
-        other = [
-            row for row in kept
-            if abs(order[row].size[0] * item.size[1] / (order[row].size[1] * item.size[0]) - 1)
-            < SAME_ASPECT
-            and (order[row].size, order[row].path.suffix) != (item.size, item.path.suffix)
-        ]  # fmt: skip
-        apart = np.abs(thumbnails[other] - thumbnails[number]).mean(axis=1)
-        if apart.size and apart.min() < SAME:
+        alike = np.array([way[number] @ units[0][kept].T for way in units]) > SAME
+        series = np.array([_one_form(item, order[row]) for row in kept], np.bool_)
+        apart = np.abs(grey[kept] - grey[number]).mean(axis=(1, 2))
+        alike[0] = np.where(series, units[0][kept] @ units[0][number] > EXACT, alike[0])
+        if alike.any() or (apart < NEAR)[~series].any():
             copies.append(item.name)
         else:
             kept.append(number)
     return sorted(copies, key=natural_key)
+
+
+def _one_form(a: CapturedPhotograph, b: CapturedPhotograph) -> bool:
+    """Whether pictures may be two of a series: of one size and kind, no name part of the other."""
+    stems = sorted((a.path.stem, b.path.stem), key=len)
+    return (a.size, a.path.suffix) == (b.size, b.path.suffix) and stems[0] not in stems[1]
 
 
 def _look_at(path: Path, name: str) -> CapturedPhotograph:

@@ -121,6 +121,39 @@ def intrinsics_beside(root: Path, *, above: bool = False) -> tuple[Float64, str]
     return (found[0][0], found[0][1].name) if found else None
 
 
+def exported_file(root: Path, name: str) -> Path:
+    """A file of an export like ScanNet's, at one of the places where exporters put it."""
+    folders = (root / "intrinsic", root / "intrinsics", root)
+    return next((f / name for f in folders if (f / name).is_file()), root / name)
+
+
+def exported_intrinsics(root: Path, camera: str) -> list[tuple[Float64, str]]:
+    """(3, 3) of the "color" or "depth" camera and the file, for each that an exporter wrote."""
+    names = [f"intrinsic_{camera}", f"intrinsics_{camera}", f"{camera}_intrinsic",
+             f"{camera}_intrinsics"]  # fmt: skip
+    if camera == "color":
+        names += ["intrinsic", "intrinsics", "camera_intrinsics", "K", "cam_K"]
+    found = list[tuple[Float64, str]]()
+    for name in names:
+        if (path := exported_file(root, f"{name}.txt")).is_file():
+            matrix = load_matrix(path, (4, 4), (3, 4), (3, 3), (1, 4))
+            found.append((pinhole(matrix[0]) if len(matrix) == 1 else matrix[:3, :3], path.name))
+    beside = intrinsics_beside(root) if camera == "color" else None
+    found += [beside] if beside else []
+    # The scan's own are of pictures as they were recorded, before any export.
+    for path in (root / "_info.txt", root / f"{root.resolve().name}.txt"):
+        if path.is_file() and not found:
+            with reading(path):
+                lines = (line.partition("=") for line in read_text(path).splitlines())
+            told = {key.strip(): value.split() for key, _, value in lines}
+            K = finite_array(told.get(f"m_calibration{camera.title()}Intrinsic"), 4, 4)
+            keys = [f"{name}_{camera}" for name in ("fx", "fy", "mx", "my")]
+            values = finite_array([told.get(key, ["x"])[0] for key in keys], 4)
+            found += [(K[:3, :3], path.name)] if K is not None else []
+            found += [(pinhole(values.tolist()), path.name)] if values is not None else []
+    return found
+
+
 def _text(path: Path) -> str:
     try:
         return read_text(path)

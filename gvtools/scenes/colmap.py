@@ -14,8 +14,9 @@ from gvtools.scenes.colmap_model import (
     RegisteredImage,
     find_model,
     load_model,
-    sparse_points,
+    other_models,
 )
+from gvtools.scenes.colmap_points import sparse_points
 from gvtools.scenes.images import IMAGE_SUFFIXES
 from gvtools.scenes.matching import find_renamed, given_folder
 from gvtools.scenes.photographs import PosedFrame, posed_scene
@@ -86,7 +87,7 @@ def read_colmap(
     kinds = Counter(frame.depth.name.split(".")[-2] for frame in frames if frame.depth is not None)
     kinds_found = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items()))
     findings = [Finding("info", f"depth maps: {kinds_found}")] if kinds_found else []
-    findings.append(_registered_finding(image_folder, loaded, files))
+    findings += [_registered_finding(image_folder, loaded, files), *other_models(root, folder)]
     return replace(scene, findings=(*scene.findings, *met, *findings))
 
 
@@ -170,7 +171,7 @@ def _first(homes: list[Path], name: str) -> Path | None:
 
 def _registered_finding(image_folder: Path, model: ColmapModel, files: list[Path]) -> Finding:
     """How many of the pictures on disk the model knows, and through which cameras."""
-    known = {os.path.relpath(file, image_folder) for file in files}
+    known = {os.path.relpath(file, image_folder) for file in files if is_file(file)}
     others = 0
     for folder, _, inner in os.walk(image_folder):
         relative = Path(folder).relative_to(image_folder)

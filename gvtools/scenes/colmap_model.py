@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,7 @@ from gvtools.errors import ProjectError
 from gvtools.scenes.faces import perspective_views
 from gvtools.scenes.matching import named, natural
 from gvtools.scenes.photographs import rotation_findings
-from gvtools.scenes.scene import Finding, Scene, SparsePoints, natural_key
+from gvtools.scenes.scene import Finding, natural_key
 from gvtools.scenes.undistort import Undistortion, undistortion
 from gvtools.untrusted import number_key, read_bytes, read_text, regular
 
@@ -73,22 +73,34 @@ def find_model(root: Path, *, number: int | None = None) -> Path | None:
 
     Of several (``sparse/0``, ``sparse/1``, ...) that with the ``number``, else with most images.
     """
-    for place in PLACES:
-        numbered = _numbered(root / place)
-        if number is not None:
-            if number in numbered:
-                return numbered[number]
-            continue
-        if numbered:
-            return max(numbered.values(), key=_count_images)
-        if has_model(root / place):
-            return root / place
     if number is None:
-        return None
-    known = [str(key) for place in PLACES for key in _numbered(root / place)]
-    raise ProjectError(
-        f"{root}: no COLMAP model of number {number}; it holds {', '.join(known) or 'none'}"
-    )
+        return next(iter(_models(root)), None)
+    known = {
+        key: path for place in reversed(PLACES) for key, path in _numbered(root / place).items()
+    }
+    if number not in known:
+        held = ", ".join(map(str, sorted(known))) or "none"
+        raise ProjectError(f"{root}: no COLMAP model of number {number}; it holds {held}")
+    return known[number]
+
+
+def _models(root: Path) -> Iterator[Path]:
+    """The model of each place of a workspace, that with most images where it holds several."""
+    for place in PLACES:
+        if numbered := _numbered(root / place):
+            yield max(numbered.values(), key=_count_images)
+        elif has_model(root / place):
+            yield root / place
+
+
+def other_models(root: Path, folder: Path) -> list[Finding]:
+    """A line for each model in another place of a workspace that has other images."""
+    counts = {path: _count_images(path) for path in _models(root) if path.parent != folder.parent}
+    return [
+        Finding("warning", f"{folder} is read, and not {path}, a model of {count} images")
+        for path, count in counts.items()
+        if count != _count_images(folder)
+    ]
 
 
 def _numbered(folder: Path) -> dict[int, Path]:
@@ -326,28 +338,49 @@ def load_model(folder: Path, *, faces: bool = False) -> ColmapModel:
 def _contradicting_text(
     files: ModelFiles, reconstruction: pycolmap.Reconstruction
 ) -> list[Finding]:
-    """A warning when a ``cameras.txt`` beside the binary model says other cameras."""
-    path = files.folder / "cameras.txt"
-    if files.suffix == ".txt" or not path.is_file():
-        return []
+    """A warning for each text file beside the binary model that says other cameras or poses."""
+    records: dict[str, dict[int, list[Any]]] = {
+        "cameras": {
+            key: [camera.model_name, camera.width, camera.height, *camera.params]
+            for key, camera in reconstruction.cameras.items()
+        },
+        "images": {
+            key: ["pose", *image.cam_from_world().rotation.matrix()[:, 2],
+                  *image.cam_from_world().translation]
+            for key, image in reconstruction.images.items() if image.has_pose
+        },
+    }  # fmt: skip
+    findings = []
+    for stem, own in records.items():
+        path = files.folder / f"{stem}.txt"
+        told = {} if files.suffix == ".txt" else _told(path)
+        for key, (name, *values) in sorted(own.items() if told else ()):
+            other, *those = told.get(key, ["none"])
+            same = name == other and len(values) == len(those)
+            if same and np.allclose(values, those, rtol=1e-3, atol=1e-3):
+                continue
+            here, there = (np.round(v, 4).tolist() for v in (values, those))
+            line = (
+                f"{stem}.bin is read, and {path.name} beside it differs: {stem[:-1]} {key} is "
+                f"{name} {here}, there {other} {there}; take the wrong one away"
+            )
+            findings.append(Finding("warning", line))
+            break
+    return findings
+
+
+def _told(path: Path) -> dict[int, list[Any]]:
+    """The records of a text file as above; none where it is absent or unreadable."""
     try:
-        rows = [line.split() for line in read_text(path).splitlines() if line[:1] not in ("", "#")]
-        told = {int(row[0]): (row[1], np.array(row[2:], np.float64)) for row in rows}
+        rows = [line.split() for line in read_text(path).splitlines() if line[:1] != "#"]
+        if path.stem == "cameras":
+            return {int(row[0]): [row[1], *map(float, row[2:])] for row in rows if row}
+        heads = [row for row in rows if len(row) > 9 and not _NUMBER.fullmatch(row[9])]
+        turned = {int(row[0]): _rotation(np.array(row[2:5] + row[1:2], float)) for row in heads}
+        return {int(row[0]): ["pose", *turned[int(row[0])][:, 2], *map(float, row[5:8])]
+                for row in heads}  # fmt: skip
     except (OSError, ValueError, IndexError):
-        return []
-    for key, camera in sorted(reconstruction.cameras.items()):
-        own = np.array([camera.width, camera.height, *camera.params])
-        model, values = told.get(key, ("", own))
-        same = model == camera.model_name and values.shape == own.shape
-        if same and np.allclose(values, own, rtol=1e-3, atol=1e-6):
-            continue
-        other = f"{model} {values.tolist()}" if model else "no such camera"
-        line = (
-            f"cameras.bin is read, and {path.name} beside it differs: camera {key} is "
-            f"{camera.model_name} {own.tolist()}, there {other}; take the wrong one away"
-        )
-        return [Finding("warning", line)]
-    return []
+        return {}
 
 
 def _read(files: ModelFiles) -> tuple[pycolmap.Reconstruction, list[Finding]]:
@@ -520,80 +553,3 @@ def _rotation(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
     if not 0 < square < np.inf:
         return np.full((3, 3), square)
     return np.asarray(square * Rotation.from_quat(quaternion).as_matrix())
-
-
-def sparse_points(model: ColmapModel, scene: Scene) -> tuple[SparsePoints | None, list[Finding]]:
-    """The model's points by id (None without any), tracks in the views' pixels, and findings."""
-    points = model.reconstruction.points3D
-    if not len(points):
-        return None, [Finding("info", "the model has no sparse points")]
-    ids = np.array(sorted(points), np.uint64)
-    index = {name: i for i, name in enumerate(scene.names)}
-    tracks = [_observations(model, image, scene, index=index, ids=ids) for image in model.images]
-    point = np.concatenate([track[0] for track in tracks])
-    view = np.concatenate([track[1] for track in tracks])
-    xy = np.concatenate([track[2] for track in tracks])
-    findings = []
-    lost = model.reconstruction.compute_num_observations() - len(view)
-    if lost:
-        findings.append(Finding("info", f"{lost} track elements belong to views that are not read"))
-    sound = np.isfinite(xy).all(axis=1)
-    if not sound.all():
-        line = f"{int((~sound).sum())} detections lie where the lens has no inverse: dropped"
-        findings.append(Finding("warning", line))
-    # By point, then by view: the model's own order depends on its tables.
-    rows = np.lexsort((view, point))
-    rows = rows[sound[rows]]
-    ordered = [points[int(key)] for key in ids]
-    positions = np.array([item.xyz for item in ordered], np.float64)
-    colors = np.array([item.color for item in ordered], np.uint8)
-    errors = np.array([item.error for item in ordered], np.float32)
-    tracks_of = SparsePoints(positions, colors, errors, point[rows], view[rows], xy[rows])
-    return tracks_of, findings
-
-
-def _observations(
-    model: ColmapModel,
-    image: RegisteredImage,
-    scene: Scene,
-    *,
-    index: dict[str, int],
-    ids: NDArray[np.uint64],
-) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float64]]:
-    """Point index, view index and pixels of all that one image saw."""
-    lenses = model.views[image.camera_id]
-    rows = [index[name] for name in (lens.name(image.name) for lens in lenses) if name in index]
-    if not rows:
-        return np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros((0, 2))
-    seen = model.reconstruction.images[image.image_id].get_observation_points2D()
-    keys = np.fromiter((point.point3D_id for point in seen), np.uint64, len(seen))
-    xy = np.array([point.xy for point in seen], np.float64).reshape(-1, 2)
-    point_index = np.minimum(np.searchsorted(ids, keys), len(ids) - 1).astype(np.int32)
-    strange = int((ids[point_index] != keys).sum())
-    if strange:
-        raise ProjectError(
-            f"{model.files.folder}: {strange} detections of image {image.name} name points that "
-            "points3D does not hold; expected files of one model; export the model again"
-        )
-    places = np.stack(
-        [
-            _of_view(lens, scene.views[row].camera.K[0], lens.points(xy))
-            for lens, row in zip(lenses, rows, strict=True)
-        ]
-    )
-    # Faces meet at their sides: the first that shows a detection takes it.
-    shown = np.isfinite(places).all(-1).argmax(0)
-    return point_index, np.array(rows, np.int32)[shown], places[shown, np.arange(len(xy))]
-
-
-def _of_view(
-    lens: Undistortion, K: NDArray[np.float64], xy: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """(N, 2) pixels of a model's pinhole camera as those of the view, whose picture may be scaled.
-
-    Both look along the same axes from the same place, so that the ray stays the same.
-    """
-    if np.array_equal(lens.K, K):
-        return xy
-    change = K @ np.linalg.inv(lens.K)
-    return np.asarray(xy @ change[:2, :2].T + change[:2, 2])

@@ -25,6 +25,8 @@ Float64 = NDArray[np.float64]
 
 # Focal lengths of usual lenses, over the image's sides.
 FOCAL = (0.1, 50.0)
+# Pictures whose grey levels deviate less than this show nothing.
+BLANK = 0.5
 # Mean reprojection error, pixels, above which a model is no good one.
 REPROJECTION = 4.0
 
@@ -161,7 +163,7 @@ def _open(
     scene: Scene, numbers: list[int], findings: list[Finding], *, pixels: PixelCheck
 ) -> list[_Opened]:
     known = {finding.message for finding in findings}
-    opened, empty = [], []
+    opened, empty, blank = [], [], []
     for number in numbers:
         view = scene.views[number]
         try:
@@ -173,6 +175,8 @@ def _open(
         pixels.see(number, frame.rgb)
         masked = 0.0 if frame.mask is None else 1.0 - float(frame.mask.mean())
         seen = number, thumbnail(frame), masked
+        if seen[1].grey.std() < BLANK:
+            blank.append(view.name)
         if frame.depth is None:
             opened.append(_Opened(*seen))
             continue
@@ -183,6 +187,9 @@ def _open(
         else:
             opened.append(_Opened(*seen, frame.depth.size))
             empty.append(view.name)
+    if blank:
+        message = f"{len(blank)} of {len(numbers)} pictures show one colour alone, first {blank[0]}"
+        findings.append(Finding("warning", message))
     if empty:
         message = f"{len(empty)} depth maps hold no valid pixel, first {empty[0]}"
         findings.append(Finding("warning", message))

@@ -8,6 +8,7 @@ import unicodedata
 from collections.abc import Iterable, Sequence
 from itertools import islice
 from pathlib import Path, PurePosixPath
+from urllib.parse import unquote
 
 import numpy as np
 from numpy.typing import NDArray
@@ -189,8 +190,9 @@ def find_renamed(
 ) -> tuple[list[Path], list[Finding]]:
     r"""Files that lists name in a folder; for one that is absent, the only one of nearly that name.
 
-    It differs by the separator "\", case, Unicode form or suffix, and, where none is as listed, by
-    folders in front of one of the two names. Absolute names may be those of another computer.
+    It differs by the separator "\", case, Unicode form, signs written as in addresses ("%20") or
+    suffix, and, where none is as listed, by folders in front of one of the two names. Absolute
+    names may be those of another computer.
     A name that leads out of the folder and to no such file is refused where ``where`` says for each
     what names it; links are followed. Files may lie in a second folder, ``also``, as listed.
     """
@@ -242,7 +244,7 @@ class _Tails:
                 self.tails.setdefault(parts[start:], []).append(name)
 
     def _parts(self, name: str) -> tuple[str, ...]:
-        name = unicodedata.normalize("NFC", name.replace("\\", "/")).casefold()
+        name = unquote(unicodedata.normalize("NFC", name.replace("\\", "/"))).casefold()
         for _ in range(0 if self.twice is None else 1 + self.twice):
             name = stem(name).removesuffix("_mask")
         return PurePosixPath(unicodedata.normalize("NFC", name)).parts

@@ -33,6 +33,8 @@ from gvtools.scenes.calibration import (
     MILLIMETRES,
     Float64,
     corner_origin,
+    exported_file,
+    exported_intrinsics,
     finite_array,
     intrinsics_beside,
     load_matrix,
@@ -164,16 +166,12 @@ class RgbdFolder(ABC):
         return Layout.of_folder(self.name, self.holds[0], matches=self.matches, read=self.read)
 
 
-def _text(path: Path) -> str:
-    with reading(path):
-        return read_text(path)
-
-
 def _with_pose(frame: PosedFrame, *, strict: bool) -> PosedFrame:
     """The frame with the pose in its own file."""
     path = Path(frame.where)
     try:
-        return replace(frame, pose=load_matrix(path, (4, 4), (3, 4))) if path.is_file() else frame
+        told = path.is_file() and path.stat().st_size  # an empty file tells nothing
+        return replace(frame, pose=load_matrix(path, (4, 4), (3, 4))) if told else frame
     except ProjectError:
         if strict:
             raise
@@ -209,6 +207,7 @@ class _SevenScenes(RgbdFolder):
         )
 
 
+TRUTH = "groundtruth.txt"
 # fx, fy, cx, cy and k1, k2, p1, p2, k3 as published with TUM RGB-D; freiburg3 is rectified.
 PUBLISHED = {
     "freiburg1": ((517.3, 516.5, 318.6, 255.3), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
@@ -228,7 +227,11 @@ class _Tum(RgbdFolder):
             return listed or self._associated(root) is not None
         named_by_time = all(_stamped_pictures(root / kind) for kind in ("rgb", "depth"))
         pictures = listed or self._associated(root) is not None or named_by_time
-        return pictures and (root / "groundtruth.txt").is_file()
+        return pictures and self._truth(root).is_file()
+
+    def _truth(self, root: Path) -> Path:
+        there = (root / f"{name}.txt" for name in ("gt", "trajectory", "poses"))
+        return next(filter(Path.is_file, (root / TRUTH, *there)), root / TRUTH)
 
     def frames(self, root: Path, options: RgbdOptions) -> list[PosedFrame]:
         return [frame for _, frame in self._stamped(root, options)[0]]
@@ -262,7 +265,7 @@ class _Tum(RgbdFolder):
         frames = []
         for i, ((time, _), color) in enumerate(zip(colors, images, strict=True)):
             depth = maps[depth_of[i]] if i in depth_of else None
-            where = f"{root / 'groundtruth.txt'}, time {time:.6f}"
+            where = f"{self._truth(root)}, time {time:.6f}"
             frames.append((time, PosedFrame(color.name, color, None, None, depth, where=where)))
         if not all((root / f"{kind}.txt").is_file() for kind in ("rgb", "depth")):
             source = pairs.name if pairs is not None else "the names of the files in rgb and depth"
@@ -280,7 +283,8 @@ class _Tum(RgbdFolder):
 
     def posed(self, recording: Recording, *, strict: bool) -> Recording:
         limit = recording.options.max_time_difference
-        truth = read_poses(recording.root / "groundtruth.txt", layout="tum", lost=True)
+        path = self._truth(recording.root)
+        truth = read_poses(path, layout="tum", lost=True)
         assert truth.stamps is not None
         order = np.argsort(truth.stamps, kind="stable")
         at = partial(pose_at, times=truth.stamps[order], poses=truth.poses[order], same=limit)
@@ -295,7 +299,9 @@ class _Tum(RgbdFolder):
         unposed = f"{NO_POSE} within {limit:g} s"
         if off:
             unposed += f" (the nearest is {min(off):.3g} to {max(off):.3g} s off)"
-        notes = [Finding("warning", f"groundtruth.txt: {note}") for note in truth.notes]
+        notes = [Finding("warning", f"{path.name}: {note}") for note in truth.notes]
+        if path.name != TRUTH:
+            notes.append(Finding("info", f"{TRUTH} is absent: poses are of {path.name}"))
         findings = [*recording.findings, *met, *notes]
         return replace(recording, frames=frames, unposed=unposed, findings=findings)
 
@@ -341,7 +347,7 @@ class _ScanNet(RgbdFolder):
 
     def matches(self, root: Path, *, posed: bool = True) -> bool:
         # Exporters put the cameras in several places; Redwood's have a trajectory instead of poses.
-        folders = [self._folder(root, "color"), root / "depth"]
+        folders = [self._folder(root, "color"), self._folder(root, "depth")]
         if posed and not any(root.glob("*.log")):
             posed_by_files = any(self._folder(root, "pose").glob("*.txt"))
             return posed_by_files and all(folder.is_dir() for folder in folders)
@@ -349,12 +355,16 @@ class _ScanNet(RgbdFolder):
         return all(folder.is_dir() for folder in folders)
 
     def _folder(self, root: Path, kind: str) -> Path:
-        names = {"color": ("color", "rgb", "image", "images"), "pose": ("pose", "poses")}[kind]
-        return next((root / name for name in names if (root / name).is_dir()), root / kind)
+        kinds = {
+            "color": ("color", "rgb", "image", "images"),
+            "depth": ("depth", "depths"),
+            "pose": ("pose", "poses"),
+        }
+        return next((root / n for n in kinds[kind] if (root / n).is_dir()), root / kind)
 
     def frames(self, root: Path, options: RgbdOptions) -> list[PosedFrame]:
         colors = pictures_in(self._folder(root, "color"))
-        depths = pictures_in(root / "depth")
+        depths = pictures_in(self._folder(root, "depth"))
         poses = sorted(self._folder(root, "pose").glob("*.txt"))
         depth_of, pose_of = pair_by_name(colors, depths), pair_by_name(colors, poses)
         return [
@@ -370,57 +380,37 @@ class _ScanNet(RgbdFolder):
     def _frame(
         self, root: Path, color: Path, *, depth: Path | None = None, pose: Path | None = None
     ) -> PosedFrame:
-        depth = depth or root / "depth" / f"{color.stem}.png"
+        depth = depth or self._folder(root, "depth") / f"{color.stem}.png"
         pose = pose or self._folder(root, "pose") / f"{color.stem}.txt"
         return PosedFrame(color.name, color, None, None, depth, where=str(pose))
 
-    def _place(self, root: Path, name: str) -> Path:
-        folders = (root / "intrinsic", root / "intrinsics", root)
-        return next((f / name for f in folders if (f / name).is_file()), root / name)
-
-    def _intrinsics(self, root: Path, camera: str) -> tuple[Float64, str] | None:
-        """(3, 3) and the file that has it, at one of the places where exporters put it."""
-        names = [f"intrinsic_{camera}", f"intrinsics_{camera}", f"{camera}_intrinsic",
-                 f"{camera}_intrinsics"]  # fmt: skip
-        if camera == "color":
-            names += ["intrinsic", "intrinsics", "camera_intrinsics", "K"]
-        for name in names:
-            if (path := self._place(root, f"{name}.txt")).is_file():
-                matrix = load_matrix(path, (4, 4), (3, 4), (3, 3), (1, 4))
-                return pinhole(matrix[0]) if len(matrix) == 1 else matrix[:3, :3], path.name
-        for path in (root / "_info.txt", root / f"{root.resolve().name}.txt"):
-            if path.is_file():
-                lines = (line.partition("=") for line in _text(path).splitlines())
-                told = {key.strip(): value.split() for key, _, value in lines}
-                K = finite_array(told.get(f"m_calibration{camera.title()}Intrinsic"), 4, 4)
-                keys = [f"{name}_{camera}" for name in ("fx", "fy", "mx", "my")]
-                values = finite_array([told.get(key, ["x"])[0] for key in keys], 4)
-                if K is not None or values is not None:
-                    return (pinhole(values) if K is None else K[:3, :3]), path.name  # type: ignore[arg-type]
-        return intrinsics_beside(root) if camera == "color" else None
-
     def calibration(self, root: Path, options: RgbdOptions) -> Recording:
         folder, cameras = root / "intrinsic", ("color", "depth")
-        found = [self._intrinsics(root, camera) for camera in cameras]
-        color_K, depth_K = (None if item is None else item[0] for item in found)
+        found = [exported_intrinsics(root, camera) for camera in cameras]
+        color_K, depth_K = (there[0][0] if there else None for there in found)
         merged = _under(options, depth_unit=self.unit, color_K=color_K, depth_K=depth_K)
         if merged.color_K is None:
             raise ProjectError(
                 f"{folder}: no intrinsic_color.txt there or in {root}; export it, or give color_K "
                 "(--color-intrinsics)"
             )
+        findings = [
+            Finding("warning", f"{other} differs from {name}, which is read; take the wrong away")
+            for (K, name), *others in filter(None, found)
+            for another, other in others
+            if not np.allclose(another, K, rtol=1e-3)
+        ]
         if depth_K is None:
-            name = "" if found[0] is None else found[0][1]
-            line = [Finding("info", f"intrinsics: {name}")] if name else []
-            return Recording(root, merged, findings=line)
+            line = [Finding("info", f"intrinsics: {found[0][0][1]}")] if found[0] else []
+            return Recording(root, merged, findings=[*line, *findings])
         # Camera from rig each; an export without such files has one place for both.
         color, depth = (
             rigid_transform(load_matrix(path, (4, 4)), what=str(path))[0]
             if path.is_file()
             else np.eye(4)
-            for path in (self._place(root, f"extrinsic_{camera}.txt") for camera in cameras)
+            for path in (exported_file(root, f"extrinsic_{camera}.txt") for camera in cameras)
         )
-        moved, findings = color @ np.linalg.inv(depth), []
+        moved = color @ np.linalg.inv(depth)
         if options.color_from_depth is None and not np.allclose(moved, np.eye(4)):
             # Exports with other than identity are rare, and tools read them both ways.
             message = "extrinsics are taken as camera-from-rig; if not, give color_from_depth"

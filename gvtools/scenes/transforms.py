@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import reprlib
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
@@ -50,8 +51,11 @@ GUESSED_SUFFIXES = (".png", ".jpg", ".jpeg")  # Blender's files name pictures wi
 
 # nerfstudio's names; the fisheye ones share one model, the others the polynomial one.
 PERSPECTIVE = ("", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
+UNBENT = PERSPECTIVE[1:3]
 FISHEYE = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 
+# Keys that list the pictures of splits.
+LISTS = ("train_filenames", "val_filenames", "test_filenames")
 # Keys that each frame has for itself.
 OF_A_FRAME = ("transform_matrix", "mask_path", "depth_file_path", "depth_path")
 # What tells the focal length along an axis: pixels, or a field of view in radians or degrees.
@@ -128,7 +132,7 @@ def read_transforms(path: Path, *, images: Path | None = None, masks: Path | Non
                 where=what,
             )
         )
-        lines = keys.doubts(file)
+        lines = [*keys.doubts(file), *_unread(entry, root)]
         if mask is None and is_file(file.with_name(f"dynamic_mask_{file.stem}.png")):
             lines.append(
                 "dynamic_mask_NAME.png lies beside them, whose white instant-ngp ignores, and is "
@@ -163,6 +167,17 @@ def read_transforms(path: Path, *, images: Path | None = None, masks: Path | Non
     )
 
 
+def _unread(entry: Mapping[str, Any], root: Path) -> list[str]:
+    """A line for each depth map or mask of a frame whose key is none that is read."""
+    others = {key: value for key, value in entry.items() if key not in FrameKeys.model_fields}
+    return [
+        f"{key} names files that are not read; depth maps are named by depth_file_path, masks by "
+        "mask_path (black = ignore)"
+        for key, value in others.items()
+        if re.search("depth|mask", key) and isinstance(value, str) and is_file(root / value)
+    ]
+
+
 def is_transforms(folder: Path) -> bool:
     """Whether a folder holds a ``transforms.json``, or those of splits."""
     return any((folder / name).is_file() for name in (FILE, *SPLITS.values()))
@@ -179,9 +194,18 @@ def _listed(path: Path) -> tuple[list[_Listed], list[Finding]]:
             _Listed(data, entry, file, name, f"{path}, frame {i}")
             for i, (entry, file, name) in enumerate(places)
         ]
-        unused = data.get("ply_file_path")
-        line = f"ply_file_path ({reprlib.repr(unused)}) is not read: depth comes from pictures"
-        return listed, [*findings, *([Finding("info", line)] if unused else [])]
+        cloud = data.get("ply_file_path")
+        parts = [name for name in SPLITS.values() if (path.parent / name).is_file()]
+        lists = [key for key in LISTS if data.get(key)]
+        unused = {
+            f"ply_file_path ({reprlib.repr(cloud)}) is not read: depth comes from pictures": cloud,
+            f"{named(parts)} beside {path.name}: not read; give its path to read it": parts,
+            f"{named(lists)}: not read; give such names by --context and --targets": lists,
+        }
+        return listed, [
+            *findings,
+            *(Finding("info", line) for line, there in unused.items() if there),
+        ]
     splits, found = dict[Path, str](), list[_Listed]()
     sizes, findings = dict.fromkeys(SPLITS, 0), list[Finding]()
     for split, name in SPLITS.items():
@@ -483,6 +507,11 @@ class FrameKeys(BaseModel):
         if self.depth_path and not self.depth_file_path and self.integer_depth_scale is None:
             unit = self.depth_unit_scale_factor
             lines.append(f"depth_path without integer_depth_scale: {unit:g} a step is assumed")
+        if self.depth_path and self.depth_file_path not in (None, self.depth_path):
+            lines.append("depth_path and depth_file_path differ: the second is taken")
+        bent = [key for key in DISTORTION if getattr(self, key)]
+        if self.camera_model in UNBENT and bent:
+            lines.append(f"camera_model {self.camera_model}, and yet {named(bent)}: these are used")
         size = self._size(picture)
         if (times := self._times(size)) != 1:
             lines.append(

@@ -368,9 +368,9 @@ def write_channels(path, positions, colors, *, names=RED, text=False):
         ]  # fmt: skip
     else:
         head = [
-            "VERSION 0.7", f"FIELDS x y z {' '.join(names)}", "SIZE 8 8 8" + f" {size}" * len(names),
-            "TYPE F F F" + f" {letter}" * len(names), "COUNT 1 1 1" + " 1" * len(names),
-            f"WIDTH {count}",
+            "VERSION 0.7", " ".join(["FIELDS x y z", *names]),
+            "SIZE 8 8 8" + f" {size}" * len(names), "TYPE F F F" + f" {letter}" * len(names),
+            "COUNT 1 1 1" + " 1" * len(names), f"WIDTH {count}",
             "HEIGHT 1", "VIEWPOINT 0 0 0 1 0 0 0", f"POINTS {count}",
             f"DATA {'ascii' if text else 'binary'}",
         ]  # fmt: skip

@@ -30,6 +30,7 @@ def told(scene):
         ("a.png", "left/a.png"),
         ("left\\a.png", "left/a.png"),
         ("A.JPG", "a.jpg"),
+        ("a%20b.png", "a b.png"),
         ("a.jpg", "a.png"),
         ("a.jpg", "a.jpg.png"),
         ("a.png.png", "a.png"),

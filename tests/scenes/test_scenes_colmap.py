@@ -89,7 +89,7 @@ def test_unused_cameras_absent_and_unregistered_images_are_reported(tmp_path):
     messages = " | ".join(finding.message for finding in scene.findings)
     assert "1 cameras of the model are used by no image" in messages
     assert "1 of 4 frames have no picture: dropped" in messages
-    assert "4 of 5 pictures registered" in messages
+    assert "3 of 4 pictures registered" in messages
     assert "40 track elements belong to views that are not read" in messages
     assert reprojection_errors(scene).max() < 1e-3
 
@@ -245,15 +245,25 @@ def test_smaller_pictures_of_the_same_aspect_scale_their_cameras_and_detections(
     assert line in [finding.message for finding in scene.findings]
 
 
-@pytest.mark.parametrize("focal", [90, 95])
-def test_a_text_model_that_contradicts_the_binary_one_beside_it_is_said(tmp_path, focal):
+@pytest.mark.parametrize(("focal", "scale"), [(90, 1), (95, 1), (90, 2)])
+def test_a_text_model_that_contradicts_the_binary_one_beside_it_is_said(tmp_path, focal, scale):
+    import pycolmap
+
     reconstruction = workspace(tmp_path, "PINHOLE")
     for camera in reconstruction.cameras.values():
         camera.focal_length_x = focal
+    reconstruction.transform(pycolmap.Sim3d(scale, pycolmap.Rotation3d(), np.zeros(3)))
     reconstruction.write_text(tmp_path / "sparse/0")
+    for frame in sorted(reconstruction.frames)[:scale]:
+        reconstruction.deregister_frame(frame)
+    (tmp_path / "sparse_txt").mkdir()
+    reconstruction.write_text(tmp_path / "sparse_txt")
     said = [found.message for found in read_colmap(tmp_path).findings]
     line = "cameras.bin is read, and cameras.txt beside it differs: camera 1 is PINHOLE [96.0, "
     assert any(line in message for message in said) == (focal != 90)
+    line = "images.bin is read, and images.txt beside it differs: image 1 is pose ["
+    assert any(line in message for message in said) == (scale != 1)
+    assert any(f"sparse_txt, a model of {4 - scale} images" in message for message in said)
 
 
 @pytest.mark.parametrize(

@@ -107,7 +107,9 @@ def test_tum_without_its_lists(tmp_path, order):
         (tmp_path / "associations.txt").write_text("\n".join(pairs))
     (tmp_path / "rgb.txt").unlink()
     (tmp_path / "depth.txt").unlink()
+    (tmp_path / "groundtruth.txt").rename(tmp_path / "gt.txt")
     scene = open_project(tmp_path)
+    assert "groundtruth.txt is absent: poses are of gt.txt" in messages(scene)
     assert scene.names == expected.names and all(view.has_depth for view in scene)
     source = "associations.txt" if order else "the names of the files"
     assert f"times are of {source}" in messages(scene)
@@ -137,6 +139,10 @@ def test_scannets_cameras_at_the_usual_other_places(tmp_path, place):
     scene = open_project(root)
     assert scene.names == expected.names and all(view.has_depth for view in scene)
     np.testing.assert_array_equal(scene.cameras.K, expected.cameras.K)
+    assert "differs from" not in messages(scene)
+    np.savetxt(root / "K.txt", 2 * np.eye(3))
+    if place in ("", "intrinsics", "single"):
+        assert "K.txt differs from intrinsic" in messages(open_project(root))
 
 
 @pytest.mark.parametrize("codes", [[[90, 5, 0], [0, 90, 0], [0, 0, 1]], [[0, 0, 0]] * 3])

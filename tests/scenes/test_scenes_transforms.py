@@ -396,6 +396,27 @@ def test_depth_as_apps_for_phones_name_it(tmp_path, keys, expected):
     assert ("0.001 a step is assumed" in messages(scene)) == (not keys)
 
 
+@pytest.mark.parametrize(
+    ("own", "shared", "said"),
+    [
+        ({"depth": "m.png"}, {}, "depth names files that are not read"),
+        ({"mask": "m.png"}, {}, "mask names files that are not read"),
+        ({"depth_path": "m.png", "depth_file_path": "n.png"}, {}, "differ: the second is taken"),
+        ({}, {"camera_model": "PINHOLE", "k1": 0.1}, "camera_model PINHOLE, and yet k1"),
+        ({}, {"test_filenames": ["images/a.png"]}, "test_filenames: not read; give such names"),
+        ({}, {}, "transforms_test.json beside transforms.json: not read"),
+    ],
+)
+def test_what_is_not_read_is_said(tmp_path, own, shared, said):
+    save(tmp_path / "images/a.png", ramp())
+    for name in ("m.png", "n.png"):
+        save(tmp_path / name, np.full((HEIGHT, WIDTH), 2000, np.uint16))
+    if not own and not shared:
+        (tmp_path / "transforms_test.json").write_text("{}")
+    scene = read_transforms(transforms(tmp_path, [frame(**own)], **PINHOLE, **shared))
+    assert said in messages(scene)
+
+
 @pytest.mark.parametrize("factor", [0.5, 2])
 def test_pictures_of_another_size_and_the_same_aspect_scale_their_camera(tmp_path, factor):
     small = int(WIDTH * factor), int(HEIGHT * factor)
