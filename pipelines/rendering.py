@@ -357,10 +357,8 @@ class FilmRenderer:
         count = len(self.cameras)
         most = most if self.rig is None else max(1, 2 * most // len(self.rig.faces))
         rows = np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(int))
-        spread = [self.cameras[int(row)] for row in rows]
-        if self.rig is None:
-            return spread
-        return [face for camera in spread for face in self.rig.cameras(camera)]
+        spread = self.cameras[rows.tolist()]
+        return list(spread) if self.rig is None else self.rig.faces_of(spread)
 
 
 def captioned(picture: Picture, text: str) -> Picture:

@@ -83,8 +83,9 @@ def capture_posed(
     """
     if not source.is_dir():
         raise OptionError(f"--poses: {source} is no folder; expected the pictures the network saw")
-    has_weights = poses.is_dir() and any(poses.rglob("*.safetensors"))
-    predictions = None if has_weights else read_predictions(poses)
+    # Where a network's program, its weights and what it saved lie together, the last is meant.
+    is_network = any(poses.rglob("*.safetensors")) and not any(poses.rglob("*.np[yz]"))
+    predictions = None if is_network else read_predictions(poses)
     with replaced_folder(out) as work:
         photographs, findings = find_photographs(source)
         sideways = [item.name for item in photographs if item.turned]

@@ -181,18 +181,14 @@ def _from_arrays(arrays: Arrays) -> Predictions:
 
 def _focal_lengths(world: NDArray[Any], poses: NDArray[np.float64]) -> NDArray[np.float64]:
     """(V, 2) by which cameras with principal points in the middle see points at their pixels."""
-    height, width = world.shape[1:3]
-    x, y = np.arange(width) + 0.5 - width / 2, np.arange(height) + 0.5 - height / 2
-    found = []
-    for pose, points in zip(poses, world, strict=True):
-        local = points @ pose[:3, :3].T + pose[:3, 3]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            along = x[None] * local[..., 2] / local[..., 0]
-            down = y[:, None] * local[..., 2] / local[..., 1]
-        # Near the middle they hang by little.
-        outer = np.abs(x) > width / 8, np.abs(y) > height / 8
-        found.append([np.nanmedian(along[:, outer[0]]), np.nanmedian(down[outer[1]])])
-    return np.array(found)
+    local = np.einsum("vij,vhwj->vhwi", poses[:, :3, :3], world) + poses[:, None, None, :3, 3]
+    y, x = np.indices(world.shape[1:3]) + 0.5
+    off = np.stack([x - x.mean(), y - y.mean()], axis=-1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        focals = off * local[..., 2:] / local[..., :2]
+    # Near the middle they hang by little.
+    outer = np.abs(off) > np.abs(off).max(axis=(0, 1)) / 4
+    return np.asarray(np.nanmedian(np.where(outer, focals, np.nan), axis=(1, 2)))
 
 
 def sample_points(

@@ -81,7 +81,10 @@ class Rig:
         width = int(options.width or min(max(fine, 16), widest)) // 4 * 4
         size = (width, width // 2) if options.kind == "equirectangular" else (width, width)
         rays, inside = _rays(options.kind, size, angle)
-        faces = _faces(width / angle)
+        # As fine as the picture in its middle.
+        wide = max(8, round(width / angle * math.pi) * 2)
+        whole = camera_of(PANORAMA, (wide, wide // 2), (wide, wide // 2), what="a rig")
+        faces = panorama_faces(whole, degrees=FACE_DEGREES)
         weights = np.stack([_weight(_turned(rays, face)) for face in faces])
         weights *= inside / np.maximum(weights.sum(axis=0), 1e-6)
         most = weights.argmax(axis=0)
@@ -102,6 +105,10 @@ class Rig:
             )
             for face in self.faces
         ])  # fmt: skip
+
+    def faces_of(self, pictures: Iterable[Cameras]) -> list[Cameras]:
+        """The faces' cameras of all pictures', each a batch of one."""
+        return [face for picture in pictures for face in self.cameras(picture)]
 
     def pictures(self, cameras: Cameras) -> Iterator[Cameras]:
         """The cameras of pictures whose faces ``cameras`` are; the first face gives the pose."""
@@ -185,13 +192,6 @@ def _rays(kind: str, size: tuple[int, int], angle: float) -> tuple[Float32, NDAr
     across = np.sinc(theta / np.pi)
     rays = np.stack([x * across, y * across, np.cos(theta)], axis=-1)
     return rays.astype(np.float32), theta <= angle / 2
-
-
-def _faces(focal: float) -> tuple[Face, ...]:
-    """The faces of a picture with ``focal`` pixels per radian in its middle."""
-    width = max(8, round(focal * math.pi) * 2)
-    size = (width, width // 2)
-    return panorama_faces(camera_of(PANORAMA, size, size, what="a rig"), degrees=FACE_DEGREES)
 
 
 def _turned(rays: Float32, face: Face) -> Float32:

@@ -90,9 +90,7 @@ class RenderCommand(LensArguments, LpipsArguments, SceneArguments):
         rig, cameras = self.rig(cameras, memory, widest=WIDEST_STILL)
         stems = file_stems(cameras.names)
         if self.complete:
-            faces = [
-                face for camera in cameras for face in (rig.cameras(camera) if rig else camera)
-            ]
+            faces = rig.faces_of(cameras) if rig else cameras
             complete_views(memory, faces, appearance=appearance)
         lpips, no_lpips = self.open_lpips() if self.against_images else (None, None)
         # The first projection compiles or loads the kernels and is not timed.

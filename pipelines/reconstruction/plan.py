@@ -72,7 +72,7 @@ class Targets:
         if rig is None:
             return self
         pictures = picture_cameras(self.cameras, options, captured=captured)
-        cameras = concatenate([rig.cameras(picture) for picture in pictures])
+        cameras = concatenate(rig.faces_of(pictures))
         return Targets(cameras, (None,) * len(cameras), options.kind, self.files, rig=rig)
 
 
@@ -131,7 +131,7 @@ class Plan:
         cameras, rig = posed(self.targets.cameras, poses.targets), self.targets.rig
         if rig is not None:
             # Each face was moved by itself.
-            cameras = concatenate([rig.cameras(picture) for picture in rig.pictures(cameras)])
+            cameras = concatenate(rig.faces_of(rig.pictures(cameras)))
         targets = replace(self.targets, cameras=cameras)
         scene = with_poses(self.scene, self.context, poses.context)
         return replace(self, scene=scene, targets=targets)

@@ -188,10 +188,12 @@ def far(points, cameras: Cameras, row, depths):
 
 def test_a_wrong_count_is_refused(truth, depths, room, tmp_path, capsys):
     poses = vggt(tmp_path, truth, depths)
+    # Its weights may lie beside it.
+    (tmp_path / "model.safetensors").touch()
     shutil.copytree(room / "images", tmp_path / "fewer")
     next(iter(sorted((tmp_path / "fewer").iterdir()))).unlink()
     line = refused(
-        capsys, "capture", tmp_path / "fewer", "--poses", poses, "--out", tmp_path / "out"
+        capsys, "capture", tmp_path / "fewer", "--poses", poses.parent, "--out", tmp_path / "out"
     )
     assert "10 cameras without names" in line and "9 pictures" in line
     assert not (tmp_path / "out").exists()
