@@ -1,4 +1,4 @@
-"""Pages that are generated for each build: commands, settings, Python names, data, data sets."""
+"""Pages that are generated for each build: commands, settings, Python names, data, a gallery."""
 
 from __future__ import annotations
 
@@ -31,6 +31,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     # MkDocs restores the path after it has read its hooks.
     sys.path[:0] = [str(ROOT), str(ROOT / "docs")]
     from diagrams import DIAGRAMS, rooms_svg
+    from gallery import gallery_files, gallery_page
 
     pages = {name: _copied(ROOT / source) for name, source in COPIED.items()}
     pages |= {
@@ -40,11 +41,14 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         "python.md": python_page(),
         "data.md": data_page(),
         "data_sets.md": data_sets_page(),
+        "gallery.md": gallery_page(),
     }
     pages |= {f"images/{name}.svg": diagram.svg() for name, diagram in DIAGRAMS.items()}
     pages["images/architecture.svg"] = rooms_svg()
     for name, content in pages.items():
         files.append(File.generated(config, name, content=content))
+    for path in gallery_files():
+        files.append(File.generated(config, f"gallery/{path.name}", abs_src_path=str(path)))
     return files
 
 

@@ -198,9 +198,12 @@ def make_folder(path: Path) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a whole text file (UTF-8) under its final name only when it is complete."""
+    """Write a whole text file (UTF-8) under its final name only when it is complete.
+
+    Names of files that are no text stand in it with backslashes.
+    """
     with replaced_when_written(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
 class JsonList:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from pathlib import Path
 from types import ModuleType
 
@@ -67,6 +68,24 @@ def test_the_generated_pages_hold_every_command_and_public_name(hooks: ModuleTyp
     commands, python = hooks.commands_page(), hooks.python_page()
     assert [name for name in COMMANDS if f"\n## gvtools {name}\n" not in commands] == []
     assert [name for name in gvtools._SOURCES if f"\n## {name}\n" not in python] == []
+
+
+def test_the_gallery_shows_what_its_commands_write(
+    hooks: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(ROOT / "docs")
+    from gallery import EXHIBITS, SAMPLES, gallery_page
+
+    from pipelines.cli import build_parser
+
+    page = gallery_page()
+    for command in (*SAMPLES, *(exhibit.command for exhibit in EXHIBITS)):
+        assert f"\n{command}\n" in page
+        told = vars(build_parser().parse_args(shlex.split(command)[1:]))
+        outputs = {str(told.get(name)) for name in ("out", "screenshot")}
+        file = next((e.file for e in EXHIBITS if e.command == command), None)
+        assert file is None or file.split("/")[0] in outputs
+    assert all(f"gallery/{exhibit.shown}" in page for exhibit in EXHIBITS)
 
 
 def test_every_setting_has_a_row_with_its_meaning(hooks: ModuleType) -> None:

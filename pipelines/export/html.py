@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gvtools.errors import GvError
-from gvtools.files import replaced_when_written
+from gvtools.files import write_text
 from gvtools.runs.layout import RECORD
 from gvtools.runs.run import load_run
 from gvtools.splats import SH, Splats
@@ -50,9 +50,8 @@ def write_html(source: ExportSource, path: Path, options: ExportOptions) -> str:
 
 def write_page(page: SharedPage, splats: Splats, path: Path) -> str:
     """Write the page of Gaussians, of a run or of a file."""
-    with replaced_when_written(path) as temporary:
-        temporary.write_text(page_html(page), encoding="utf-8")
-        size = temporary.stat().st_size / 1e6
+    write_text(path, page_html(page))
+    size = path.stat().st_size / 1e6
     pictures = sum(camera.picture is not None for camera in page.cameras)
     return f"{splats.summary()} and {pictures} pictures in {path}, {size:.1f} MB"
 

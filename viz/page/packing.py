@@ -18,6 +18,8 @@ PARTS = ((0, 4), (4, 8), (8, 12), (12, 15))
 PARTS_OF_DEGREE = (0, 1, 2, 4)
 # Steps of a rotation's axis and angle, and of a coefficient; what exponents are counted from.
 AXIS, ANGLE, MAGNITUDE, BIAS = 1023, 4095, 255, 15
+# The largest number in half precision.
+MOST = 65504.0
 
 Float32 = NDArray[np.float32]
 Words = NDArray[np.uint32]
@@ -37,7 +39,8 @@ def pack_gaussians(
     """
     opacity = 1 / (1 + np.exp(-logits.astype(np.float64)))
     color = 0.5 + HARMONICS[0] * harmonics[:, 0]
-    halves = np.concatenate([color, log_scales], axis=1).astype("<f2").view("<u2").astype(np.uint32)
+    numbers = np.concatenate([color, log_scales], axis=1).clip(-MOST, MOST)
+    halves = numbers.astype("<f2").view("<u2").astype(np.uint32)
     first = np.empty((len(positions), 4), np.uint32)
     first[:, :3] = positions.astype("<f4").view("<u4")
     first[:, 3] = opacity.astype("<f2").view("<u2")

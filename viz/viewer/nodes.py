@@ -349,7 +349,7 @@ class Backdrop:
         """Make the run's page, unless it is there."""
         if self._page is None and run.page_of is not None:
             page = run.page_of(run, budget)
-            content = page_html(page).encode()
+            content = page_html(page).encode(errors="backslashreplace")
             # Another address, so that no browser takes the one before for it.
             self._number += 1
             self._pages.clear()

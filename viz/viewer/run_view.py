@@ -100,8 +100,8 @@ class RunView:
 
     @property
     def title(self) -> str:
-        """A name for windows and pages."""
-        return self.path.resolve().name
+        """A name for windows and pages, text also where the folder's is none."""
+        return self.path.resolve().name.encode(errors="backslashreplace").decode()
 
     @property
     def last_round(self) -> int:

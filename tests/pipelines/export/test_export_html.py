@@ -5,7 +5,9 @@ from __future__ import annotations
 import base64
 import gzip
 import json
+import os
 import re
+import shutil
 import time
 
 import numpy as np
@@ -83,6 +85,15 @@ def test_words_hold_what_was_packed(degree):
         assert (np.abs(found - sh[:, 1:]) <= largest / 255 + 2.0**-15 / 255).all()
 
 
+def test_numbers_beyond_half_precision_stay_finite():
+    one = np.ones((1, 4), np.float32)
+    _, words = pack_gaussians(
+        one[:, :3], log_scales=1e6 * one[:, :3], quaternions=one, logits=1e3 * one[:, 0],
+        harmonics=1e30 * one[:, None, :3],
+    )  # fmt: skip
+    assert np.isfinite([halves(words[:, k]) for k in range(3)]).all()
+
+
 def scene_of(path):
     """What the page's script reads, and its groups: round, generated, fitted, count, words."""
     text = path.read_text("utf-8")
@@ -130,6 +141,16 @@ def test_names_of_files_are_text_alone():
         up=np.array([0.0, -1, 0]), depth=1.0, near=0.1,
     )  # fmt: skip
     assert page_html(page).count("<img") == 0
+
+
+def test_a_folder_whose_name_is_no_text_has_a_page(bare_run, tmp_path):
+    folder = tmp_path / os.fsdecode(b"run_\xff")
+    try:
+        shutil.copytree(bare_run.folder, folder)
+    except OSError:
+        pytest.skip("this file system takes no such names")
+    export_run(folder, "html", tmp_path / "page.html")
+    assert "<h1>run_\\udcff</h1>" in (tmp_path / "page.html").read_text("utf-8")
 
 
 def test_pages_that_are_no_export_are_kept(fitted_run, tmp_path):
@@ -218,9 +239,10 @@ def test_a_click_flies_and_the_address_keeps_view_and_choices(fitted_run, tmp_pa
         assert not np.array_equal(still(browser), third)
         assert run("return document.getElementById('walk').ariaPressed") == "true"
         browser.driver.get("about:blank")
-        browser.driver.get(kept)
+        browser.driver.get(f"{kept}&round=9")
         reaches(browser, "shown")
         assert psnr(still(browser)[60:, :700], third[60:, :700]) > 45
+        assert "after round 2" in browser.text().replace("\n", " ")
         assert browser.console_errors() == [] and browser.foreign_requests() == []
 
 
