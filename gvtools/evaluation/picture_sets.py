@@ -96,17 +96,16 @@ def match_pictures(
     # Pictures that are numbered alphabetically must not be taken for views whose names are numbers.
     by_name = rule == "name" or (rule == "auto" and not alphabetical)
     partners: list[int | None] = [None] * len(views)
+    like: list[int] = []
     if by_name:
-        partners = _by_name(pictures, views, what, others=others)
+        partners, like = _by_name(pictures, views, what, others=others)
     found = sum(number is not None for number in partners)
-    if rule == "auto" and by_name and not found and others:
-        like = [i for i in _by_name(pictures, others, what) if i is not None]
-        if like:
-            raise OptionError(
-                f"{what}: {len(like)} of {len(pictures)} pictures (such as {pictures[like[0]]!r}) "
-                f"are named like views that are not judged, and none like one that is (such as "
-                f"{views[0]!r}); give those views' pictures, or, where names count, --match order"
-            )
+    if rule == "auto" and like and not found:
+        raise OptionError(
+            f"{what}: {len(like)} of {len(pictures)} pictures (such as {pictures[like[0]]!r}) "
+            f"are named like views that are not judged, and none like one that is (such as "
+            f"{views[0]!r}); give those views' pictures, or, where names count, --match order"
+        )
     if rule == "name" and not found:
         raise OptionError(
             f"{what}: none of {len(pictures)} pictures (first {pictures[0]!r}) is named like one "
@@ -116,6 +115,12 @@ def match_pictures(
         raise OptionError(
             f"{what}: {found} of {len(pictures)} pictures are named like views, the others are "
             "not, and the order would give other partners; say --match name or --match order"
+        )
+    if rule == "auto" and by_name and not found and _first_number(pictures) is None:
+        raise OptionError(
+            f"{what}: the pictures' numbers (such as {pictures[0]!r}) are none of the views' (such "
+            f"as {views[0]!r}) and do not count on by 1; give pictures named like the views, or, "
+            "where the order is right, --match order"
         )
     if not found and len(pictures) != len(views):
         raise OptionError(
@@ -141,21 +146,31 @@ def _natural_order(names: Sequence[str]) -> list[int]:
 
 
 def _by_name(
-    pictures: Sequence[str], views: Sequence[str], what: str, *, others: Sequence[str] = ()
-) -> list[int | None]:
-    """For each view the index of the picture with its name, with or without folders; or None.
+    pictures: Sequence[str], views: Sequence[str], what: str, *, others: Sequence[str]
+) -> tuple[list[int | None], list[int]]:
+    """For each view the index of the picture with its name, or None; those of other views.
 
-    Of both, and of names without what all views share, what finds most partners is taken.
+    Names with and without folders, and without what all views share: what finds most partners is
+    taken, among all views where any is found, else among those to be judged. Zeros in front of
+    numbers count where the pictures' numbers may merely count them, from 0 or 1.
     """
-    tried: list[list[list[int]]] = [[[] for _ in views]]
-    for view_folders in (True, False):
-        whole = [_key(name, folders=view_folders) for name in (*views, *others)]
-        for view_keys in (whole[: len(views)], _without_affixes(whole)[: len(views)]):
-            if len(set(view_keys)) == len(view_keys):
-                for folders in (True, False):
-                    keys = [_key(name, folders=folders) for name in pictures]
-                    tried.append(_partners(keys, view_keys))
-    best = max(tried, key=lambda lists: sum(bool(numbers) for numbers in lists))
+    every, best = (*views, *others), list[list[int]]()
+    padded = _first_number(pictures) in (0, 1)
+    for judged in (len(every), len(views)):
+        best = [[] for _ in every[:judged]]
+        for view_folders in (True, False):
+            whole = [_key(name, folders=view_folders, padded=padded) for name in every]
+            for view_keys in (whole[:judged], _without_affixes(whole)[:judged]):
+                if len(set(view_keys)) == len(view_keys):
+                    for folders in (True, False):
+                        keys = [_key(name, folders=folders, padded=padded) for name in pictures]
+                        best = max(
+                            best, _partners(keys, view_keys), key=lambda p: sum(map(bool, p))
+                        )
+        if any(best):
+            break
+    like = [numbers[0] for numbers in best[len(views) :] if numbers]
+    best = best[: len(views)]
     for view, numbers in zip(views, best, strict=True):
         if len(numbers) > 1:
             listed = ", ".join(repr(pictures[number]) for number in numbers[:2])
@@ -163,7 +178,22 @@ def _by_name(
                 f"{what}: {len(numbers)} pictures of the view {view!r} ({listed}); expected one; "
                 "give a folder with one picture a view"
             )
-    return [numbers[0] if numbers else None for numbers in best]
+    return [numbers[0] if numbers else None for numbers in best], like
+
+
+def _first_number(names: Sequence[str]) -> int | None:
+    """From where numbered names count on; None where they do not, as times and dates.
+
+    >>> _first_number(["r_2.png", "r_3.png"]), _first_number(["r_4.png", "r_8.png"])
+    (2, None)
+    """
+    numbers = _without_affixes([_key(name, folders=False) for name in names])
+    if not all(re.fullmatch(r"\d[\d._-]*", number) for number in numbers):
+        return 0
+    if not all(map(str.isdecimal, numbers)):
+        return None
+    found = sorted(map(int, numbers))
+    return found[0] if found == list(range(found[0], found[0] + len(found))) else None
 
 
 def _without_affixes(names: Sequence[str]) -> list[str]:
@@ -179,6 +209,8 @@ def _without_affixes(names: Sequence[str]) -> list[str]:
         words = re.sub("[0-9]+$", "", shared)
         if not all(text[len(words) : len(words) + 1].isdecimal() for text in texts):
             words = re.sub("[a-z0-9]+$", "", shared)
+        if re.fullmatch(r"\d+\.", words):  # of numbers with the same decimals
+            words = ""
         cuts.append(len(words))
     return [name[cuts[0] : len(name) - cuts[1]] or name for name in names]
 
@@ -211,11 +243,12 @@ def _partners(pictures: Sequence[str], views: Sequence[str]) -> list[list[int]]:
     return out
 
 
-def _key(name: str, *, folders: bool) -> str:
-    """A name as it is compared."""
+def _key(name: str, *, folders: bool, padded: bool = True) -> str:
+    """A name as it is compared; folders may be joined to it by other signs elsewhere."""
     path = PurePosixPath(name.replace("\\", "/"))
     path = path.with_suffix("") if path.suffix.lower() in IMAGE_ENDINGS else path
-    return str(path if folders else path.name).lower()
+    key = str(path if folders else path.name).replace("/", "_").lower()
+    return key if padded else re.sub(r"(?<!\d)0+(?=\d)", "", key)
 
 
 @dataclass(frozen=True, eq=False)

@@ -304,3 +304,30 @@ def test_affixes_that_views_share_are_stripped(form):
     views = ["cam/k-012.color.png", "cam/k-004.color.png", "cam/k-001.color.png"]
     found = match_pictures([form.format(n) for n in ("001", "012")], views)
     assert (found.rule, found.picture_of) == ("name", (1, None, 0))
+
+
+@pytest.mark.parametrize(
+    ("pictures", "views", "others"),
+    [
+        # Another camera's of a rig, in folders and flat.
+        ("cam1/{}.png", "cam0/{}.jpg", "cam1/{}.jpg"),
+        ("cam1_{}.png", "cam0/{}.jpg", "cam1/{}.jpg"),
+        # Numbers without the zeros in front, of other views and of none.
+        ("{}.png", "f_00{}5.jpg", "f_000{}.jpg"),
+        ("{}7.png", "f_00{}5.jpg", "f_000{}.jpg"),
+        # Taken 0.4 s apart.
+        ("140{}.25.png", "140{}.65.png", "{}"),
+    ],
+)
+def test_pictures_of_other_views_and_times_stand_for_none(pictures, views, others):
+    names = [[form.format(n) for n in (2, 4, 7)] for form in (pictures, views, others)]
+    with pytest.raises(OptionError, match="--match order"):
+        match_pictures(names[0], names[1], others=names[2])
+    assert match_pictures(names[0], names[1], rule="order").picture_of == (0, 1, 2)
+
+
+def test_numbers_without_zeros_and_folders_that_are_joined_find_their_views():
+    found = match_pictures(["4.png", "12.png"], ["f_0012.jpg", "f_0004.jpg"], others=["f_0000.jpg"])
+    assert (found.rule, found.picture_of) == ("name", (1, 0))
+    found = match_pictures(["b_1.png", "a_1.png"], ["a/1.jpg", "b/1.jpg"])
+    assert (found.rule, found.picture_of) == ("name", (1, 0))
