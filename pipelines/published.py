@@ -52,6 +52,8 @@ class Published:
         template = source or self.host
         if "://" not in template:
             return str(Path(template) / self.place)
+        if not re.match("https?://[^/]", template):
+            raise OptionError(f"--from {source}; expected https://, http:// or a folder")
         if "{" not in template:
             return f"{template.rstrip('/')}/{quote(self.place)}"
         try:
@@ -202,9 +204,9 @@ def fetch(
 
     What an interrupted attempt has left is continued.
     """
-    make_folder(to)
     absent = []
     for file in files:
+        file.address(source)  # refused before anything is made
         target = to / file.place
         if not target.exists():
             absent.append(file)
@@ -212,6 +214,7 @@ def fetch(
             raise CheckpointError(f"{target}: is there, and is {wrong}; remove it and fetch again")
         else:
             say(f"{file.place}: is there already")
+    make_folder(to)
     total = sum(file.size for file in absent)
     check_space(to, total - sum(min(_size(_part(to, f)), f.size) for f in absent))
     done = 0
@@ -337,8 +340,6 @@ def _opened(address: str, have: int, version: str) -> Iterator[_Answer]:
             file.seek(have)
             yield _Answer(file, have, path.stat().st_size)
         return
-    if not address.startswith(("https://", "http://")):
-        raise OptionError(f"--from {address}; expected https://, http:// or a folder")
     asked = {"Accept-Encoding": "identity", "User-Agent": "gvtools"}
     if have:
         asked["Range"] = f"bytes={have}-"

@@ -290,7 +290,7 @@ def pack(
             continue
         step = max(1, len(records) // RECORDS)
         kept = [*records[:-1][::step], records[-1]]
-        lines = (json.dumps({k: _short(v) for k, v in line.items()}) for line in kept)
+        lines = (json.dumps({k: float(f"{v:.5g}") for k, v in line.items()}) for line in kept)
         write_text(out / f"log_{stage}.jsonl", "\n".join(lines) + "\n")
         if (training / stage / SETTINGS).exists():
             settings = read_json(training / stage / SETTINGS)
@@ -322,12 +322,3 @@ def _pack_folder(source: Path, out: Path, *, dtype: str, text_encoder: Path | No
                 write_empty_prompt(text_encoder, new)
     save_pretrained(model, out, dtype=dtype, about="packed")
     return source
-
-
-def packed_bytes(folder: Path) -> int:
-    """Of the model's own files."""
-    return sum((folder / name).stat().st_size for name in (CONFIG_FILE, WHOLE_FILE))
-
-
-def _short(value: float) -> float:
-    return float(f"{value:.5g}")

@@ -57,7 +57,7 @@ def to_json(value: Any) -> Any:
 def from_json(kind: type[T], data: Any, *, where: str = "config") -> T:
     """A configuration of ``kind`` from what ``to_json`` gave; absent keys have their defaults."""
     if not isinstance(data, Mapping):
-        raise OptionError(f"{where} = {data!r}; expected an object of fields ({kind.__name__})")
+        raise OptionError(f"{where} = {data!r:.60}; expected an object of fields ({kind.__name__})")
     hints = get_type_hints(kind)
     names = [entry.name for entry in fields(kind)]  # type: ignore[arg-type]
     for key in data:
@@ -78,18 +78,18 @@ def _value(kind: Any, data: Any, where: str) -> Any:
         return _value(rest[0], data, where)
     if origin is tuple:
         if not isinstance(data, (list, tuple)):
-            raise OptionError(f"{where} = {data!r}; expected a list")
+            raise OptionError(f"{where} = {data!r:.60}; expected a list")
         if len(arguments) == 2 and arguments[1] is Ellipsis:
             return tuple(_value(arguments[0], entry, where) for entry in data)
         if len(data) != len(arguments):
-            raise OptionError(f"{where} = {data!r}; expected {len(arguments)} entries")
+            raise OptionError(f"{where} = {data!r:.60}; expected {len(arguments)} entries")
         return tuple(_value(k, entry, where) for k, entry in zip(arguments, data, strict=True))
     if is_dataclass(kind):
         return from_json(kind, data, where=where)  # type: ignore[arg-type]
     if kind is float and type(data) is int:
         return float(data)
     if type(data) is not kind:
-        raise OptionError(f"{where} = {data!r}; expected {getattr(kind, '__name__', kind)}")
+        raise OptionError(f"{where} = {data!r:.60}; expected {getattr(kind, '__name__', kind)}")
     if kind is float and not math.isfinite(data):
         raise OptionError(f"{where} = {data!r}; expected a finite number")
     return data

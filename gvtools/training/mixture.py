@@ -33,7 +33,7 @@ def with_data(
 ) -> tuple[TrainingSettings, tuple[MixedDataSet, ...]]:
     """The training on what of the mixture lies in ``root``, all of its samples, and what does."""
     if not root.is_dir():
-        raise OptionError(f"--data {root}: no such folder; expected downloads, as {root}/hypersim")
+        raise OptionError(f"--data {root}: not a folder; expected downloads, as {root}/hypersim")
     whole = with_file(TrainingSettings(), MIXTURE).data
     used: list[SceneSource] = []
     notes = {}

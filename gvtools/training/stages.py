@@ -19,7 +19,6 @@ from torch import Tensor, nn
 
 from gvtools.completers.geoverse.composition import compose
 from gvtools.completers.geoverse.flow import (
-    Velocity,
     clean_from_velocity,
     fast_loss,
     guide,
@@ -191,11 +190,17 @@ class ReflowStage(Stage):
         """The loss, and its terms for the log."""
         model, options, flow = self.model, self.options, self.model.config.flow
         # Once for both: the encoder and the video model are frozen. What takes their features in is
-        # not, so that the teacher's is by its own weights.
+        # not, so that the teacher's is by its own weights, with guidance if that is asked for.
         seed = draws.seeds("video", batch.images.shape[1])
         video = model.video_features(batch.views, seed=seed)
         prepared = model.prepare(batch.views, video=video)
-        taught = self._teacher[0].with_video(prepared, video)
+        teacher, scale = self._teacher[0], options.cfg_scale
+        taught = teacher.with_video(prepared, video)
+        taught = taught if scale == 1 else teacher.without_and_with_cameras(taught)
+
+        def velocity(state: Tensor, t: Tensor) -> Tensor:
+            return teacher.velocity1(taught, state, t, least=TEACHER_LEAST_TIME)
+
         _, clean = model.clean_latents(batch.true_views)
         bounds = options.bounds or flow.level1
         intervals, t = interval_times(
@@ -203,7 +208,7 @@ class ReflowStage(Stage):
         )
         noise = draws.normal("eps", clean.shape, clean.device)
         pair = reflow_pair(
-            self._teacher_velocity(taught),
+            guide(velocity, scale),
             clean,
             noise,
             intervals=intervals,
@@ -213,23 +218,10 @@ class ReflowStage(Stage):
             shift=flow.shift,
         )
         reflow = self._error(prepared, pair.state, pair.t, velocity=pair.velocity)
-        state, time, velocity = self.noisy_state(clean, noise, draws.uniform("t", 1))
-        matching = self._error(prepared, state, time, velocity=velocity)
+        state, time, wanted = self.noisy_state(clean, noise, draws.uniform("t", 1))
+        matching = self._error(prepared, state, time, velocity=wanted)
         total = fast_loss(reflow, matching, rho=options.rho)
         return total, {"reflow": reflow, "flow": matching}
-
-    def _teacher_velocity(self, prepared: Prepared) -> Velocity:
-        """The teacher's velocity (state, t), with classifier-free guidance if that is asked for."""
-        teacher, scale = self._teacher[0], self.options.cfg_scale
-
-        def velocity(conditions: Prepared) -> Velocity:
-            return lambda state, t: teacher.velocity1(
-                conditions, state, t, least=TEACHER_LEAST_TIME
-            )
-
-        if scale == 1:
-            return velocity(prepared)
-        return guide(velocity(prepared), velocity(teacher.without_cameras(prepared)), scale)
 
     def _error(self, prepared: Prepared, state: Tensor, t: Tensor, *, velocity: Tensor) -> Tensor:
         """The loss of the student's velocity at a state, against the given one."""

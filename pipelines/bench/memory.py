@@ -77,11 +77,7 @@ class LiveBytes(TorchDispatchMode):
         self, func: Any, types: Any, args: Any = (), kwargs: Any = None
     ) -> Any:
         """Run an operation and count what it created."""
-        kwargs = kwargs or {}
-        try:
-            out = func(*args, **kwargs)
-        except (DataDependentOutputException, DynamicOutputShapeException):
-            out = _supposed(func, *args, **kwargs)
+        out = run_without_numbers(func, *args, **(kwargs or {}))
         for leaf in tree_leaves(out):
             if isinstance(leaf, Tensor):
                 self._hold(leaf)
@@ -153,6 +149,14 @@ def alone(run: Callable[..., Any], *given: Any, **named: Any) -> Any:
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, mp_context=context) as pool:
         return pool.submit(run, *given, **named).result()
+
+
+def run_without_numbers(func: Any, *args: Any, **kwargs: Any) -> Any:
+    """What an operation gives, on whatever tensors."""
+    try:
+        return func(*args, **kwargs)
+    except (DataDependentOutputException, DynamicOutputShapeException):
+        return _supposed(func, *args, **kwargs)
 
 
 def _supposed(func: Any, *args: Any, **kwargs: Any) -> Any:
@@ -302,7 +306,7 @@ def _inference(options: CompleteOptions, config: GeoVerseConfig) -> list[dict[st
     """A row for each stage of a pass."""
     dtype = options.compute_type
     with fake_tensors():
-        model = _model(config)
+        model = model_without_numbers(config)
         model.hold_in(dtype)
         steps = (options.steps, options.cascade_steps)
         peaks = pass_peaks(model, _views(options, config), steps=steps, dtype=dtype)
@@ -328,7 +332,7 @@ def _training(
     """A step of one sample; the video prior stays on the card."""
     dtype = _trained_type(options)
     with fake_tensors():
-        model = _model(config)
+        model = model_without_numbers(config)
         views = _views(options, config)
         batch = TrainingBatch(views, torch.rand_like(views.images), 1 + views.depth)
         optimizer = OptimizerOptions(batch=1, precision=name_of(dtype), recompute=recompute)
@@ -356,7 +360,8 @@ def _views(options: CompleteOptions, config: GeoVerseConfig) -> ViewBatch:
     return random_views(size, context=options.context, targets=options.targets)
 
 
-def _model(config: GeoVerseConfig) -> GeoVerse:
+def model_without_numbers(config: GeoVerseConfig) -> GeoVerse:
+    """With its video prior; called within ``fake_tensors``."""
     model = GeoVerse(config).eval()
     if config.video is not None:
         model.attach_video(random_video(config.video))

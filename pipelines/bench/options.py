@@ -23,7 +23,7 @@ class CompleteOptions(Settings):
 
     section = "bench complete"
 
-    config: Literal["tiny", "base"] | None = None
+    config: Literal["tiny", "base", "gld"] | None = None
     """Of random weights; none for the weights' own, tiny without weights."""
     weights: Path | None = None
     """Folder of a model; none for random numbers."""
@@ -41,7 +41,7 @@ class CompleteOptions(Settings):
     """Auto takes a GPU where there is one."""
     precision: Literal["float32", "bfloat16", "float16"] | None = None
     """Of products; none for what the device computes in: float32 on a CPU, bfloat16 on a GPU,
-    float16 on one before compute capability 8.0; for a prediction of memory bfloat16."""
+    float16 on one before compute capability 8.0; for a prediction bfloat16."""
     video: bool | None = None
     """Run the video prior, 15 GB of weights; none: on a GPU, where the configuration has one."""
     repeat: Count = 9
@@ -50,6 +50,8 @@ class CompleteOptions(Settings):
     """Compile the denoisers and the RGB head first: needs a C++ compiler and most of a minute."""
     memory: bool = False
     """Predict the peak memory of a pass and of a training step, by stage; runs nothing."""
+    predict: bool = False
+    """Predict the time of a pass on six kinds of GPU, by stage; runs nothing."""
     card: float | None = Field(None, gt=0)
     """Memory of a card: say what of the predicted memory fits it. [GB]"""
 
@@ -75,8 +77,8 @@ class CompleteOptions(Settings):
             )
         if self.card is not None and not self.memory:
             raise OptionError("bench complete: --card is of --memory; give both")
-        if self.memory and self.compile:
-            raise OptionError("bench complete: --compile, and --memory runs nothing")
+        if self.memory + self.predict + self.compile > 1:
+            raise OptionError("bench complete: expected one of --memory, --predict and --compile")
         if self.device == "cuda" and self.place.type != "cuda":
             raise OptionError("bench complete: --device cuda, and torch sees no CUDA device here")
         config = self.network()
@@ -114,7 +116,7 @@ class CompleteOptions(Settings):
         """Of products."""
         from gvtools.networks.compute import inference_type, named_type
 
-        if self.memory:
+        if self.memory or self.predict:
             return named_type(self.precision or "bfloat16")
         return inference_type(self.precision or "auto", self.place)
 

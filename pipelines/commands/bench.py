@@ -26,7 +26,7 @@ POINTS = {"fuse": 3_200_000, "splat": 4_000_000}
 COMPLETE = {
     name: name
     for name in ("config", "weights", "size", "context", "targets", "steps", "cascade_steps",
-                 "device", "precision", "video", "compile", "memory", "card")
+                 "device", "precision", "video", "compile", "memory", "predict", "card")
 }  # fmt: skip
 
 
@@ -37,6 +37,7 @@ class BenchCommand(Arguments):
         "gvtools bench splat --repeat 15 --json splat.json",
         "gvtools bench complete --config base",
         "gvtools bench complete --config base --memory --card 24",
+        "gvtools bench complete --config base --predict",
     )
     positional = ("what",)
 
@@ -96,6 +97,11 @@ def _run_complete(args: BenchCommand, given: dict[str, Any], console: Console) -
         figures = memory_figures(chosen)
         rows = len(figures["inference"]) + len(figures["training"])
         tables = show_memory
+    elif chosen.predict:
+        from pipelines.bench.prediction import prediction_figures, show_prediction
+
+        figures = prediction_figures(chosen)
+        rows, tables = len(figures["results"]), show_prediction
     else:
         figures = complete_figures(chosen)
         rows, tables = len(figures["results"]), show

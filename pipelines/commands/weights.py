@@ -206,10 +206,12 @@ class PackWeights(Arguments):
     """Wan's, for a video prior without the empty prompt; never needed again. [DIR|FILE]"""
 
     def run(self, console: Console) -> None:
-        from pipelines.weights import pack, packed_bytes, size_text
+        from gvtools.completers.geoverse.weights import WHOLE_FILE
+        from pipelines.weights import pack, size_text
 
         source = pack(self.source, self.folder, dtype=self.dtype, text_encoder=self.text_encoder)
-        console.line(f"{self.folder}: {size_text(packed_bytes(self.folder))}, from {source}")
+        size = (self.folder / WHOLE_FILE).stat().st_size
+        console.line(f"{self.folder}: {size_text(size)}, from {source}")
 
 
 class TruncateWan(Arguments):

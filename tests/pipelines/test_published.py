@@ -211,6 +211,7 @@ def test_a_folder_that_holds_something_else_is_left_alone(server, tmp_path):
     ("source", "error", "message"),
     [
         ("file:///etc", OptionError, "expected https://, http:// or a folder"),
+        ("https://", OptionError, "--from https://; expected https://, http:// or a folder"),
         ("http://127.0.0.1:9/{nothing}", OptionError, r"\{revision\} and \{path\} may stand"),
         ("/nowhere", CheckpointError, "no /nowhere/checkpoints/da3_level1.pt; expected the folder"),
         ("http://127.0.0.1:9", CheckpointError, "refused.*0 of 300,000 bytes are kept"),
@@ -218,8 +219,8 @@ def test_a_folder_that_holds_something_else_is_left_alone(server, tmp_path):
 )
 def test_a_source_that_is_none(server, tmp_path, source, error, message):
     with pytest.raises(error, match=message):
-        fetch(ALL, tmp_path, source=source)
-    assert held(tmp_path) == {}
+        fetch(ALL, tmp_path / "to", source=source)
+    assert held(tmp_path) == {} and (error is not OptionError or not (tmp_path / "to").exists())
 
 
 def test_free_space_is_looked_at_first(server, tmp_path):

@@ -71,7 +71,7 @@ def test_what_is_there_is_trained_on_by_its_share(downloads):
 def test_it_does_not_begin_without_scenes(downloads, tmp_path, capsys):
     words = ["train", "base", "--out", str(tmp_path / "out")]
     assert "--rooms for drawn rooms alone" in refused(capsys, *words)
-    assert "no such folder" in refused(capsys, *words, "--data", str(tmp_path / "absent"))
+    assert "not a folder" in refused(capsys, *words, "--data", str(tmp_path / "absent"))
     both = refused(capsys, *words, "--data", str(downloads), "--rooms")
     assert "--data and --rooms: expected one" in both
     for name in ("gtasfm", "virtualkitti"):

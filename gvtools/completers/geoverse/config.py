@@ -18,12 +18,14 @@ from gvtools.completers.geoverse.refiner import RefinerConfig
 from gvtools.completers.geoverse.rgb_head import RGBHeadConfig
 from gvtools.completers.geoverse.video_injection import ControlConfig, SharedAttentionConfig
 from gvtools.completers.geoverse.video_prior import VideoPriorConfig
+from gvtools.completers.geoverse.wan import MOST_BLOCKS
 from gvtools.errors import CheckpointError, OptionError
 from gvtools.networks.config_json import check_choice, check_range, from_json, to_json
 from gvtools.networks.depth_anything.network import DepthAnythingConfig
 from gvtools.untrusted import read_json
 
 NAMES = ("base", "gld", "tiny")
+MOST_PIXELS = 4096  # see ``MOST_BLOCKS``
 
 
 @dataclass(frozen=True)
@@ -142,7 +144,12 @@ class GeoVerseConfig:
         if self.video is not None:
             self._check_layers(len(self.video.taps))
         check_range("geometry.encoder.patch", encoder.patch, ge=1)
-        check_range("image_size", self.image_size, ge=encoder.patch)
+        check_range("image_size", self.image_size, ge=encoder.patch, le=MOST_PIXELS)
+        networks = {"geometry.encoder": encoder, "rgb": self.rgb, "level1": self.level1}
+        for name, network in (networks | {"cascade": self.cascade}).items():
+            blocks = getattr(network, "depth", 0) + getattr(network, "head_depth", 0)
+            check_range(f"blocks of {name}", blocks, le=MOST_BLOCKS)
+        check_range("geometry.camera_depth", self.geometry.camera_depth, le=MOST_BLOCKS)
         check_range("views", self.views, ge=2)
         check_range("context", self.context, ge=1)
         check_range("decode_views", self.decode_views, ge=1)

@@ -152,18 +152,19 @@ def velocity_from_clean(
     return ((state - clean) / time).to(state.dtype)
 
 
-def guide(velocity: Velocity, unconditional: Velocity | None, scale: float) -> Velocity:
-    """Classifier-free guidance u = unconditional + scale (conditional - unconditional)."""
+def guide(both: Velocity, scale: float) -> Velocity:
+    """Classifier-free guidance u = unconditional + scale (conditional - unconditional).
+
+    ``both`` takes every sample twice, in one batch: all without the condition, then all with it;
+    at a scale of 1 once, with it.
+    """
     check_range("cfg_scale", scale, ge=0, lt=math.inf)
     if scale == 1:
-        return velocity
-    if unconditional is None:
-        raise OptionError(f"cfg_scale {scale:g} needs an unconditional velocity; set it to 1")
-    without = unconditional
+        return both
 
     def combined(state: Tensor, t: Tensor) -> Tensor:
-        base = without(state, t)
-        return base + scale * (velocity(state, t) - base)
+        without, given = both(torch.cat((state, state)), torch.cat((t, t))).chunk(2)
+        return without + scale * (given - without)
 
     return combined
 
@@ -199,14 +200,10 @@ def sample(
     noise: Tensor,  # (B, ...), the state at t = 1
     bounds: Sequence[float],  # K + 1 times, see ``check_bounds``; the last is 0 in GeoVerse
     *,
-    # The network without the condition that ``cfg_scale`` is to strengthen.
-    unconditional: Velocity | None = None,
-    cfg_scale: float = 1.0,  # of classifier-free guidance, 1 = none, see ``guide``
     callback: Callable[[int, Tensor, Tensor], None] | None = None,
 ) -> Tensor:  # The state (B, ...) at the last bound
     """From noise to clean with one Euler step an interval."""
-    step = guide(velocity, unconditional, cfg_scale)
-    return integrate(step, noise, check_bounds(bounds), callback=callback)
+    return integrate(velocity, noise, check_bounds(bounds), callback=callback)
 
 
 def view_seed(seed: int, *names: int | str) -> int:

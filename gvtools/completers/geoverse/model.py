@@ -13,8 +13,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, replace
-from typing import cast
+from dataclasses import dataclass, is_dataclass, replace
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -32,9 +32,9 @@ from gvtools.completers.geoverse.conditioning import (
 from gvtools.completers.geoverse.config import GeoVerseConfig
 from gvtools.completers.geoverse.denoiser import Conditions, Denoiser, Positions, VideoKeys
 from gvtools.completers.geoverse.flow import (
-    Velocity,
     check_bounds,
     drawn_noise,
+    guide,
     over_state,
     sample,
     velocity_from_clean,
@@ -265,6 +265,12 @@ class GeoVerse(nn.Module):
         video: VideoFeatures | None = None,  # of the attached prior when None
     ) -> Prepared:
         """Everything that the denoising steps share, computed once: Eq. 1, cameras, video."""
+        if video is None:
+            video = self.video_features(batch, seed=seed)
+        return self.with_video(self.encoded(batch), video)
+
+    def encoded(self, batch: ViewBatch) -> Prepared:
+        """What does not come from the video prior."""
         config = self.config
         with self.clock(HINTS):
             source = batch
@@ -286,10 +292,7 @@ class GeoVerse(nn.Module):
                 depth = torch.cat((depth[:, :, :1], source.valid.to(depth.dtype)), dim=2)
             conditions = Conditions(hints.level1, camera, depth=depth)
             grid = (hints.level1.shape[-2], hints.level1.shape[-1])
-            prepared = Prepared(batch, hints, conditions, Positions(config.level1, camera, grid))
-        if video is None:
-            video = self.video_features(source, seed=seed)
-        return self.with_video(prepared, video)
+            return Prepared(batch, hints, conditions, Positions(config.level1, camera, grid))
 
     def video_features(
         self, batch: ViewBatch, *, seed: int | Sequence[Sequence[int]] = 0
@@ -364,16 +367,13 @@ class GeoVerse(nn.Module):
         # The floor is for training. A step from t goes (t - next) / t of the way to the clean
         # latents, however small t is; with the floor, short last steps would leave noise behind.
         least = min(flow.least_time, tau[-2])
+        known = prepared if scale == 1 else self.without_and_with_cameras(prepared)
 
-        def velocity(known: Prepared) -> Velocity:
-            def at(state: Tensor, t: Tensor) -> Tensor:
-                with self.clock(LEVEL1):
-                    return self.velocity1(known, state, t, least=least)
+        def velocity(state: Tensor, t: Tensor) -> Tensor:
+            with self.clock(LEVEL1):
+                return self.velocity1(known, state, t, least=least)
 
-            return at
-
-        without = None if scale == 1 else velocity(self.without_cameras(prepared))
-        return sample(velocity(prepared), noise, tau, unconditional=without, cfg_scale=scale)
+        return sample(guide(velocity, scale), noise, tau)
 
     def sample0(
         self,
@@ -389,23 +389,18 @@ class GeoVerse(nn.Module):
             return torch.zeros_like(level1)
         cascade, flow = self.cascade, self.config.flow
 
-        def velocity(known: Conditions) -> Velocity:
-            positions = Positions(cascade.config, known.camera, prepared.grid)
-
-            def at(state: Tensor, t: Tensor) -> Tensor:
-                with self.clock(LEVEL0):
-                    return cascade(state, t, known, positions=positions)
-
-            return at
-
-        conditions = self.cascade_conditions(prepared, level1)
-        scale, without = flow.cascade_cfg_scale if cfg_scale is None else cfg_scale, None
+        known = self.cascade_conditions(prepared, level1)
+        scale = flow.cascade_cfg_scale if cfg_scale is None else cfg_scale
         if scale != 1:
             # As GLD's evaluation runs its cascade: poses are dropped, intrinsics kept.
-            camera = conditions.camera.unconditional("old")
-            without = velocity(replace(conditions, camera=camera))
-        bounds = bounds or flow.cascade
-        return sample(velocity(conditions), noise, bounds, unconditional=without, cfg_scale=scale)
+            known = joined(replace(known, camera=known.camera.unconditional("old")), known)
+        positions = Positions(cascade.config, known.camera, prepared.grid)
+
+        def velocity(state: Tensor, t: Tensor) -> Tensor:
+            with self.clock(LEVEL0):
+                return cascade(state, t, known, positions=positions)
+
+        return sample(guide(velocity, scale), noise, bounds or flow.cascade)
 
     def cascade_conditions(self, prepared: Prepared, level1: Tensor) -> Conditions:
         """Clean context level 0, level 1 of all views, cameras: the conditions of Eq. 3."""
@@ -468,6 +463,12 @@ class GeoVerse(nn.Module):
             keys=self._keys(prepared.video, camera, prepared.grid),
         )
 
+    def without_and_with_cameras(self, prepared: Prepared) -> Prepared:
+        """Every sample twice in a batch, for ``velocity1`` under ``guide``."""
+        twice: Prepared = joined(self.without_cameras(prepared), prepared)
+        positions = Positions(self.config.level1, twice.level1.camera, prepared.grid)
+        return replace(twice, positions=positions)
+
     @torch.no_grad()
     def clean_latents(self, batch: ViewBatch) -> tuple[Tensor, Tensor]:
         """Level-0 and level-1 latents, (B, V, C, h, w) each, of true pictures of all views."""
@@ -483,12 +484,9 @@ class GeoVerse(nn.Module):
         nothing = torch.zeros_like(images[:, :, :1])
         pose = torch.eye(4, device=picture.device).expand(1, 2, 4, 4)
         batch = ViewBatch(images, nothing, nothing == 0, pose, K.expand(1, 2, 3, 3), 1)
-        with_video, self.without_video = self.without_video, True
-        try:
-            prepared = self.prepare(batch)
-        finally:
-            self.without_video = with_video
-        return self.decode(prepared, *self.clean_latents(batch), targets_alone=True).rgb[:, 0]
+        return self.decode(self.encoded(batch), *self.clean_latents(batch), targets_alone=True).rgb[
+            :, 0
+        ]
 
     def velocity_wanted(self, velocity: Tensor, t: Tensor) -> Tensor:
         """The target of ``velocity1`` at ``t`` where ``velocity`` (B, V, C, h, w) is right.
@@ -500,6 +498,19 @@ class GeoVerse(nn.Module):
         if flow.prediction == "velocity":
             return velocity
         return velocity * over_state((t / flow.least_time).clamp(max=1), velocity)
+
+
+def joined(first: Any, second: Any) -> Any:
+    """One batch of two, in whatever holds tensors (B, ...)."""
+    if isinstance(first, Tensor) and first.ndim:
+        return torch.cat((first, second))
+    if isinstance(first, (list, tuple)):
+        return type(first)(map(joined, first, second))
+    if isinstance(first, dict):
+        return {key: joined(value, second[key]) for key, value in first.items()}
+    if is_dataclass(first):
+        return replace(first, **joined(vars(first), vars(second)))  # type: ignore[type-var]
+    return first
 
 
 def empty_model(config: GeoVerseConfig, *, where: object) -> GeoVerse:

@@ -241,6 +241,8 @@ class VideoPrior:
         vae = load_network(Path(folder), "vae", device=str(device))
         prior = cls(transformer, vae, prompt, config=config)
         prior._guest = guest
+        if guest is not None:
+            prior.networks.pin()
         return prior
 
     @property

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,9 +25,12 @@ from torch import Tensor, nn
 
 from gvtools.errors import CheckpointError
 from gvtools.networks.compute import constant, on_device
+from gvtools.networks.config_json import check_range
 from gvtools.networks.tensors import Shapes, TensorFiles, check_fit, shapes, shapes_alone
 from gvtools.untrusted import read_json
 
+# More is no model, but a file that keeps a machine busy.
+MOST_BLOCKS = 1000
 # Pictures that the VAE encodes at once on a GPU: a pass of base still fits a card of 24 GB.
 AT_ONCE = 2
 STRIDE = 8  # pixels of a latent's edge
@@ -96,21 +99,27 @@ class WanNetworks:
         self.transformer.to(device)
         self.vae.to(device)
 
+    def _tensors(self) -> list[Tensor]:
+        networks = (self.transformer, self.vae)
+        return [tensor for n in networks for tensor in (*n.parameters(), *n.buffers())]
+
+    def pin(self) -> None:
+        """Lock the weights in the host's memory as far as it lets, for cards to fetch sooner."""
+        with suppress(RuntimeError):
+            for tensor in self._tensors():
+                tensor.data = tensor.data.pin_memory()
+
     @contextmanager
     def lent(self, device: torch.device | None) -> Iterator[None]:
         """On another device within the block, where only copies go: nothing is brought back."""
         if device is None or device == self.device:
             yield
             return
-        tensors = [
-            tensor
-            for network in (self.transformer, self.vae)
-            for tensor in (*network.parameters(), *network.buffers())
-        ]
+        tensors = self._tensors()
         home = [tensor.data for tensor in tensors]
         try:
             for tensor in tensors:
-                tensor.data = tensor.data.to(device)
+                tensor.data = tensor.data.to(device, non_blocking=True)
             yield
         finally:
             for tensor, data in zip(tensors, home, strict=True):
@@ -276,6 +285,8 @@ def empty_network(component: str, config: Mapping[str, Any]) -> nn.Module:
     """A network of a diffusers config, on the meta device: shapes, no numbers, no memory."""
     kind = network_class(component)
     try:
+        for name in ("num_layers", "num_res_blocks"):
+            check_range(name, config.get(name), le=MOST_BLOCKS)
         with shapes_alone():
             network: nn.Module = kind.from_config(dict(config))
     except Exception as error:

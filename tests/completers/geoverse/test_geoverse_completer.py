@@ -335,7 +335,7 @@ def test_predicted_rays_come_back_to_the_world(weights, monkeypatch, world):
 
 def test_steps_and_the_scale_of_guidance_are_the_options(weights, monkeypatch):
     calls: list[float] = []
-    after(monkeypatch, lambda v, p, state, t, **_: calls.append(float(t[0])), of="velocity1")
+    after(monkeypatch, lambda v, p, state, t, **_: calls.extend(t.tolist()), of="velocity1")
     context, known = micro.context_views(1), micro.guidance(1)
     for options, times in (
         ({}, [1, 2 / 3, 1 / 3]),

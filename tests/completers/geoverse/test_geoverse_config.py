@@ -59,10 +59,20 @@ def test_settings_of_a_pass_outside_their_range_are_refused(field, refused, take
 
 def test_wrong_ranges_in_a_file_are_refused():
     data = to_json(named("tiny"))
-    for part, key, value in (("flow", "shift", 0.0), ("camera", "reference", 8)):
+    for part, key, value, said in (
+        ("flow", "shift", 0.0, r"flow\.shift"),
+        ("camera", "reference", 8, r"camera\.reference"),
+        # They would be built for hours before anything is compared.
+        ("level1", "depth", 10**8, "blocks of level1 100000002; expected at most 1000"),
+        ("rgb", "depth", 10**8, "blocks of rgb 100000000; expected"),
+    ):
         changed = {**data, part: {**data[part], key: value}}
-        with pytest.raises(OptionError, match=rf"{part}\.{key}"):
+        with pytest.raises(OptionError, match=said):
             from_json(GeoVerseConfig, changed)
+    with pytest.raises(OptionError, match="image_size 12000000; expected at least 12 and at most"):
+        from_json(GeoVerseConfig, {**data, "image_size": 12_000_000})
+    with pytest.raises(OptionError, match=r"^config = .{60}; expected an object"):
+        from_json(GeoVerseConfig, [data] * 1000)
 
 
 @pytest.mark.usefixtures("one_thread")

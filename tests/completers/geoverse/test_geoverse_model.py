@@ -407,12 +407,11 @@ def test_both_levels_are_sampled_with_guidance_along_its_grid():
 
         def velocity(x, t):
             calls.append(float(t[0]))
-            return network(x, t, conditions, positions=positions)
+            given = network(x, t, conditions, positions=positions)
+            bare = network(x, t, without, positions=elsewhere)
+            return bare + 1.5 * (given - bare)
 
-        found = sample(
-            velocity, noise, times, cfg_scale=1.5,
-            unconditional=lambda x, t: network(x, t, without, positions=elsewhere),
-        )  # fmt: skip
+        found = sample(velocity, noise, times)
         assert calls == pytest.approx(times[:-1])
         return found
 
@@ -422,13 +421,35 @@ def test_both_levels_are_sampled_with_guidance_along_its_grid():
 
     level1 = run(model.level1, prepared.level1, dropped="new", times=FLOW.level1,
                  noise=noise("level1"))  # fmt: skip
-    torch.testing.assert_close(made.level1, level1)
+    torch.testing.assert_close(made.level1, level1, rtol=1e-5, atol=1e-5)
     conditions = model.cascade_conditions(prepared, level1)
     level0 = run(model.cascade, conditions, dropped="old", times=FLOW.cascade,
                  noise=noise("level0"))  # fmt: skip
-    torch.testing.assert_close(made.level0, level0)
+    torch.testing.assert_close(made.level0, level0, rtol=1e-5, atol=1e-5)
     plain = model.generate(views, seed=3, cascade_cfg_scale=1.0)
     assert torch.equal(plain.level1, made.level1) and not torch.equal(plain.level0, made.level0)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("injection", ["none", "control", "shared"])
+def test_guidance_in_one_batch_is_that_of_two_passes(injection):
+    flow = replace(micro.CONFIG.flow, prediction="clean", skip=True, level1=(1.0, 0.5, 0.0))
+    model = micro.model(replace(micro.config(injection=injection), flow=flow))
+    if model.shared is not None:
+        model.shared.gates.fill_(0.7)
+    video = None if injection == "none" else micro.video_features(2, 4)
+    prepared = model.prepare(micro.batch(2), video=video)
+    bare = model.without_cameras(prepared)
+    noise = torch.randn(prepared.hints.level1.shape, generator=torch.Generator().manual_seed(0))
+
+    def velocity(x, t):
+        given, without = (model.velocity1(known, x, t) for known in (prepared, bare))
+        return without + 1.5 * (given - without)
+
+    wanted = sample(velocity, noise, flow.level1)
+    found = model.sample1(prepared, noise, cfg_scale=1.5)
+    torch.testing.assert_close(found, wanted, rtol=1e-5, atol=1e-5)
+    assert float((found - model.sample1(prepared, noise)).abs().max()) > 1e-3
 
 
 def test_it_sees_the_context_and_no_projections():

@@ -374,6 +374,7 @@ def test_lent_weights_come_home_without_being_copied_back(network, monkeypatch):
 
     def copied(tensor: Tensor, *args: Any, **kwargs: Any) -> Tensor:
         if args == (torch.device("cpu", 0),):
+            assert kwargs == {"non_blocking": True}
             # Another place of the same memory stands for a device.
             moved.append(args[0])
             return tensor.clone()
@@ -394,6 +395,32 @@ def test_lent_weights_come_home_without_being_copied_back(network, monkeypatch):
     with pytest.raises(ZeroDivisionError), networks.lent(torch.device("cpu", 0)):
         _ = 1 / 0
     assert [tensor.data_ptr() for tensor in tensors] == home
+
+
+@pytest.mark.parametrize("locked", [10**6, 7])
+def test_weights_that_leave_are_locked_in_memory_as_far_as_there_is_room(
+    tmp_path, monkeypatch, network, locked
+):
+    prior = tiny.prior(network)
+    for name in ("transformer", "vae"):
+        getattr(prior.networks, name).save_pretrained(tmp_path / name)
+    given: list[Tensor] = []
+
+    def pin_memory(tensor: Tensor) -> Tensor:
+        if len(given) == locked:
+            raise RuntimeError("CUDA error: out of memory")
+        given.append(tensor.clone())
+        return given[-1]
+
+    monkeypatch.setattr(Tensor, "pin_memory", pin_memory)
+    config = replace(tiny.CONFIG, prompt="zeros")
+    there = VideoPrior.from_pretrained(tmp_path, config=config, device="cuda", offload="always")
+    tensors = there.networks._tensors()
+    pinned = {tensor.data_ptr() for tensor in given}
+    assert len(given) == min(locked, len(tensors)) and there.networks.device.type == "cpu"
+    assert sum(tensor.data_ptr() in pinned for tensor in tensors) == len(given)
+    VideoPrior.from_pretrained(tmp_path, config=config, device="cpu", offload="always")
+    assert len(given) == min(locked, len(tensors))
 
 
 @pytest.mark.parametrize(

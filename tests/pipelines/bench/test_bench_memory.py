@@ -135,7 +135,9 @@ def test_what_fits_a_card():
     ("words", "said"),
     [
         (("--card", 24), "--card is of --memory"),
-        (("--memory", "--compile"), "--memory runs nothing"),
+        (("--memory", "--compile"), "expected one of --memory"),
+        (("--memory", "--predict"), "expected one of --memory"),
+        (("--predict", "--compile"), "expected one of --memory"),
         (("--memory", "--card", 0), "more than 0"),
     ],
 )
