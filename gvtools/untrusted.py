@@ -284,25 +284,6 @@ def _unpacked(path: Path, time: int) -> Path:
     return home
 
 
-def unpack_gzip(data: bytes, most: int) -> bytes:
-    """What a gzip stream holds, which may be of so many bytes.
-
-    >>> import gzip
-    >>> unpack_gzip(gzip.compress(b"abc"), 3)
-    b'abc'
-    """
-    unpacker = zlib.decompressobj(31)
-    try:
-        found = unpacker.decompress(data, most + 1)
-    except zlib.error as error:
-        raise ValueError(f"damaged gzip stream ({error})") from None
-    if len(found) > most:
-        raise ValueError(f"{len(data)} bytes that unpack to more than {most}")
-    if not unpacker.eof:
-        raise ValueError("a gzip stream that ends early")
-    return found
-
-
 def other_version(found: object, known: int, advice: str) -> str:
     """What to do about a file of another version than the known one, older or newer.
 

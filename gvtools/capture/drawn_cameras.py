@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras, concatenate
 from gvtools.glb import drawn_nodes, glb_numbers, split_glb
-from gvtools.untrusted import open_picture, read_bytes
+from gvtools.untrusted import PIXEL_BYTES, PIXEL_RATIO, open_picture, read_bytes
 
 Float64 = NDArray[np.float64]
 
@@ -36,17 +36,21 @@ def read_drawn_cameras(
     """
     tree, body = split_glb(read_bytes(path))
     shapes: list[tuple[dict[str, Any], Float64]] = []
+    count = 0
     for node, matrix in drawn_nodes(tree):
         for part in tree["meshes"][node["mesh"]]["primitives"] if "mesh" in node else ():
             local = glb_numbers(tree, body, part["attributes"]["POSITION"]).astype(np.float64)
             shapes.append((part, local @ matrix[:3, :3].T + matrix[:3, 3]))
-            if sum(len(points) for _, points in shapes) * LEAST_BYTES > len(body):
+            count += len(local)
+            if count * LEAST_BYTES > len(body):
                 raise ValueError("nodes that draw a mesh several times")
-    drawn = [
-        _camera(quad, pyramid[1], tree=tree, body=body)
-        for quad, pyramid in pairwise(shapes)
-        if "TEXCOORD_0" in quad[0]["attributes"] and len(quad[1]) == 4
-    ]
+    drawn, pixels = list[tuple[Cameras, NDArray[np.uint8]]](), 0
+    for quad, pyramid in pairwise(shapes):
+        if "TEXCOORD_0" in quad[0]["attributes"] and len(quad[1]) == 4:
+            drawn.append(_camera(quad, pyramid[1], tree=tree, body=body))
+            pixels += drawn[-1][1].size
+            if pixels > PIXEL_BYTES + PIXEL_RATIO * len(body):
+                raise ValueError(f"pictures of {pixels} bytes in {len(body)}")
     if not drawn:
         raise ValueError("a scene to look at, in which no cameras are drawn with their pictures")
     cameras = concatenate([camera for camera, _ in drawn])
@@ -57,8 +61,8 @@ def read_drawn_cameras(
     colors = np.zeros((0, 3)) if colored is None else 255 * glb_numbers(tree, body, colored)[::step]
     points = points[::step][: len(colors)]
     view, xy = np.full(len(points), -1), np.zeros((len(points), 2))
-    places, depths = cameras.project(points)
-    for row, (place, z, picture) in enumerate(zip(places, depths, pictures, strict=True)):
+    for row, (camera, picture) in enumerate(drawn):
+        (place,), (z,) = camera.project(points)
         # Whether pixels' centres are at 0 or at 0.5.
         x, y = np.floor(place + 0.25).T
         seen = (z > 0) & (view < 0) & (x >= 0) & (y >= 0)

@@ -48,6 +48,8 @@ Float64 = NDArray[np.float64]
 DRAWN = 12
 # Loops that still miss by this (median) tell of wrong intrinsics, or of too fast a motion.
 DOUBTFUL_MM = 30.0
+# All digits of float64.
+DIGITS = "%.17g"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -204,19 +206,14 @@ def _write(
         stem = names[number][: names[number].rindex(".color.")]
         link_or_copy(frame.image, work / names[number])
         link_or_copy(frame.depth, work / f"{stem}.depth.png")
-        _save(work / f"{stem}.pose.txt", pose)
+        np.savetxt(work / f"{stem}.pose.txt", pose, fmt=DIGITS)
     options = recording.options
-    _save(work / INTRINSICS, np.asarray(options.color_K)[:3, :3])
+    np.savetxt(work / INTRINSICS, np.asarray(options.color_K)[:3, :3], fmt=DIGITS)
     names_kept = ("depth_unit", "depth_K", "color_from_depth", "distortion", "depth_max")
     sidecar = {name: getattr(options, name) for name in names_kept}
     write_json(
         work / SIDECAR, {name: value for name, value in sidecar.items() if value is not None}
     )
-
-
-def _save(path: Path, matrix: Float64) -> None:
-    """A matrix with all digits of float64."""
-    np.savetxt(path, matrix, fmt="%.17g")
 
 
 def _report(
@@ -286,12 +283,11 @@ def points_from_above(scene: Scene, keyframes: Sequence[str]) -> tuple[Cameras, 
 def _summary(rows: Float64) -> dict[str, float] | None:
     if not len(rows):
         return None
-    median, most = np.median(rows, axis=0), rows.max(axis=0)
+    figures = {"median": np.median(rows, axis=0), "max": rows.max(axis=0)}
     return {
-        "median_mm": float(median[0]),
-        "max_mm": float(most[0]),
-        "median_deg": float(median[1]),
-        "max_deg": float(most[1]),
+        f"{how}_{unit}": float(values[column])
+        for column, unit in enumerate(("mm", "deg"))
+        for how, values in figures.items()
     }
 
 
