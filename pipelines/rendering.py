@@ -215,7 +215,12 @@ WEBP_QUALITY = 80
 
 
 def film_cameras(
-    memory: SpatialMemory, path: str, *, width: int | None = None, run: Path | None = None
+    memory: SpatialMemory,
+    path: str,
+    *,
+    width: int | None = None,
+    run: Path | None = None,
+    say: Callable[[str], object] = str,
 ) -> Cameras:
     """The cameras of a film's frames, all of one even size, as video coders need it.
 
@@ -223,12 +228,12 @@ def film_cameras(
         memory: ``orbit`` and the like are computed from its observed views; the first of these
             gives intrinsics and size to paths that have none.
         width: of the frames, pixels; None keeps the cameras' width.
-        run: whose refined poses the views of a project take.
+        run: whose refined poses the views of a project take, which ``say`` tells.
     """
     views = [view.camera for view in memory.views.photographed]
     if not views:
         raise OptionError("a memory without observed views; give a run or its memory.npz")
-    cameras = _path_cameras(memory, concatenate(views), path, run=run)
+    cameras = _path_cameras(memory, concatenate(views), path, run=run, say=say)
     first = cameras[0]
     columns, rows = int(first.width[0]), int(first.height[0])
     if (cameras.width != columns).any() or (cameras.height != rows).any():
@@ -242,7 +247,12 @@ def film_cameras(
 
 
 def _path_cameras(
-    memory: SpatialMemory, captured: Cameras, path: str, *, run: Path | None
+    memory: SpatialMemory,
+    captured: Cameras,
+    path: str,
+    *,
+    run: Path | None,
+    say: Callable[[str], object],
 ) -> Cameras:
     name, _, count = path.partition(":")
     if name in PATHS:
@@ -269,7 +279,9 @@ def _path_cameras(
     cameras = read_camera_path(Path(place), captured, selection=selection)
     if cameras is None:
         scene = open_project(Path(place))
-        scene = scene if run is None else at_run_poses(scene, run)[0]
+        scene, poses = (scene, "") if run is None else at_run_poses(scene, run, memory)
+        if poses:
+            say(poses)
         cameras = scene.subset(select(scene.names, selection)).cameras
     return cameras
 

@@ -31,6 +31,7 @@ from gvtools.runs.layout import (
 )
 from gvtools.runs.poses import refined_poses_of, with_poses
 from gvtools.runs.target_files import TargetFiles, entry_camera, read_target
+from gvtools.splat_files import READERS
 from gvtools.untrusted import read_json
 
 if TYPE_CHECKING:
@@ -189,15 +190,23 @@ def load_run(path: Path | str, *, project: Path | None = None) -> Run:
     return Run(path, read_record(path), read_reports(path), project)
 
 
-def at_run_poses(scene: Scene, run: Path) -> tuple[Scene, str]:
+def at_run_poses(scene: Scene, run: Path, memory: SpatialMemory | None = None) -> tuple[Scene, str]:
     """A scene at the poses of a run of it, and what was done; "" where the run has no own poses.
 
     ``run`` is a run's folder or the memory in it. Views that it did not have move like its context
-    near them, where cameras err alike there.
+    near them, where cameras err alike there. A ``memory`` apart from its run tells other poses.
     """
     folder = run if run.is_dir() else run.parent
     poses = refined_poses_of(folder) if (folder / RECORD).is_file() else None
     if poses is None:
+        seen = memory.views.photographed if memory is not None else ()
+        for camera in (view.camera for view in seen if view.camera.names[0] in scene.names):
+            given_pose = scene[camera.names[0]].camera.cam_from_world
+            if not np.allclose(given_pose, camera.cam_from_world, rtol=1e-9, atol=1e-6):
+                return scene, (
+                    f"poses: as given, not those of the memory's views ({camera.names[0]}); if its "
+                    "run refined them, give the run's folder"
+                )
         return scene, ""
     record = read_record(folder)
     context, held = record["context"], record["targets"]
@@ -422,7 +431,7 @@ def memory_path(path: Path) -> Path:
     if path.is_file() and path.suffix.lower() not in ("", *MEMORIES):
         raise ProjectError(
             f"{path}: no memory by its suffix; expected a run's folder, or a file that ends with "
-            f"{', '.join(MEMORIES)}"
+            f"{', '.join(MEMORIES)}; view and export open more ({', '.join(READERS)})"
         )
     if path.is_file() or (path / INDEX).is_file():
         return path

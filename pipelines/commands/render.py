@@ -136,7 +136,7 @@ class RenderCommand(LensArguments, LpipsArguments, SceneArguments):
         scene, poses = None, ""
         cameras = self._path(memory) if self.cameras.is_file() else None
         if cameras is None:
-            scene, poses = at_run_poses(self.open_scene(self.cameras), self.memory)
+            scene, poses = at_run_poses(self.open_scene(self.cameras), self.memory, memory)
             cameras = scene.cameras
         if self.against_images:
             if scene is None:
@@ -238,7 +238,7 @@ class FilmCommand(LensArguments):
         if not len(memory):
             raise OptionError(f"{self.memory}: {EMPTY}")
         width = self.width if self.lens == "perspective" else None
-        cameras = film_cameras(memory, self.path, width=width, run=self.memory)
+        cameras = film_cameras(memory, self.path, width=width, run=self.memory, say=console.line)
         rig, cameras = self.rig(cameras, memory, widest=WIDEST_FRAME)
         columns, rows = rig.size if rig else (int(cameras.width[0]), int(cameras.height[0]))
         rounds = memory.rounds if self.growth else (self.round,)

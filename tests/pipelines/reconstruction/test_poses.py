@@ -15,7 +15,7 @@ from gvtools.errors import MemoryFileError
 from gvtools.poses.motions import move_pose
 from gvtools.procedural.noisy_room import jitter_poses
 from gvtools.runs.poses import RunPoses
-from gvtools.runs.run import at_run_poses, load_run
+from gvtools.runs.run import at_run_poses, load_memory, load_run
 from gvtools.scenes.project import open_project
 from pipelines.reconstruction import prepare
 
@@ -122,7 +122,7 @@ def test_a_world_whose_origin_is_far_away_is_refined_as_well(scan, whole, tmp_pa
 
 
 @pytest.mark.parametrize("depth", [0.0, 2.0])
-def test_the_project_of_a_run_is_seen_at_its_refined_poses(scan, whole, tmp_path, depth):
+def test_the_project_of_a_run_is_seen_at_its_refined_poses(scan, whole, tmp_path, capsys, depth):
     copy = tmp_path / "run"
     shutil.copytree(whole, copy)
     scene = open_project(scan)
@@ -146,3 +146,10 @@ def test_the_project_of_a_run_is_seen_at_its_refined_poses(scan, whole, tmp_path
     out = tmp_path / "out.json"
     run_command("render", copy, "--cameras", scan, "--against-images", "--json", out, quiet=True)
     assert "as refined by the run" in json.loads(out.read_text())["poses"]
+    film = tmp_path / "film.gif"
+    run_command("film", copy, "--path", f"{scan}@first:2", "--out", film)
+    assert "as refined by the run" in capsys.readouterr().out
+    # Apart from its run, a memory has poses that are not the project's.
+    alone, memory = tmp_path / "memory.npz", load_memory(whole)
+    assert at_run_poses(scene, alone, memory)[1].startswith("poses: as given, not those")
+    assert at_run_poses(at_run_poses(scene, whole)[0], alone, memory)[1] == ""
