@@ -265,9 +265,10 @@ class GeoVerse(nn.Module):
         video: VideoFeatures | None = None,  # of the attached prior when None
     ) -> Prepared:
         """Everything that the denoising steps share, computed once: Eq. 1, cameras, video."""
+        prepared = self.encoded(batch)
         if video is None:
             video = self.video_features(batch, seed=seed)
-        return self.with_video(self.encoded(batch), video)
+        return self.with_video(prepared, video)
 
     def encoded(self, batch: ViewBatch) -> Prepared:
         """What does not come from the video prior."""
