@@ -1,10 +1,7 @@
 """Meshes of a memory with vertex colours or a texture, as PLY, glTF binary or OBJ.
 
 They come from a TSDF of depth maps rendered from the memory, or from Poisson reconstruction, both
-of Open3D, in the memory's own frame, where float32 is precise. Open3D's quadric decimation goes
-through all edges in order of their cost, one at a time: triangles without area confuse that order,
-and a mesh of millions takes minutes. So a mesh is cleaned first, and where far fewer triangles are
-wanted, vertices are merged in cells before.
+of Open3D, in the memory's own frame, where float32 is precise.
 """
 
 from __future__ import annotations
@@ -220,10 +217,6 @@ def _checked(mesh: o3d.t.geometry.TriangleMesh, method: str) -> o3d.t.geometry.T
 METHODS = {"tsdf": tsdf_mesh, "poisson": poisson_mesh}
 NODE, HEADER = "gvtools_mesh", "gvtools mesh, input world frame, scene units"
 CHANNELS = ("red", "green", "blue")
-# Decimation starts from at most so many times the triangles that are wanted.
-RATIO = 8
-# Cells grow by so much until they leave few enough.
-GROWTH = 1.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -377,48 +370,34 @@ def _material(path: Path) -> str:
 
 
 def simplify(mesh: o3d.t.geometry.TriangleMesh, max_triangles: int) -> o3d.t.geometry.TriangleMesh:
-    """The mesh with at most so many triangles; as it is where it has no more."""
+    """The mesh with at most so many triangles; as it is where it has no more.
+
+    VTK, which decimates it, leaves no colours: each vertex takes that of the nearest place before.
+    """
     from gvtools.o3d import o3d
 
-    if len(mesh.triangle.indices) <= max_triangles:
+    count = len(mesh.triangle.indices)
+    if count <= max_triangles:
         return mesh
-    legacy = _clean(mesh.to_legacy())
-    legacy = _merge_vertices(legacy, RATIO * max_triangles)
-    legacy = _clean(legacy.simplify_quadric_decimation(max_triangles))
-    # Where borders keep decimation from its number, cells give it.
-    legacy = _merge_vertices(legacy, max_triangles)
-    if not len(legacy.triangles):
+    a, b, c = mesh.vertex.positions.numpy()[mesh.triangle.indices.numpy().T]
+    # VTK crashes on triangles without area.
+    whole = np.linalg.norm(np.cross(b - a, c - a), axis=1) > 0
+    mesh = mesh.select_faces_by_mask(o3d.core.Tensor(whole))
+    bare = o3d.t.geometry.TriangleMesh(mesh.vertex.positions, mesh.triangle.indices)
+    fewer = bare.simplify_quadric_decimation(max(0, 1 - max_triangles / int(whole.sum())))
+    if not len(fewer.triangle.indices):
         raise DegenerateError(
-            f"--max-triangles {max_triangles}: no triangle is left of "
-            f"{len(mesh.triangle.indices)}; expected more"
+            f"--max-triangles {max_triangles}: no triangle is left of {count}; expected more"
         )
-    return o3d.t.geometry.TriangleMesh.from_legacy(legacy)
-
-
-def _merge_vertices(mesh: o3d.geometry.TriangleMesh, most: int) -> o3d.geometry.TriangleMesh:
-    """Vertices merged in cells that grow until at most ``most`` triangles are left."""
-    if len(mesh.triangles) <= most:
-        return mesh
-    corners = np.asarray(mesh.vertices)[np.asarray(mesh.triangles)]
-    edge = float(np.median(np.linalg.norm(corners[:, 0] - corners[:, 1], axis=1)))
-    fewer = mesh
-    while len(fewer.triangles) > most:
-        fewer = _clean(mesh.simplify_vertex_clustering(edge))
-        edge *= GROWTH
+    before = o3d.t.geometry.RaycastingScene()
+    before.add_triangles(bare)
+    near = before.compute_closest_points(fewer.vertex.positions.to(o3d.core.float32))
+    corners = mesh.triangle.indices.numpy()[near["primitive_ids"].numpy()]
+    shares = near["primitive_uvs"].numpy()
+    shares = np.column_stack([1 - shares.sum(axis=1), shares])
+    colors = np.einsum("nk,nkc->nc", shares, mesh.vertex.colors.numpy()[corners])
+    fewer.vertex.colors = o3d.core.Tensor(colors.astype(np.float32))
     return fewer
-
-
-def _clean(mesh: o3d.geometry.TriangleMesh) -> o3d.geometry.TriangleMesh:
-    mesh.remove_duplicated_vertices()
-    mesh.remove_degenerate_triangles()
-    mesh.remove_duplicated_triangles()
-    corners = np.asarray(mesh.vertices)[np.asarray(mesh.triangles)]
-    area = np.linalg.norm(
-        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
-    )
-    mesh.remove_triangles_by_mask(~(area > 0))
-    mesh.remove_unreferenced_vertices()
-    return mesh
 
 
 SAVERS = {".ply": _save_ply, ".glb": _save_glb, ".obj": _save_obj}
