@@ -60,6 +60,8 @@ GLB_HEAD = 1 << 20
 LEAST_BYTES = 16
 # How many coefficients of a colour harmonics of degree 1 to 4 have above degree 0.
 RESTS = (0, 3, 8, 15, 24)
+# Who reads a USD, in a child process.
+USD = f"{__name__}:usd"
 PACKED, MODES = "packed_position", ("mip", "2dgs")
 
 
@@ -70,15 +72,17 @@ def read_splats(path: Path) -> Splats:
     if suffix not in READERS:
         raise OptionError(f"{path}: expected splats, a file that ends with {', '.join(READERS)}")
     try:
-        return READERS[suffix](regular(path))
+        with np.errstate(all="ignore"):  # what becomes no number is left out
+            return READERS[suffix](regular(path))
     except GvError as error:
         if str(path) in str(error):
             raise
         raise type(error)(f"{path}: {error}") from None
     except (ReaderError, *DAMAGED) as error:
+        said = str(error)[:200] or type(error).__name__
         raise MemoryFileError(
-            f"{path}: cannot be read as {suffix} ({error or type(error).__name__}); expected a "
-            "whole file of Gaussians; it is damaged, or of another kind; save it again"
+            f"{path}: cannot be read as {suffix} ({said}); expected a whole file of Gaussians; it "
+            "is damaged, or of another kind; save it again"
         ) from None
 
 
@@ -168,8 +172,7 @@ def _dc(colors: Any) -> NDArray[np.float64]:
 
 
 def _logarithms(sizes: Any) -> NDArray[np.float64]:
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.log(np.asarray(sizes, np.float64))
+    return np.log(np.asarray(sizes, np.float64))
 
 
 def _read_ply(path: Path) -> Splats:
@@ -463,18 +466,19 @@ def _glb_rows(
 
 def _read_usd(path: Path) -> Splats:
     require("pxr", extra="export", purpose=f"{path}: {path.suffix}")
-    parts, up = [], None
-    for facts, arrays in read_apart(f"{__name__}:usd", path):
-        up = facts.get("up", up)
-        if "values" in arrays:
-            parts.append(place_gaussians(arrays["values"], arrays["matrix"]))
-    values, center = _joined(parts)
-    return _splats(values, center=center, up=_unit(up))
+    facts, parts = zip(*read_apart(USD, path), strict=True)
+    placed = [place_gaussians(part["values"], part["matrix"]) for part in parts if "values" in part]
+    values, center = _joined(placed)
+    return _splats(values, center=center, up=_unit(facts[0].get("up")))
 
 
 def usd(path: Path) -> Iterator[Item]:
-    """Rows and frame of each ParticleField3DGaussianSplat, for ``read_apart``."""
-    from pxr import Sdf, Usd, UsdGeom, UsdVol
+    """What is up, and what each prim of Gaussians or of points holds, for ``read_apart``.
+
+    Rows and frame of each ParticleField3DGaussianSplat; positions and linear colours of each
+    UsdGeom.Points, in the file's frame.
+    """
+    from pxr import Sdf, Usd, UsdGeom
 
     yield {}, {}
     layer = Sdf.Layer.OpenAsAnonymous(str(path))
@@ -483,8 +487,16 @@ def usd(path: Path) -> Iterator[Item]:
     cache, stage = UsdGeom.XformCache(), Usd.Stage.Open(layer)
     up = layer.customLayerData.get("up") or [0, *map(float, (
         UsdGeom.GetStageUpAxis(stage) == "Y", UsdGeom.GetStageUpAxis(stage) == "Z"))]  # fmt: skip
+    yield {"up": [float(number) for number in up]}, {}
     for prim in stage.Traverse():
-        if not prim.IsA(UsdVol.ParticleField3DGaussianSplat):
+        matrix = np.array(cache.GetLocalToWorldTransform(prim)).T
+        if prim.IsA(UsdGeom.Points):
+            local = np.asarray(UsdGeom.Points(prim).GetPointsAttr().Get(), np.float64)
+            positions = local.reshape(-1, 3) @ matrix[:3, :3].T + matrix[:3, 3]
+            colors = UsdGeom.Gprim(prim).GetDisplayColorAttr().Get()
+            parts = {"positions": positions} | ({} if colors is None else {"colors": colors})
+            yield {}, {name: np.asarray(part, np.float64) for name, part in parts.items()}
+        if prim.GetTypeName() != "ParticleField3DGaussianSplat":
             continue
 
         def array(name: str, width: int, prim: Any = prim) -> NDArray[Any]:
@@ -501,8 +513,7 @@ def usd(path: Path) -> Iterator[Item]:
             np.roll(array("orientations", 4), 1, axis=1), logits=_logits(array("opacities", 1)),
             sh=array("radiance:sphericalHarmonicsCoefficients", 3 * terms),
         )  # fmt: skip
-        matrix = np.array(cache.GetLocalToWorldTransform(prim)).T
-        yield {"up": [float(number) for number in up]}, {"values": values, "matrix": matrix}
+        yield {}, {"values": values, "matrix": matrix}
 
 
 READERS: Mapping[str, Callable[[Path], Splats]] = {

@@ -16,7 +16,7 @@ from gvtools.kernels import compiled
 from gvtools.ply import point_vertices, read_header
 from gvtools.ranges import color_names, intensity_names, packed_names
 from gvtools.scans.points import CHUNK, GENERATED, Chunk, ScanFile, Station
-from gvtools.splat_files import PACKED, read_splats
+from gvtools.splat_files import holds_splats, read_splats
 
 # A number and what parts it from the next one; what one takes at most.
 LEAST_TEXT, MOST_TEXT = 2, 64
@@ -29,8 +29,6 @@ KEYS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPO
         "DATA")  # fmt: skip
 KINDS = {"F": "f", "U": "u", "I": "i"}
 SIZES = ("1", "2", "4", "8")
-# What Gaussians have for a colour, less 0.5 and over the factor, and for how opaque they are.
-SPLATS, HARMONIC = ("f_dc_0", "f_dc_1", "f_dc_2", "opacity"), 0.28209479177387814
 # What compressed points unpack to at most: LZF makes no more than 88 bytes of one, and of points
 # about two.
 MOST_RATIO, MOST_BYTES = 88, 1 << 31
@@ -130,9 +128,9 @@ def _lines(file: IO[bytes], count: int, most: int) -> Iterator[bytes]:
 
 def open_ply(path: Path) -> ScanFile:
     """A PLY, its header read: of either byte order or as text, with or without faces behind."""
-    header = read_header(path)
-    if any(PACKED in dict(item.columns) for item in header.elements):
+    if holds_splats(path):
         return open_splats(path)
+    header = read_header(path)
     vertices = point_vertices(path, header)
     layout = "rows" if header.order else "text"
     last = not any(item.count for item in header.elements if item is not vertices)
@@ -144,30 +142,21 @@ def open_ply(path: Path) -> ScanFile:
 
 
 def open_splats(path: Path) -> ScanFile:
-    """The centres of a file of Gaussians, whatever its format."""
+    """The centres of Gaussians that are rather opaque, in the colour that they have all around."""
     splats = read_splats(path)
-    columns = dict(zip("xyz", splats.positions.T + splats.origin[:, None], strict=True))
-    columns |= dict(zip(SPLATS, (*splats.harmonics[:, 0].T, splats.logits), strict=True))
-    return ScanFile(path, len(splats), (Station(path.stem),), iter([_splat_chunk(columns)]))
+    colors = np.rint(255 * splats.colors).astype(np.uint8)
+    chunk = Chunk(splats.positions + splats.origin, colors)
+    chunk = chunk.without(~(splats.logits > 0), "transparent Gaussians")
+    return ScanFile(path, len(splats), (Station(path.stem),), iter([chunk]))
 
 
 def _chunk(columns: Columns, kinds: Mapping[str, np.dtype[Any]]) -> Chunk:
-    if {*SPLATS} <= {*columns}:
-        return _splat_chunk(columns)
     colors = _stored_colors(columns, kinds)
     for name in packed_names(columns)[:1]:
         colors = _unpacked_colors(columns[name], kinds[name])
     intensities = [columns[name].astype(np.float32) for name in intensity_names(columns)]
     chunk = Chunk(_positions(columns), colors, next(iter(intensities), None))
     return chunk.without(columns[GENERATED] != 0, GENERATED) if GENERATED in columns else chunk
-
-
-def _splat_chunk(columns: Columns) -> Chunk:
-    """The centres of Gaussians that are rather opaque, in the colour that they have all around."""
-    shade = np.stack([columns[name] for name in SPLATS[:3]], axis=1) * HARMONIC + 0.5
-    colors = np.rint(np.clip(np.nan_to_num(shade), 0, 1) * 255).astype(np.uint8)
-    chunk = Chunk(_positions(columns), colors)
-    return chunk.without(~(columns[SPLATS[3]] > 0), "transparent Gaussians")
 
 
 def _stored_colors(columns: Columns, kinds: Mapping[str, np.dtype[Any]]) -> NDArray[Any] | None:

@@ -20,7 +20,8 @@ from gvtools.errors import MemoryFileError
 from gvtools.glb import GLB, glb_array, join_glb, split_glb
 from gvtools.optional import require
 from gvtools.ply import read_header
-from gvtools.sandbox import Item, ReaderError, read_apart
+from gvtools.sandbox import ReaderError, read_apart
+from gvtools.splat_files import USD
 from gvtools.untrusted import PIXEL_BYTES, PIXEL_RATIO, read_bytes
 
 if TYPE_CHECKING:
@@ -168,42 +169,22 @@ def _with_plain_colors(tree: dict[str, Any], body: bytes) -> bytes | None:
     return join_glb(tree, body)
 
 
-def read_usd(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """(N, 3) positions and colours of all UsdGeom.Points, in the file's frame."""
+def read_usd(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8], NDArray[np.float64]]:
+    """(N, 3) positions and colours of all UsdGeom.Points, in the file's frame; (3,) what is up."""
     require("pxr", extra="export", purpose=f"{path}: {path.suffix}")
     try:
-        parts = [arrays for _, arrays in read_apart(f"{__name__}:usd_points", path)]
-        positions, colors = (
-            np.concatenate([part[name] for part in parts]) for name in ("positions", "colors")
-        )
-        return positions, colors
+        (facts, _), *items = read_apart(USD, path)
+        parts = [arrays for _, arrays in items if "positions" in arrays]
+        grey = np.full((1, 3), GREY / 255)
+        colors = [np.broadcast_to(part.get("colors", grey), part["positions"].shape)
+                  for part in parts]  # fmt: skip
+        positions = np.concatenate([part["positions"] for part in parts])
+        return positions, _srgb(np.concatenate(colors)), np.array(facts["up"])
     except (ReaderError, OSError, ValueError, KeyError):
         raise MemoryFileError(
             f"{path}: no USD with UsdGeom.Points, or one that is damaged or names other files; "
             "expected a file as gvtools export writes it; export it again"
         ) from None
-
-
-def usd_points(path: Path) -> Iterator[Item]:
-    """Positions and colours of each UsdGeom.Points, for ``read_apart``."""
-    from pxr import Sdf, Usd, UsdGeom
-
-    yield {}, {}
-    layer = Sdf.Layer.OpenAsAnonymous(str(path))
-    if layer is None or layer.GetCompositionAssetDependencies():
-        raise ValueError("no layer of its own")
-    cache = UsdGeom.XformCache()
-    # The stage has to outlive its prims.
-    stage = Usd.Stage.Open(layer)
-    for prim in stage.Traverse():
-        if not prim.IsA(UsdGeom.Points):
-            continue
-        local = np.asarray(UsdGeom.Points(prim).GetPointsAttr().Get(), np.float64).reshape(-1, 3)
-        matrix = np.array(cache.GetLocalToWorldTransform(prim))
-        color = UsdGeom.Gprim(prim).GetDisplayColorAttr().Get()
-        linear = np.full((1, 3), GREY / 255) if color is None else np.asarray(color, np.float64)
-        colors = np.broadcast_to(_srgb(linear), local.shape)
-        yield {}, {"positions": local @ matrix[:3, :3] + matrix[3, :3], "colors": colors}
 
 
 def _srgb(linear: NDArray[np.float64]) -> NDArray[np.uint8]:

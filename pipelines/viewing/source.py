@@ -211,11 +211,18 @@ def _open_usd(path: Path) -> RunView:
     try:
         return _open_splats(path)
     except MemoryFileError:
-        return _points_view(path, *read_usd(path))
+        positions, colors, up = read_usd(path)
+        return _points_view(path, positions, colors, up=up)
 
 
-def _points_view(path: Path, positions: NDArray[Any], colors: NDArray[Any] | None) -> RunView:
-    return RunView(path, _memory(path, positions, colors))
+def _points_view(
+    path: Path,
+    positions: NDArray[Any],
+    colors: NDArray[Any] | None,
+    *,
+    up: NDArray[np.float64] | None = None,
+) -> RunView:
+    return RunView(path, _memory(path, positions, colors), told_up=up)
 
 
 def _open_splats(path: Path) -> RunView:

@@ -450,15 +450,21 @@ def test_las_with_colours_of_several_bits_and_an_outlier(tmp_path, factor):
 
 def test_gaussians_given_as_a_scan_are_their_opaque_centres(tmp_path):
     positions, colors = surface(300)
-    names = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity")
+    names = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity",
+             *(f"scale_{k}" for k in range(3)), *(f"rot_{k}" for k in range(4)))  # fmt: skip
     opacity = np.where(np.arange(300) < 100, -3.0, 3.0)
-    values = np.column_stack([positions, (colors / 255 - 0.5) / 0.28209479, opacity])
-    head = ["ply", "format binary_little_endian 1.0", "element vertex 300",
-            *(f"property float {name}" for name in names), "end_header", ""]  # fmt: skip
+    values = np.column_stack(
+        [positions, (colors / 255 - 0.5) / 0.28209479, opacity, np.ones((300, 7))]
+    )
+    properties = [f"property float {name}" for name in names]
+    head = ["ply", "format binary_little_endian 1.0", "comment origin 4e5 5e6 0",
+            "element vertex 300", *properties, "end_header", ""]  # fmt: skip
     path = tmp_path / "splats.ply"
     path.write_bytes("\n".join(head).encode() + values.astype("<f4").tobytes())
     scan = read_scan(path)
     np.testing.assert_allclose(scan.colors.astype(int), colors[100:], atol=1)
+    placed = positions[100:] + np.array([4e5, 5e6, 0])
+    np.testing.assert_allclose(scan.positions + scan.origin, placed, atol=1e-6)
     assert scan.dropped == {"transparent Gaussians": 100} and scan.colored_by == "colour"
 
 

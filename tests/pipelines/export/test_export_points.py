@@ -84,6 +84,21 @@ def test_pxr_reads_the_points(bare_run, tmp_path, suffix):
     np.testing.assert_array_equal(np.array(generated), memory.generated[rows])
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("suffix", [".usdc", ".usda"])
+@pytest.mark.parametrize("form", ["usd", "splat"])
+def test_usd_passes_every_validator(bare_run, tmp_path, form, suffix):
+    validation = pytest.importorskip("pxr.UsdValidation")
+    from pxr import Usd
+
+    out = tmp_path / f"out{suffix}"
+    export_run(bare_run.folder, form, out)
+    every = validation.ValidationRegistry().GetOrLoadAllValidators()
+    told = validation.ValidationContext(every).Validate(Usd.Stage.Open(str(out)))
+    assert len(every) > 10
+    assert [each.GetMessage() for each in told] == []
+
+
 def far_las(path):
     cloud = pytest.importorskip("laspy").read(path)
     assert cloud.header.scales[0] <= 0.003 and cloud.header.global_encoding.wkt
