@@ -10,6 +10,7 @@ from __future__ import annotations
 import atexit
 import codecs
 import csv
+import gzip
 import io
 import json
 import math
@@ -18,6 +19,7 @@ import shutil
 import stat
 import struct
 import sys
+import tarfile
 import tempfile
 import zipfile
 import zlib
@@ -250,15 +252,18 @@ def archive(source: Path | bytes) -> Iterator[zipfile.ZipFile]:
         raise ValueError(f"damaged archive: {error or type(error).__name__}") from None
 
 
-def unpacked(path: Path) -> Path:
-    """What a ZIP archive holds, in a folder that lasts as long as the process.
+def unpacked(path: Path, *, whole: bool = False) -> Path:
+    """What an archive holds (ZIP, or tar by gzip), in a folder that lasts as long as the process.
 
-    Folders that hold one folder alone are gone through. Files have the archive's time, so that they
-    are the same ones whenever it is unpacked.
+    Folders that hold one folder alone are gone through, unless it is to be the ``whole``. Files
+    have the archive's time, so that they are the same ones whenever it is unpacked.
     """
     with reading(path):
         time = regular(path).stat().st_mtime_ns
-    return _unpacked(path.resolve(), time)
+    home = _unpacked(path.resolve(), time)
+    while not whole and len(inner := list(home.iterdir())) == 1 and inner[0].is_dir():
+        home = inner[0]
+    return home
 
 
 @cache
@@ -268,20 +273,35 @@ def _unpacked(path: Path, time: int) -> Path:
     # Messages that name its files tell which archive is meant.
     home = work / path.name
     home.mkdir()
-    advice = "expected a ZIP archive; unpack it and give its folder"
-    with reading(path, advice), archive(path) as opened:
-        for item in opened.infolist():
-            name = item.filename.replace("\\", "/")
-            if item.is_dir() or name.endswith("/") or name.startswith("__MACOSX/"):
-                continue
-            file = named_file(home, name, where=str(path))
-            file.parent.mkdir(parents=True, exist_ok=True)
-            with opened.open(item) as source, file.open("wb") as target:
-                shutil.copyfileobj(source, target)
-            os.utime(file, ns=(time, time))
-    while len(inner := list(home.iterdir())) == 1 and inner[0].is_dir():
-        home = inner[0]
+    advice = "expected an archive; copy or export it again, or unpack it and give its folder"
+    with reading(path, advice, also=(tarfile.TarError,)):
+        for name, content in _files_of(path):
+            if not name.startswith("__MACOSX/"):
+                file = named_file(home, name.replace("\\", "/"), where=str(path))
+                file.parent.mkdir(parents=True, exist_ok=True)
+                with file.open("wb") as target:
+                    shutil.copyfileobj(content, target)
+                os.utime(file, ns=(time, time))
     return home
+
+
+def _files_of(path: Path) -> Iterator[tuple[str, IO[bytes]]]:
+    """Name and content of each file in an archive."""
+    if path.suffix.lower() in (".gz", ".tgz"):
+        most = UNPACKED_RATIO * path.stat().st_size + UNPACKED_BYTES
+        with gzip.open(path) as packed:
+            # As a stream, of which nothing is skipped unread.
+            stream: Any = LimitedReader(packed, most)
+            with tarfile.open(fileobj=stream, mode="r|") as tar:
+                for member in tar:
+                    if (content := tar.extractfile(member)) is not None:
+                        yield member.name, content
+        return
+    with archive(path) as opened:
+        for item in opened.infolist():
+            if not item.filename.endswith(("/", "\\")):
+                with opened.open(item) as content:
+                    yield item.filename, content
 
 
 def other_version(found: object, known: int, advice: str) -> str:

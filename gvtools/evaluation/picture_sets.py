@@ -25,17 +25,13 @@ partners, and without a prefix or suffix that most pictures share (``generated_N
 
 from __future__ import annotations
 
-import gzip
-import io
 import re
-import tarfile
-import zlib
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path, PurePosixPath
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,7 +39,7 @@ from numpy.typing import NDArray
 from gvtools.errors import OptionError, ProjectError
 from gvtools.scenes.images import read_depth
 from gvtools.scenes.scene import Frame, natural_key
-from gvtools.untrusted import UNPACKED_BYTES, UNPACKED_RATIO, LimitedReader, open_picture, regular
+from gvtools.untrusted import open_picture, unpacked
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".ppm")
 SPLITS = ("test", "val", "train")
@@ -297,19 +293,19 @@ def in_natural_order(paths: Iterable[Path], folder: Path) -> list[Path]:
     return sorted(paths, key=lambda path: natural_key(path.relative_to(folder).as_posix()))
 
 
-def read_rgb(source: Path | IO[bytes], *, name: str = "") -> NDArray[np.uint8]:
+def read_rgb(source: Path) -> NDArray[np.uint8]:
     """(H, W, 3) uint8; what is transparent lies before black. EXIF orientation is not applied."""
     from gvtools.scenes.images import UNREADABLE, read_header, read_image
 
-    if isinstance(source, Path) and not read_header(source).has_alpha:
+    if not read_header(source).has_alpha:
         return read_image(source).rgb
     try:
-        with open_picture(source if isinstance(source, Path) else source.read()) as image:
+        with open_picture(source) as image:
             rgba: NDArray[Any] = np.asarray(image.convert("RGBA")).astype(np.float64)
             return np.rint(rgba[..., :3] * (rgba[..., 3:] / 255)).astype(np.uint8)
     except UNREADABLE as error:
         raise ProjectError(
-            f"{name or source}: no readable picture ({error}); expected PNG or JPEG"
+            f"{source}: no readable picture ({error}); expected PNG or JPEG"
         ) from None
 
 
@@ -413,47 +409,15 @@ def nerfbaselines_predictions(path: Path) -> PictureSet | None:
 
 
 def _archive(file: Path, path: Path, *, others: int = 0) -> PictureSet:
-    stored: dict[str, bytes] = {}
-    try:
-        most = UNPACKED_RATIO * regular(file).stat().st_size + UNPACKED_BYTES
-        with gzip.open(file) as packed, _tar(LimitedReader(packed, most)) as tar:
-            for member in tar:
-                name = member.name.removeprefix("./")
-                picture = Path(name).suffix.lower() in IMAGE_ENDINGS
-                if member.isfile() and picture and name.startswith((COLOR, TRUTH)):
-                    content = tar.extractfile(member)
-                    stored[name] = content.read() if content else b""
-    except (OSError, EOFError, ValueError, zlib.error, tarfile.TarError) as error:
-        raise ProjectError(
-            f"{file}: no readable archive ({error}); expected predictions of NerfBaselines"
-        ) from None
-    names = sorted((name for name in stored if name.startswith(COLOR)), key=natural_key)
-    if not names:
+    home = unpacked(file, whole=True)
+    files = image_files(home / COLOR)
+    if not files:
         raise ProjectError(
             f"{file}: no pictures under {COLOR}; expected predictions of NerfBaselines"
         )
     notes = (f"{file.name} taken, the last of {others + 1}",) if others else ()
-    return PictureSet(
-        path, LAYOUT, tuple(_stored(name, stored, file) for name in names), notes=notes
-    )
-
-
-def _tar(stream: LimitedReader) -> tarfile.TarFile:
-    # As a stream, of which nothing is skipped unread.
-    return tarfile.open(fileobj=stream, mode="r|")  # type: ignore[call-overload, no-any-return]
-
-
-def _stored(name: str, stored: dict[str, bytes], file: Path) -> MethodPicture:
-    short = name.removeprefix(COLOR)
-
-    def read(key: str) -> NDArray[np.uint8]:
-        return read_rgb(io.BytesIO(stored[key]), name=f"{file}: {key}")
-
-    return MethodPicture(
-        short,
-        lambda: Frame(read(name)),
-        partial(read, TRUTH + short) if TRUTH + short in stored else None,
-    )
+    pictures = (_beside_truth(picture, home / COLOR, home / TRUTH) for picture in files)
+    return PictureSet(path, LAYOUT, tuple(pictures), notes=notes)
 
 
 # Recognised in this order, by what no other layout has.

@@ -15,8 +15,7 @@ if TYPE_CHECKING:
 SPEC = "spec:"
 FORM = f"{SPEC}NAME:SCENE"
 # Files that a project may be.
-ARCHIVE = ".zip"
-PACKED = (".json", ".r3d", ARCHIVE)
+ARCHIVES = (".zip", ".r3d", ".tar.gz", ".tgz")
 
 
 def is_address(path: Path | str) -> bool:
@@ -30,7 +29,8 @@ def is_address(path: Path | str) -> bool:
 
 def holds_views(path: Path | str) -> bool:
     """Whether a place is opened as a project, rather than read as a trajectory."""
-    return is_address(path) or Path(path).is_dir() or Path(path).suffix.lower() in PACKED
+    packed = str(path).lower().endswith((".json", *ARCHIVES))
+    return is_address(path) or Path(path).is_dir() or packed
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
@@ -35,11 +34,9 @@ from gvtools.scenes.calibration import (
     opencv_pose,
     pinhole_lens,
     quaternion_pose,
-    scaled_lens,
     sky_findings,
 )
 from gvtools.scenes.images import (
-    decode_picture,
     exr_depth,
     read_depth,
     read_image,
@@ -53,7 +50,7 @@ from gvtools.scenes.photographs import Depth, PosedFrame, first_size, posed_scen
 from gvtools.scenes.scene import Finding, Frame, Scene
 from gvtools.scenes.undistort import LensParameters
 from gvtools.scenes.video import frame_seconds, read_frame, video_header
-from gvtools.untrusted import archive, open_picture, parse_json, read_bytes, reading
+from gvtools.untrusted import read_bytes, read_json, reading
 
 WORLD_UP = 1  # y
 AGAIN = "export the recording again"
@@ -338,7 +335,7 @@ STRAY_SCANNER = Layout.of_folder(
 
 # --- Record3D ---------------------------------------------------------------------------------
 #
-# An ``.r3d`` archive, the folder that it was unpacked into, or an export of EXR and JPG.
+# An ``.r3d`` archive, unpacked as every archive is, or an export of EXR and JPG.
 #
 # An archive (ZIP) has ``metadata``, a JSON, and ``rgbd/N.{jpg, depth, conf}``; depth is float32
 # metres and confidence uint8, both compressed by LZFSE. The export has ``metadata.json``, ``rgb``
@@ -350,7 +347,7 @@ STRAY_SCANNER = Layout.of_folder(
 # none of its axes need be gravity's. Recordings of the selfie camera have no poses: each is the
 # identity.
 
-_ARCHIVE, _EXPORT = ".r3d", "EXR_RGBD"
+_EXPORT = "EXR_RGBD"
 _PHOTOS = (".jpg", ".png")
 _CHANNELS = ("R", "Y", "Z")
 _NO_POSE = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
@@ -389,10 +386,8 @@ class Record3dMetadata(BaseModel):
 
 
 def _is_record3d(path: Path) -> bool:
-    if path.is_file():
-        return path.suffix.lower() == _ARCHIVE
-    unpacked = (path / "metadata").is_file() and (path / "rgbd").is_dir()
-    return unpacked or _export(path) is not None
+    recording = (path / "metadata").is_file() and (path / "rgbd").is_dir()
+    return recording or _export(path) is not None
 
 
 def _export(path: Path) -> Path | None:
@@ -406,9 +401,9 @@ def _export(path: Path) -> Path | None:
 def _read_record3d(path: Path) -> Scene:
     home = _export(path)
     if home is None:
-        pictures, bare = _from_archive(path, _metadata(path, "metadata"))
+        pictures, bare = _from_recording(path, _metadata(path / "metadata"))
     else:
-        pictures, bare = _from_export(home, _metadata(home, "metadata.json"))
+        pictures, bare = _from_export(home, _metadata(home / "metadata.json"))
     line = "the world is where the recording began: which way is up is not said"
     findings = [Finding("info", line)]
     if bare:
@@ -417,13 +412,12 @@ def _read_record3d(path: Path) -> Scene:
     return phone_scene(path, "Record3D", pictures, upright=False, findings=findings)
 
 
-def _metadata(home: Path, name: str) -> Record3dMetadata:
-    expected = f"expected Record3D's form with w, h, K and poses; {AGAIN}"
-    with reading(f"{home}: {name}", expected):
-        metadata = Record3dMetadata.model_validate(parse_json(_stored(home, name)))
+def _metadata(path: Path) -> Record3dMetadata:
+    with reading(path, f"expected Record3D's form with w, h, K and poses; {AGAIN}"):
+        metadata = Record3dMetadata.model_validate(read_json(path))
     if len(metadata.poses) > 1 and all(pose == _NO_POSE for pose in metadata.poses):
         raise ProjectError(
-            f"{home}: no frame has a pose, as in recordings of the selfie camera; expected one of "
+            f"{path}: no frame has a pose, as in recordings of the selfie camera; expected one of "
             "the LiDAR camera, or its pictures alone: gvtools capture finds their cameras"
         )
     return metadata
@@ -449,80 +443,41 @@ def _from_export(home: Path, metadata: Record3dMetadata) -> tuple[list[PosedFram
     return pictures, bare
 
 
-def _from_archive(path: Path, metadata: Record3dMetadata) -> tuple[list[PosedFrame], int]:
+def _from_recording(path: Path, metadata: Record3dMetadata) -> tuple[list[PosedFrame], int]:
     """The frames, and how many depth maps lack confidence."""
-    held, packed = _members(path), path.is_file()
-    stems = {Path(name).stem for name in held if name.endswith(".jpg")}
-    size = _picture_size(path, held) if packed else None
+    stems = {item.stem for item in (path / "rgbd").glob("*.jpg")}
     pictures, bare = [], 0
     for number in metadata.frames(stems):
-        image, depth, conf = (f"rgbd/{number}.{kind}" for kind in ("jpg", "depth", "conf"))
-        lens = metadata.lens(number)
-        bare += depth in held and conf not in held
-        maps = [name for name in (depth, conf) if name in held]
+        image, depth, conf = (path / f"rgbd/{number}.{kind}" for kind in ("jpg", "depth", "conf"))
+        bare += depth.is_file() and not conf.is_file()
+        shape = metadata.dh, metadata.dw
+        read = partial(_lzfse_depth, confidence=conf if conf.is_file() else None, shape=shape)
+        pose = metadata.pose(number)
         pictures.append(
-            PosedFrame(
-                f"{number}.jpg",
-                # What an archive lacks is given as a path that does not exist.
-                path if packed and image in held else path / image,
-                lens if lens is None or size is None else scaled_lens(lens, size),
-                metadata.pose(number),
-                path if packed and depth in held else path / depth,
-                partial(_lzfse_depth, path, maps, shape=(metadata.dh, metadata.dw)),
-                read=partial(_picture, member=image) if packed and image in held else None,
-            )
+            PosedFrame(f"{number}.jpg", image, metadata.lens(number), pose, depth, read)
         )
     return pictures, bare
 
 
-def _members(path: Path) -> set[str]:
-    """Names of the frames' files, in an archive or the folder that it was unpacked into."""
-    if not path.is_file():
-        return {f"rgbd/{item.name}" for item in (path / "rgbd").iterdir()}
-    with reading(path, AGAIN), archive(path) as opened:
-        return {item.filename for item in opened.infolist() if item.file_size}
+def _lzfse_depth(path: Path, *, confidence: Path | None, shape: tuple[int, int]) -> Depth:
+    """(h, w) depth of a map and, if there is any, its confidence."""
+    depth = readings(_unpacked(path, "<f4", shape=shape))
+    return depth if confidence is None else confident(
+        depth, _unpacked(confidence, "u1", shape=shape) > 0
+    )  # fmt: skip
 
 
-def _stored(home: Path, name: str) -> bytes:
-    """A file of a folder or of an archive."""
-    with reading(home / name, AGAIN):
-        if not home.is_file():
-            return read_bytes(home / name)
-        with archive(home) as opened:
-            return opened.read(name)
-
-
-def _picture_size(path: Path, held: set[str]) -> tuple[int, int] | None:
-    """Width and height of an archive's first readable picture."""
-    for name in sorted(name for name in held if name.endswith(".jpg")):
-        with suppress(OSError, ValueError, ProjectError):
-            return open_picture(_stored(path, name)).size
-    return None
-
-
-def _picture(path: Path, *, member: str) -> Frame:
-    return decode_picture(_stored(path, member), where=str(path / member))
-
-
-def _lzfse_depth(home: Path, maps: list[str], _: Path, *, shape: tuple[int, int]) -> Depth:
-    """(h, w) depth; ``maps`` are names of it and, if there is any, its confidence in ``home``."""
-    depth = readings(_unpacked(home, maps[0], "<f4", shape=shape))
-    if len(maps) == 1:
-        return depth
-    return confident(depth, _unpacked(home, maps[1], "u1", shape=shape) > 0)
-
-
-def _unpacked(home: Path, name: str, dtype: str, *, shape: tuple[int, int]) -> NDArray[Any]:
+def _unpacked(path: Path, dtype: str, *, shape: tuple[int, int]) -> NDArray[Any]:
     lzfse = require(
         "lzfse",
         extra="phones",
-        purpose=f"{home}: depth compressed by LZFSE",
+        purpose=f"{path}: depth compressed by LZFSE",
         instead="or export EXR and JPG",
     )
     count = np.dtype(dtype).itemsize * shape[0] * shape[1]
     expected = f"expected {shape[0]}x{shape[1]} values by LZFSE; {AGAIN}"
-    with reading(home / name, expected, also=(lzfse.error,)):
-        return np.frombuffer(_decompressed(_stored(home, name), count), dtype).reshape(shape)
+    with reading(path, expected, also=(lzfse.error,)):
+        return np.frombuffer(_decompressed(read_bytes(path), count), dtype).reshape(shape)
 
 
 def _decompressed(data: bytes, size: int) -> bytes:

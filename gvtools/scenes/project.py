@@ -16,7 +16,7 @@ from gvtools.scenes.calibration import load_matrix
 from gvtools.scenes.collection import SceneCollection, of_scenes
 from gvtools.scenes.colmap_model import find_model
 from gvtools.scenes.images import ALPHA
-from gvtools.scenes.layout import ARCHIVE, FORM, SPEC, is_address
+from gvtools.scenes.layout import ARCHIVES, FORM, SPEC, is_address
 from gvtools.scenes.matching import named
 from gvtools.scenes.phones import POLYCAM, RECORD3D, SCANNER_APP, STRAY_SCANNER
 from gvtools.scenes.photographs import Photograph
@@ -162,8 +162,8 @@ def _capture(path: Path) -> str:
 
 
 def is_archive(path: Path) -> bool:
-    """Whether a path is of a ZIP archive, which is read as the folder that it holds."""
-    return path.suffix.lower() == ARCHIVE and path.is_file()
+    """Whether a path is of an archive, which is read as the folder that it holds."""
+    return path.name.lower().endswith(ARCHIVES) and path.is_file()
 
 
 def is_recording(folder: Path) -> bool:

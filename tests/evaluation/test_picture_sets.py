@@ -171,9 +171,9 @@ def test_what_holds_no_pictures_is_refused(tmp_path, monkeypatch):
     with pytest.raises(ProjectError, match="is a file"):
         open_pictures(tmp_path / "a.zip")
     (tmp_path / "predictions.tar.gz").write_bytes(b"x")
-    with pytest.raises(ProjectError, match="no readable archive"):
+    with pytest.raises(ProjectError, match="expected an archive"):
         open_pictures(tmp_path / "predictions.tar.gz")
-    monkeypatch.setattr("gvtools.evaluation.picture_sets.UNPACKED_BYTES", 1 << 20)
+    monkeypatch.setattr("gvtools.untrusted.UNPACKED_BYTES", 1 << 20)
     write_archive(tmp_path / "large.tar.gz", {"color/a.png": bytes(2 << 20)})
     with pytest.raises(ProjectError, match="more than such a file can hold"):
         open_pictures(tmp_path / "large.tar.gz")

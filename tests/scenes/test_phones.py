@@ -275,5 +275,5 @@ def test_record3d_damaged_files_name_what_is_wrong(tmp_path: Path) -> None:
     with pytest.raises(ProjectError, match=r"rgbd/0\.depth: unreadable .*expected 24x17 values"):
         open_project(path).views[0].load()
     path.write_bytes(path.read_bytes()[:-100])
-    with pytest.raises(ProjectError, match=r"unreadable .*export the recording again"):
+    with pytest.raises(ProjectError, match=r"unreadable .*expected an archive"):
         open_project(path)

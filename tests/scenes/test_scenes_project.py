@@ -39,7 +39,8 @@ def test_kinds_are_found_out(tmp_path, make, kind):
     scene = open_project(tmp_path / "project")
     assert scene.kind == kind
     assert scene.views[0].load().rgb.dtype == np.uint8
-    packed = Path(shutil.make_archive(str(tmp_path / "packed"), "zip", tmp_path, "project"))
+    form = "gztar" if kind == "colmap" else "zip"
+    packed = Path(shutil.make_archive(str(tmp_path / "packed"), form, tmp_path, "project"))
     unpacked = open_project(packed)
     assert (unpacked.kind, unpacked.names, unpacked.address) == (kind, scene.names, str(packed))
     assert np.array_equal(unpacked.views[0].load().rgb, scene.views[0].load().rgb)
