@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from gvtools.cameras import Cameras
 from gvtools.errors import GvError
 from gvtools.scenes.images import Depth
-from gvtools.scenes.scene import Finding, Scene, View
+from gvtools.scenes.scene import Finding, Frame, Scene
 
 Float64 = NDArray[np.float64]
 
@@ -33,12 +33,13 @@ def unit_findings(scene: Scene) -> list[Finding]:
     """A warning when depth of neighbours does not agree with the poses."""
     numbers = [number for number, view in enumerate(scene.views) if view.has_depth]
     first = sorted({*np.linspace(0, len(numbers) - 1, PROBES).astype(int).tolist()})
-    depth_of = cache(_depth)
+    frame_of = cache(partial(frame_there, scene))
     pairs = [(at, at + gap) for at in first for gap in GAPS if at + gap < len(numbers)]
     compared, names = list[Pair](), list[str]()
     for pair in pairs:
         a, b = (scene.views[numbers[place]] for place in pair)
-        one, other = depth_of(a), depth_of(b)
+        depths = [frame.depth for place in pair if (frame := frame_of(numbers[place]))]
+        one, other = depths if len(depths) == 2 else (None, None)
         moved = np.linalg.norm(a.camera.centers - b.camera.centers) > 0
         if one is not None and other is not None and moved:
             compared.append((one, other, (a.camera, b.camera)))
@@ -73,10 +74,11 @@ def unit_findings(scene: Scene) -> list[Finding]:
     return [Finding("warning", line)]
 
 
-def _depth(view: View) -> Depth | None:
+def frame_there(scene: Scene, number: int) -> Frame | None:
+    """A view's pixels; None where they cannot be read, which is said elsewhere."""
     try:
-        return view.load().depth
-    except GvError:  # said elsewhere
+        return scene.views[number].load()
+    except GvError:
         return None
 
 

@@ -215,15 +215,12 @@ def _views_without_depth(scene: Scene) -> list[Finding]:
 def _doubtful_cameras(scene: Scene, errors: np.ndarray) -> list[Finding]:
     """Intrinsics that no camera has, and poses that the sparse points contradict."""
     findings = []
-    odd = []
-    for view in scene.views:
-        K = view.camera.K[0]
-        size = np.array([view.camera.width[0], view.camera.height[0]])
-        focal = np.array([K[0, 0], K[1, 1]]) / size
-        center = K[:2, 2] / size
-        if focal.min() < FOCAL[0] or focal.max() > FOCAL[1] or np.abs(center - 0.5).max() > 0.5:
-            odd.append(view.name)
-    if odd:
+    K = np.array([view.camera.K[0] for view in scene.views]).reshape(-1, 3, 3)
+    size = np.array([[*view.camera.width, *view.camera.height] for view in scene.views])
+    sides = K[:, :2] / size.reshape(-1, 2, 1)
+    focal, center = sides[:, (0, 1), (0, 1)], np.abs(sides[:, :, 2] - 0.5).max(axis=1)
+    strange = (focal.min(axis=1) < FOCAL[0]) | (focal.max(axis=1) > FOCAL[1]) | (center > 0.5)
+    if odd := [view.name for view, wrong in zip(scene.views, strange, strict=True) if wrong]:
         message = (
             f"{len(odd)} views have intrinsics that no camera has (focal length outside "
             f"{FOCAL[0]} to {FOCAL[1]:g} image sides, or a principal point outside the image): "

@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.errors import GvError
-from gvtools.scenes.scene import Finding, Frame, Scene, SparsePoints
+from gvtools.scenes.depth_contradictions import frame_there
+from gvtools.scenes.scene import Finding, Scene, SparsePoints
 
 Grey = NDArray[np.float32]
 
@@ -142,21 +142,14 @@ class PixelCheck:
         return None if found is None or shown is None or found.shape != shown.shape else found
 
     def _detail(self, number: int) -> Grey | None:
-        frame = _frame(self.scene, number) if 0 <= number < len(self.rows) else None
+        frame = frame_there(self.scene, number) if 0 <= number < len(self.rows) else None
         return None if frame is None else detail(frame.rgb)
-
-
-def _frame(scene: Scene, number: int) -> Frame | None:
-    try:
-        return scene.views[number].load()
-    except GvError:  # said elsewhere
-        return None
 
 
 def _points_of_depth(scene: Scene) -> SparsePoints | None:
     """Places with detail that depth of a few views gives, and where some after them show these."""
     numbers = [number for number, view in enumerate(scene.views) if view.has_depth]
-    load = cache(partial(_frame, scene))
+    load = cache(partial(frame_there, scene))
     places, count = [np.zeros((0, 3))], 0
     tracks = list[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]]()
     last = len(numbers) - 1

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import invert_rigid
-from gvtools.errors import GvError
 from gvtools.features import Features, SiftMatcher
 from gvtools.scenes.calibration import OPENCV_FROM_OPENGL
+from gvtools.scenes.depth_contradictions import frame_there
 from gvtools.scenes.scene import Finding, Scene
 from gvtools.trajectory_files import reordered
 
@@ -180,11 +180,9 @@ def _pairs(scene: Scene, chosen: Sequence[int], scale: Float64, *, most_pairs: i
 
 def _features(scene: Scene, view: int, scale: float, *, matcher: SiftMatcher) -> Features | None:
     """Features of a view's picture at the longer side SIDE; None where it cannot be read."""
-    try:
-        rgb = scene.views[view].load().rgb
-    except GvError:
+    frame = frame_there(scene, view)
+    if frame is None:
         return None
-    size = tuple(max(1, round(side * scale)) for side in rgb.shape[1::-1])
-    return matcher.extract(
-        np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
-    )
+    size = tuple(max(1, round(side * scale)) for side in frame.rgb.shape[1::-1])
+    reduced = cv2.resize(frame.rgb, size, interpolation=cv2.INTER_AREA)
+    return matcher.extract(np.asarray(reduced, np.uint8))

@@ -19,7 +19,7 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, Field, PrivateAttr, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError
 
 from gvtools.cameras import Cameras, invert_rigid, rigid_transform
 from gvtools.errors import ProjectError
@@ -61,6 +61,7 @@ OF_A_FRAME = ("transform_matrix", "mask_path", "depth_file_path", "depth_path")
 # What tells the focal length along an axis: pixels, or a field of view in radians or degrees.
 FOCAL = {axis: (f"fl_{axis}", f"camera_angle_{axis}", f"{axis}_fov") for axis in "xy"}
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+# Of models that are not read.
 FURTHER = ("k5", "k6", "p3", "p4", "b1", "b2")
 # What tells one axis may differ so much from what else tells it.
 SAME_FOCAL = 0.02
@@ -413,6 +414,7 @@ class FrameKeys(BaseModel):
     Keys as nerfstudio and instant-ngp have them.
     """
 
+    model_config = ConfigDict(extra="allow")
     transform_matrix: Any = None
     mask_path: str | None = None
     depth_file_path: str | None = None
@@ -439,13 +441,6 @@ class FrameKeys(BaseModel):
     p2: Number = 0.0
     # nerfstudio's k1, k2, k3, k4, p1, p2 in one; they count before the single ones.
     distortion_params: Annotated[list[Number], Field(min_length=6, max_length=6)] | None = None
-    # Of models that are not read.
-    k5: Number = 0.0
-    k6: Number = 0.0
-    p3: Number = 0.0
-    p4: Number = 0.0
-    b1: Number = 0.0
-    b2: Number = 0.0
     # The file's, where the frame tells a focal length of its own.
     _of_file: FrameKeys | None = PrivateAttr(None)
 
@@ -477,9 +472,8 @@ class FrameKeys(BaseModel):
                 f"{', '.join(name for name in (*PERSPECTIVE, *FISHEYE, PANORAMA) if name)}; "
                 "render perspective views first"
             )
-        further = {key: value for key in FURTHER if (value := getattr(self, key))}
-        if further:
-            key, value = next(iter(further.items()))
+        others = self.model_extra or {}
+        for key, value in ((key, others[key]) for key in FURTHER if others.get(key)):
             raise ProjectError(
                 f"{what}: {key} = {value} is of a camera model that is not read; expected k1, k2, "
                 "k3, p1, p2 at most; undistort the pictures first, or calibrate without it"
