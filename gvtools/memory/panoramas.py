@@ -18,9 +18,10 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from gvtools.cameras import Cameras, concatenate, invert_rigid
+from gvtools.errors import OptionError
 from gvtools.guidance import IMAGES, Guidance
 from gvtools.scenes.faces import FACE_DEGREES, PANORAMA, Face, face_name, panorama_faces, picture_of
 from gvtools.scenes.undistort import camera_of
@@ -47,6 +48,20 @@ class LensOptions(Settings):
     """Of a panorama or fisheye picture; none: as fine as the cameras, within limits. [px]"""
     field_of_view: float = Field(180.0, ge=10, le=360)
     """Across a fisheye's circle. [degrees]"""
+
+    @model_validator(mode="after")
+    def _check(self) -> LensOptions:
+        """Nothing is given that the lens does not heed."""
+        if self.kind != "fisheye" and self.field_of_view != 180:
+            raise OptionError(
+                "lens.field_of_view or --field-of-view: belongs to --lens fisheye; give that or "
+                "neither"
+            )
+        if self.kind == "perspective" and self.width is not None:
+            raise OptionError(
+                "lens.width: of panoramas and fisheye pictures; give lens.kind or --lens, too"
+            )
+        return self
 
 
 @dataclass(frozen=True, eq=False)

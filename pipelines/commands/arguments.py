@@ -127,16 +127,15 @@ class LensArguments(Arguments):
         from gvtools.cameras import concatenate
         from gvtools.memory.panoramas import LensOptions, Rig, picture_cameras
 
-        if self.field_of_view is not None and self.lens != "fisheye":
-            raise OptionError("--field-of-view: belongs to --lens fisheye; give that or neither")
-        if self.lens == "perspective":
-            return None, cameras
+        width = None if self.lens == "perspective" else self.width
         options = LensOptions(
-            kind=self.lens, width=self.width, field_of_view=self.field_of_view or 180.0
+            kind=self.lens, width=width, field_of_view=self.field_of_view or 180.0
         )
+        rig = Rig.of(options, cameras, widest=widest)
+        if rig is None:
+            return None, cameras
         views = [view.camera for view in memory.views.photographed]
         captured = concatenate(views) if views else cameras
-        rig = Rig.of(options, cameras, widest=widest)
         return rig, picture_cameras(cameras, options, captured=captured)
 
 

@@ -167,7 +167,7 @@ def test_wrong_inputs_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[
     out = ("--out", tmp_path / "out")
     assert "at least two photographs" in refused(capsys, "capture", tmp_path / "empty", *out)
     assert "no such file" in refused(capsys, "capture", tmp_path / "nothing", *out)
-    assert "expected a folder of photographs" in refused(
+    assert "expected a folder (or .zip) of photographs" in refused(
         capsys, "capture", tmp_path / "text.txt", *out
     )
     assert "nothing is overwritten" in refused(

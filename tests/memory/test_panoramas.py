@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gvtools.cameras import Cameras, concatenate, invert_rigid
+from gvtools.errors import OptionError
 from gvtools.guidance import Guidance
 from gvtools.memory.panoramas import LensOptions, Rig, picture_cameras
 from gvtools.trajectories import level_up, look_at
@@ -38,7 +39,8 @@ def colors(direction: np.ndarray) -> np.ndarray:
     [("equirectangular", 360, "EQUIRECTANGULAR"), ("fisheye", 170, "SIMPLE_FISHEYE")],
 )
 def test_pixels_show_the_directions_of_colmaps_lens(kind, angle, model):
-    rig = Rig.of(LensOptions(kind=kind, width=240, field_of_view=min(angle, 360)), CAMERA, widest=0)
+    view = {"field_of_view": angle} if kind == "fisheye" else {}
+    rig = Rig.of(LensOptions(kind=kind, width=240, **view), CAMERA, widest=0)
     width, height = rig.size
     assert height == (width // 2 if kind == "equirectangular" else width)
     focal = width / np.radians(angle)
@@ -69,6 +71,14 @@ def test_a_fisheye_sees_behind_itself():
         shown.rgb[0, 100, 199], colors(np.array([np.sin(angle), 0, np.cos(angle)])), atol=0.01
     )
     assert abs(rig.inside.mean() - np.pi / 4) < 0.01
+
+
+@pytest.mark.parametrize(
+    "given", [{"width": 64}, {"kind": "equirectangular", "field_of_view": 90.0}]
+)
+def test_what_a_lens_does_not_heed_is_refused(given):
+    with pytest.raises(OptionError, match="--lens"):
+        LensOptions(**given)
 
 
 def test_pictures_are_as_fine_as_the_cameras_within_a_limit():
