@@ -73,7 +73,7 @@ class PageGroup:
     def packed(self) -> str:
         """The words as the page holds them."""
         data = b"".join(each.astype("<u4").tobytes() for each in self.words)
-        return base64.b64encode(gzip.compress(data, mtime=0)).decode("ascii")
+        return base64.b64encode(gzip.compress(data, 6, mtime=0)).decode("ascii")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

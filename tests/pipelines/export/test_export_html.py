@@ -243,6 +243,9 @@ def test_a_click_flies_and_the_address_keeps_view_and_choices(fitted_run, tmp_pa
         reaches(browser, "shown")
         assert psnr(still(browser)[60:, :700], third[60:, :700]) > 45
         assert "after round 2" in browser.text().replace("\n", " ")
+        # In a window of the size that frames have, the scene alone.
+        browser.resize(300, 150)
+        assert run("return document.getElementById('stage').clientHeight") == 150
         assert browser.console_errors() == [] and browser.foreign_requests() == []
 
 
