@@ -29,12 +29,13 @@ def png_tag(content: bytes) -> str:
 
 def path_sketch(places: NDArray[np.float64]) -> str:
     """An SVG of (N, 3) places along a path, in the plane that it spreads in most."""
+    places = places[np.isfinite(places).all(axis=1)]  # Where a tracker was lost it has none.
     if len(places) < 2:
         return ""
     around = places - places.mean(axis=0)
     flat = around @ np.linalg.svd(around[:: max(1, len(around) // 1000)])[2][:2].T
     flat -= flat.min(axis=0)
-    flat *= (WIDTH - 8) / max(float(flat.max()), 1e-12)
+    flat *= (WIDTH - 8) / max(float(flat.max()), 1e-300)
     height = round(float(flat[:, 1].max())) + 8
     points = " ".join(
         f"{x + 4:.1f},{height - 4 - y:.1f}" for x, y in flat[:: len(flat) // 2000 + 1]
