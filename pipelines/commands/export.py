@@ -6,8 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from gvtools.errors import OptionError
@@ -16,6 +14,9 @@ from pipelines.export.formats import FORMATS, ExportFormat, ExportOptions, Forma
 from pipelines.options import Arguments
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from pipelines.console import Console
 
 _FORMATS = "; ".join(
@@ -128,6 +129,8 @@ class ExportCommand(Arguments, ExportOptions):
         """(3,) unit vector of --up."""
         if self.up is None:
             return None
+        import numpy as np
+
         length = float(np.linalg.norm(self.up))
         if not 0 < length < np.inf:
             told = " ".join(f"{x:g}" for x in self.up)
