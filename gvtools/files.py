@@ -54,7 +54,7 @@ def replaced_when_written(path: Path, *, suffix: str = "", flush: bool = True) -
         if not reason:
             raise
         # A writer's own temporary name says nothing to the user.
-        name = path.with_name(re.sub(r"^\.(.+)\.part(\.\w+)*$", r"\1", path.name))
+        name = path.parent / re.sub(r"^\.(.+)\.part(\.\w+)*$", r"\1", path.name)
         raise ProjectError(
             f"{name}: cannot be written ({reason}); free some space or choose another folder; what "
             "was there before is intact"

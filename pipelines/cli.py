@@ -111,9 +111,9 @@ def main(argv: Sequence[str] | None = None, *, modules: Mapping[str, str] = COMM
     if main_thread and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
         signal.signal(signal.SIGTERM, _terminate)
     words = sys.argv[1:] if argv is None else argv
-    parser = build_parser(modules, only=words[0] if words and words[0][:1] != "-" else "")
     args = argparse.Namespace(debug=False)
     try:
+        parser = build_parser(modules, only=words[0] if words and words[0][:1] != "-" else "")
         args = parser.parse_args(argv)
         if args.command is None:
             parser.print_help()

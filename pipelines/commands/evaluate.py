@@ -66,7 +66,7 @@ class EvaluateCommand(MeasurementArguments, ProtocolArguments, SceneArguments):
 
     def run(self, console: Console) -> None:
         from gvtools.evaluation.published import benchmark_names
-        from gvtools.files import write_json
+        from gvtools.files import make_folder, write_json
         from pipelines.scoring import evaluation
 
         shown = benchmark_names() if "all" in self.against else self.against
@@ -79,6 +79,7 @@ class EvaluateCommand(MeasurementArguments, ProtocolArguments, SceneArguments):
         if self.protocol is not None:
             paths = [_run_protocol(self, self.protocol, out, console=console)]
         runs = evaluation.load_runs(paths, project=self.project)
+        make_folder(out)  # before the work, which a folder that cannot be made would cost
         evaluations = evaluation.evaluate_runs(runs, options, console=console)
         figures = evaluation.write_evaluation(
             runs,

@@ -7,6 +7,7 @@ import json
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -18,6 +19,7 @@ from tiny_scan import write_scan
 
 import gvtools
 from gvtools.errors import GvError
+from pipelines import cli
 from pipelines.cli import COMMANDS, build_parser, main
 
 pytestmark = pytest.mark.usefixtures("unpainted")
@@ -195,3 +197,16 @@ def test_closed_streams_are_no_reason_to_fail(monkeypatch):
         monkeypatch.setattr(sys, name, None)
     assert main(["completers"]) == 0
     assert main(["completers", "--json", "/"]) == 2
+
+
+def test_a_termination_while_a_command_loads_is_told_too(monkeypatch, capsys):
+    def terminated(name: str) -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(cli, "import_module", terminated)
+    before = signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    try:
+        assert main(["check", "."]) == 143
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert capsys.readouterr().err.startswith("gvtools: terminated; ")
