@@ -78,6 +78,8 @@ def read_splats(path: Path) -> Splats:
         if str(path) in str(error):
             raise
         raise type(error)(f"{path}: {error}") from None
+    except FileNotFoundError:
+        raise MemoryFileError(f"{path}: no such file; expected splats") from None
     except (ReaderError, *DAMAGED) as error:
         said = str(error)[:200] or type(error).__name__
         raise MemoryFileError(

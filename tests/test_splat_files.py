@@ -259,6 +259,12 @@ def test_a_file_is_converted_and_the_suffix_tells_the_format(tmp_path, capsys):
     run_command("export", file, "--out", tmp_path / "b.glb", quiet=True)
     np.testing.assert_allclose(read_splats(tmp_path / "b.glb").values[:, 3:6],
                                some().log_scales, atol=1e-6)  # fmt: skip
+    run_command("export", file, "--out", tmp_path / "b.html", "--up", 0, 0, -1, quiet=True)
+    assert '"up": [0.0, 0.0, -1.0]' in (tmp_path / "b.html").read_text()
+    said = refused(capsys, "export", file, "--out", tmp_path / "c.las")
+    assert "holds Gaussians" in said and "give --format splat" in said
+    said = refused(capsys, "export", file, "--out", tmp_path / "b.spz", "--up", 0, 1, 0)
+    assert "a .spz has no place for it" in said
     said = refused(capsys, "export", file, "--out", tmp_path / "c.ply", "--observed")
     assert "--observed" in said and "leave it out" in said
     assert "give --format" in refused(capsys, "export", tmp_path, "--out", tmp_path / "c.usdc")

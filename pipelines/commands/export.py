@@ -53,7 +53,8 @@ class ExportCommand(Arguments, ExportOptions):
         from pipelines.export.source import ExportSource
 
         splats = holds_splats(self.memory)
-        form = FORMATS["splat"] if splats and self.format is None else self._form()
+        converts = splats and self.out.suffix.lower() in FORMATS["splat"].suffixes
+        form = FORMATS["splat"] if converts and self.format is None else self._form()
         for name in (name for name in ExportOptions.model_fields if name in self.model_fields_set):
             if name not in form.options:
                 takers = ", ".join(each.name for each in FORMATS.values() if name in each.options)
@@ -65,6 +66,11 @@ class ExportCommand(Arguments, ExportOptions):
         if splats and form.name in ("splat", "spz", "html"):
             self._convert(console, form)
             return
+        if splats:
+            raise OptionError(
+                f"--format {form.name}: {self.memory} holds Gaussians; expected a run or its "
+                "memory; give --format splat, spz or html"
+            )
         if form.name in ("colmap", "transforms", "mesh") and self.memory.suffix.lower() == ".ply":
             raise OptionError(
                 f"--format {form.name}: {self.memory} is a PLY, which holds no cameras; give the "

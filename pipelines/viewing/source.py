@@ -151,6 +151,8 @@ class ProjectFrames:
 
 def open_file(path: Path) -> RunView | None:
     """What a file shows; None where it is no export but, perhaps, a memory or a run."""
+    if path.is_dir() and holds_splats(path):
+        return _open_splats(path)
     suffix = path.suffix.lower()
     if path.is_file() and suffix not in ("", ".npz", *OPENERS):
         raise OptionError(
