@@ -126,7 +126,7 @@ def glb_array(tree: dict[str, Any], body: bytes, place: int) -> NDArray[Any]:
     kind, width, count = _kind(accessor), WIDTHS[accessor["type"]], accessor["count"]
     if "bufferView" in accessor:
         array = _stored(tree, body, accessor, kind=kind, shape=(count, width))
-    elif not 0 <= count <= len(body):
+    elif not 0 <= count * width * kind.itemsize <= len(body):
         raise ValueError(f"an array of {count} items")
     else:
         array = np.zeros((count, width), kind)

@@ -7,7 +7,6 @@ the greatest, where version 2 has a codebook. Positions are logarithms, sign(x) 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +26,7 @@ from gvtools.untrusted import (
 )
 
 META, VERSION = "meta.json", 2
+PARTS = ("means", "scales", "quats", "sh0", "shN")
 # Of a quaternion's fourth byte: the place of the greatest part is what is above it.
 PLACES = 252
 # Sets of harmonics in a row of their picture.
@@ -41,15 +41,19 @@ def read_sog(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     file has none, ``sh`` (N, H, 3), and either ``opacities`` or ``logits`` (N,).
     """
     if path.suffix.lower() == ".json":
-        beside = partial(named_file, path.parent, where=str(path))
-        return _decoded(read_json(path), lambda name: read_bytes(beside(name)))
+        meta = read_json(path)
+        names = {name for part in PARTS if part in meta for name in meta[part]["files"]}
+        files = {name: named_file(path.parent, name, where=str(path)) for name in names}
+        size = sum(file.stat().st_size for file in files.values())
+        return meta, _decoded(meta, lambda name: read_bytes(files[name]), size=size)
     with archive(path) as members:
-        return _decoded(parse_json(members.read(META)), members.read)
+        meta = parse_json(members.read(META))
+        return meta, _decoded(meta, members.read, size=path.stat().st_size)
 
 
 def _decoded(
-    meta: dict[str, Any], read: Callable[[str], bytes]
-) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    meta: dict[str, Any], read: Callable[[str], bytes], *, size: int
+) -> dict[str, NDArray[Any]]:
     version = meta.get("version", 1)
     if version not in (1, VERSION):
         raise MemoryFileError(
@@ -57,6 +61,9 @@ def _decoded(
             f"{other_version(version, VERSION, 'save it again')}"
         )
     count = meta["means"]["shape"][0] if version == 1 else meta["count"]
+    # Blank pictures are packed without end: a Gaussian takes at least a byte.
+    if not 0 <= count <= size:
+        raise ValueError(f"{count} Gaussians in {size} bytes")
 
     def picture(part: str, number: int = 0) -> Pixels:
         return np.asarray(open_picture(read(meta[part]["files"][number])).convert("RGBA"))
@@ -64,7 +71,7 @@ def _decoded(
     def pixels(part: str, number: int = 0) -> Pixels:
         """(N, 4) of a picture of one pixel for each Gaussian."""
         found = picture(part, number).reshape(-1, 4)
-        if not 0 <= count <= len(found):
+        if count > len(found):
             raise ValueError(f"{part} of {len(found)} Gaussians, where {count} are said to be")
         return found[:count]
 
@@ -97,7 +104,7 @@ def _decoded(
         labels = pixels("shN", 1).astype(np.int64)
         stored = palette[..., :3].reshape(-1, terms, 3)[labels[:, 0] + 256 * labels[:, 1]]
         parts["sh"] = np.concatenate([parts["sh"], numbers("shN", stored)], axis=1)
-    return meta, parts
+    return parts
 
 
 def _quaternions(stored: Pixels) -> NDArray[np.float64]:

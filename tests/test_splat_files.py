@@ -248,6 +248,11 @@ def test_sog_of_version_1_in_a_folder_and_zipped(tmp_path):
         check_alike(found, given, (1e-4, 0.02, 0.01, 0.005, 0.01))
         assert found.degree == 3
     meta = json.loads((tmp_path / "meta.json").read_text())
+    meta["means"]["shape"][0] = 2_000_000
+    Image.new("RGB", (2000, 1000)).save(tmp_path / "means_l.webp", lossless=True)
+    (tmp_path / "meta.json").write_text(json.dumps(meta))
+    with pytest.raises(MemoryFileError, match="2000000 Gaussians in"):
+        read_splats(tmp_path)
     meta["means"]["files"][0] = "../a.webp"
     (tmp_path / "meta.json").write_text(json.dumps(meta))
     with pytest.raises(GvError, match="lies outside of"):

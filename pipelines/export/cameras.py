@@ -14,10 +14,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.errors import GvError
 from gvtools.files import link_or_copy, write_text
 from gvtools.memory.thinning import thin
-from gvtools.runs.run import load_run
 from gvtools.runs.target_files import write_png
 from gvtools.scenes.colmap_writer import write_colmap as write_model
 from gvtools.scenes.images import IMAGE_SUFFIXES, read_image
@@ -79,7 +77,7 @@ def write_transforms(source: ExportSource, path: Path, options: ExportOptions) -
     file, distinct = transforms_file(path), source.cameras()
     home = file.parent.resolve()
     paths, elsewhere, absent = [], dict[Path, Path | NDArray[np.uint8]](), list[str]()
-    views = _project_views(source)
+    views = source.project
     for name in distinct.cameras.names:
         made = distinct.generated.get(name)
         given = (home / options.images / name if made is None else made).resolve()
@@ -111,14 +109,6 @@ def write_transforms(source: ExportSource, path: Path, options: ExportOptions) -
     if absent:
         told += f"; {len(absent)} pictures are not there ({named(absent)}): give --images"
     return told
-
-
-def _project_views(source: ExportSource) -> dict[str, View]:
-    """The views of the run's project by name; none where it cannot be read."""
-    try:
-        return {view.name: view for view in load_run(source.path).scenes[0]}
-    except GvError:
-        return {}
 
 
 def _pixels(view: View) -> Path | NDArray[np.uint8]:

@@ -15,8 +15,6 @@ import numpy as np
 
 from gvtools.errors import GvError
 from gvtools.files import write_text
-from gvtools.runs.layout import RECORD
-from gvtools.runs.run import load_run
 from gvtools.splats import SH, Splats
 from pipelines.export.formats import ExportOptions
 from pipelines.export.source import ExportSource
@@ -103,13 +101,9 @@ def _cameras(source: ExportSource) -> Iterator[PageCamera]:
     """Cameras of the photographs, with their pictures where they can be read."""
     views = [view.camera for view in source.memory.views.photographed if view.camera.width[0] > 1]
     chosen = np.unique(np.linspace(0, len(views) - 1, min(len(views), MOST_PICTURES)).round())
-    scene = None
-    if (source.path / RECORD).is_file():
-        with suppress(GvError):  # A project that cannot be read any more has no pictures.
-            scene = load_run(source.path).scenes[0]
     for camera in (views[int(row)] for row in chosen):
         name, picture = camera.names[0], None
-        if scene is not None and name in scene.names:
+        if name in source.project:
             with suppress(GvError):
-                picture = thumbnail(name, scene[name].load().rgb, side=SIDE)
+                picture = thumbnail(name, source.project[name].load().rgb, side=SIDE)
         yield PageCamera(camera, picture)

@@ -7,7 +7,6 @@ where float32 would be too coarse in the world frame; the recording's name says 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
-from gvtools.errors import GvError
 from gvtools.files import replaced_when_written
 from gvtools.runs.layout import RECORD
 from gvtools.runs.run import load_run
@@ -160,10 +158,6 @@ def _log(
 def _shots(source: ExportSource) -> Iterator[RecordedCamera]:
     """Cameras of the memory's views and the run's targets, with pictures where they are there."""
     run = load_run(source.path) if (source.path / RECORD).is_file() else None
-    scene = None
-    if run is not None:
-        with suppress(GvError):  # A project that cannot be read any more has no pictures.
-            scene = run.scenes[0]
     for view in source.memory.views:
         name = view.camera.names[0]
         if view.scanned:
@@ -172,7 +166,7 @@ def _shots(source: ExportSource) -> Iterator[RecordedCamera]:
             if run is None:
                 yield RecordedCamera(view.round, "generated", view.camera, None)
             continue
-        picture = scene[name].load().rgb if scene is not None and name in scene.names else None
+        picture = source.project[name].load().rgb if name in source.project else None
         yield RecordedCamera(view.round, "context", view.camera, picture)
     for target in run.views if run else ():
         if source.up_to is None or target.round <= source.up_to:

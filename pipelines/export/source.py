@@ -7,7 +7,8 @@ a fit all points are exported. Each point becomes a spherical Gaussian.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import count
@@ -19,11 +20,11 @@ from numpy.typing import NDArray
 
 from gvtools.appearance.gaussians import Gaussians
 from gvtools.cameras import Cameras, concatenate
-from gvtools.errors import OptionError, ProjectError
+from gvtools.errors import GvError, OptionError, ProjectError
 from gvtools.memory.store.local_frame import LocalFrame
 from gvtools.memory.store.voxel_index import levels_above
 from gvtools.memory.thinning import thin
-from gvtools.runs.run import load_appearance
+from gvtools.runs.run import load_appearance, load_run
 from gvtools.runs.target_files import completed_picture
 from gvtools.splats import LOG_SCALE, LOGIT, SH, Splats, box_middle, near_origin, turn_gaussians
 from gvtools.trajectories import level_up
@@ -32,6 +33,7 @@ from pipelines.export.formats import ExportOptions
 if TYPE_CHECKING:
     from gvtools.appearance.appearance import Appearance
     from gvtools.memory.spatial_memory import SpatialMemory
+    from gvtools.scenes.scene import View
 
 # Standard deviation of a point's Gaussian, as a share of the distance to the next point.
 SPREAD = 0.6
@@ -80,6 +82,13 @@ class ExportSource:
     def appearance(self) -> Appearance | None:
         """The Gaussians that the run fitted; None where it has none."""
         return load_appearance(self.path)
+
+    @cached_property
+    def project(self) -> Mapping[str, View]:
+        """The views of the run's project by name; none where it cannot be read (any more)."""
+        with suppress(GvError):
+            return {view.name: view for view in load_run(self.path).scenes[0]}
+        return {}
 
     @property
     def up(self) -> NDArray[np.float64] | None:
