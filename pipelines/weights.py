@@ -42,7 +42,7 @@ from gvtools.completers.geoverse.weights import (
     parts_of,
     save_pretrained,
 )
-from gvtools.errors import CheckpointError, ProjectError
+from gvtools.errors import CheckpointError, OptionError, ProjectError
 from gvtools.evaluation.images import psnr
 from gvtools.files import folder_replaced_when_written, link_or_copy, make_folder, write_text
 from gvtools.networks.depth_anything.network import RELEASED, DepthAnything3, tied_norms
@@ -249,40 +249,39 @@ RECORDS = 150
 
 
 def pack(
-    training: Path, out: Path, *, dtype: str = "float16", text_encoder: Path | None = None
-) -> Path:
-    """Write the last stage's weights and every stage's record, or a weights folder as one file.
-
-    Args:
-        training: folder of a ``gvtools train --out``, or a weights folder.
-        text_encoder: Wan's, for a video prior without the empty prompt.
-
-    Returns:
-        The folder that the weights came from.
-    """
-    if any(part.find(training) for part in (WHOLE, *parts_of(configs.named("base")))):
-        return _pack_folder(training, out, dtype=dtype, text_encoder=text_encoder)
-    folders = [training / name / WEIGHTS for name in STAGES]
-    finished = [folder for folder in folders if folder.is_dir() and config_of(folder).trained]
-    if not finished:
-        raise ProjectError(
-            f"{training}: no finished denoiser; expected {training / 'denoiser' / WEIGHTS}; run "
-            "gvtools train first"
-        )
+    training: Path,  # of ``gvtools train --out``, or a weights folder
+    out: Path,
+    *,
+    dtype: str = "float16",
+    text_encoder: Path | None = None,  # Wan's, for a video prior without the empty prompt
+) -> Path:  # the folder that the weights came from
+    """Write the last stage's weights and every stage's record, or a weights folder as one file."""
+    whole = any(part.find(training) for part in (WHOLE, *parts_of(configs.named("base"))))
+    source = training if whole else _last_weights(training)
     if out.resolve().is_relative_to(training.resolve()):
-        raise ProjectError(f"{out} lies within the training {training}; choose another folder")
-    source = finished[-1]
-    weights = [folder / WHOLE_FILE for folder in finished]
-    newest = max(weights, key=lambda path: path.stat().st_mtime)
-    if newest != weights[-1]:
-        raise ProjectError(
-            f"{source}: older than {newest.parent}, which an earlier stage made; run the later "
-            "stage again, with its folder removed"
+        raise ProjectError(f"{out} lies within {training}; choose another folder")
+    video = source / VIDEO_FOLDER
+    lacking = video.is_dir() and not (video / EMPTY_PROMPT).is_file()
+    if lacking and text_encoder is None:
+        raise CheckpointError(
+            f"{video}: no {EMPTY_PROMPT}; name Wan's text encoder with --text-encoder, once"
         )
-    model = from_pretrained(source)
-    out.mkdir(parents=True, exist_ok=True)
-    save_pretrained(model, out, dtype=dtype)
-    for stage in STAGES:
+    if text_encoder is not None and not lacking:
+        raise OptionError(f"--text-encoder: no {video} that lacks {EMPTY_PROMPT}; leave it out")
+    model = from_pretrained(source, video=False)
+    make_folder(out)
+    if video.is_dir():
+        make_folder(out / VIDEO_FOLDER)
+        # Linked, or copied to another disk.
+        with folder_replaced_when_written(out / VIDEO_FOLDER) as new:
+            for path in sorted(path for path in video.rglob("*") if path.is_file()):
+                target = new / path.relative_to(video)
+                make_folder(target.parent)
+                link_or_copy(path, target)
+            if text_encoder is not None:
+                write_empty_prompt(text_encoder, new)
+    save_pretrained(model, out, dtype=dtype, about="packed")
+    for stage in () if whole else STAGES:
         for name in (f"log_{stage}.jsonl", f"training_{stage}.json"):
             (out / name).unlink(missing_ok=True)
         records = read_log(training / stage)
@@ -300,25 +299,21 @@ def pack(
     return source
 
 
-def _pack_folder(source: Path, out: Path, *, dtype: str, text_encoder: Path | None) -> Path:
-    """One file of a weights folder's many; the video prior is linked, or copied to another disk."""
-    video = source / VIDEO_FOLDER
-    if out.resolve().is_relative_to(source.resolve()):
-        raise ProjectError(f"{out} lies within {source}; choose another folder")
-    if video.is_dir() and text_encoder is None and not (video / EMPTY_PROMPT).is_file():
-        raise CheckpointError(
-            f"{video}: no {EMPTY_PROMPT}; name Wan's text encoder with --text-encoder, once"
+def _last_weights(training: Path) -> Path:
+    """The weights of the last stage that a training has finished."""
+    folders = [training / name / WEIGHTS for name in STAGES]
+    finished = [folder for folder in folders if folder.is_dir() and config_of(folder).trained]
+    if not finished:
+        raise ProjectError(
+            f"{training}: no finished denoiser; expected {training / 'denoiser' / WEIGHTS}; run "
+            "gvtools train first"
         )
-    model = from_pretrained(source, video=False)
-    make_folder(out)
-    if video.is_dir():
-        make_folder(out / VIDEO_FOLDER)
-        with folder_replaced_when_written(out / VIDEO_FOLDER) as new:
-            for path in sorted(path for path in video.rglob("*") if path.is_file()):
-                target = new / path.relative_to(video)
-                make_folder(target.parent)
-                link_or_copy(path, target)
-            if text_encoder is not None and not (new / EMPTY_PROMPT).is_file():
-                write_empty_prompt(text_encoder, new)
-    save_pretrained(model, out, dtype=dtype, about="packed")
+    source = finished[-1]
+    weights = [folder / WHOLE_FILE for folder in finished]
+    newest = max(weights, key=lambda path: path.stat().st_mtime)
+    if newest != weights[-1]:
+        raise ProjectError(
+            f"{source}: older than {newest.parent}, which an earlier stage made; run the later "
+            "stage again, with its folder removed"
+        )
     return source

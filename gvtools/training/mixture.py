@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gvtools.errors import GvError, OptionError
+from gvtools.scenes.project import open_collection
 from gvtools.settings import with_file
 from gvtools.training.data import open_source
 from gvtools.training.options import SHIPPED, SceneSource, TrainingSettings
@@ -48,12 +49,14 @@ def with_data(
             continue
         try:
             collection, _, own = open_source(here)
+            if here.estimated:
+                open_collection(here.estimated)
         except GvError as error:
             notes[entry.root] = str(error)
             continue
         used.append(here)
         geometry = f"{own:.0%} own geometry" if here.estimated else "own geometry alone"
-        notes[entry.root] = f"{len(collection)} scenes, {geometry}"
+        notes[entry.root] = f"{len(collection)} scene(s), {geometry}"
     total = sum(entry.weight or 0 for entry in used)
     shares = {Path(str(e.root)).name: (e.weight or 0) / total for e in used}
     found = tuple(MixedDataSet(name, shares.get(name, 0.0), note) for name, note in notes.items())

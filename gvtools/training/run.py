@@ -216,9 +216,11 @@ class StageRun:
         if source is None:
             source = self._weights_before(before)
         if source is None and before:
+            made = [name for name in before if getattr(self.config, name) is not None]
+            first = f"run --stage {made[-1]} first, or give" if made else "give"
             raise CheckpointError(
-                f"stage {self.stage} needs weights to start from; run --stage {before[-1]} first, "
-                "or give --init DIR"
+                f"stage {self.stage} needs weights to start from; {first} --init DIR (gvtools "
+                "weights fetch)"
             )
         if source is None:
             torch.manual_seed(self.config.seed)

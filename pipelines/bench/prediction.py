@@ -2,9 +2,8 @@
 
 The library's own code runs on tensors without numbers, as in ``memory``. Of every kernel the
 operations are counted, and the bytes that it reads and writes. It takes as long as the slower of
-the two does, at the rates that the card's maker states times the shares of them in ``REACHED``:
-these were set by the passes that were measured on an H200 (``benchmarks/complete.md``). Kernels are
-those of eager torch; what a compiler fuses takes less.
+the two, at the rates that the card's maker states times their shares in ``REACHED``, which were set
+by the passes that were measured on an H200 (``benchmarks/complete.md``), not compiled.
 """
 
 from __future__ import annotations

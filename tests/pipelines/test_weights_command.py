@@ -207,6 +207,8 @@ def test_published_files_are_packed_into_one(capsys, folder, tmp_path, dtype):
     assert (tmp_path / "out" / "video" / "vae" / "numbers").read_bytes() == b"1234"
     assert not (folder / "video" / "empty_prompt.safetensors").exists()
     assert weights("check", tmp_path / "out") == 0
+    again = ("weights", "pack", tmp_path / "out", tmp_path / "again", "--text-encoder", "t5")
+    assert "that lacks empty_prompt.safetensors; leave it out" in refused(capsys, *again)
     assert "lies within" in refused(capsys, "weights", "pack", folder, folder / "packed")
 
 

@@ -14,11 +14,13 @@ from command_line import refused
 from data_sets import mini_synthetic
 from data_sets.miniature import Miniature, miniatures
 from geoverse_models import awake
+from safetensors.torch import save_file
 
 from gvtools.completers.geoverse import from_pretrained
 from gvtools.completers.geoverse.config import GeoVerseConfig, named, read
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.completers.geoverse.video_prior import VideoPrior
+from gvtools.completers.geoverse.wan import EMPTY_PROMPT
 from gvtools.completers.geoverse.weights import save_pretrained
 from gvtools.networks.config_json import to_json
 from gvtools.scenes.data_sets.catalogue import load_spec, spec_names
@@ -50,6 +52,8 @@ def downloads(tmp_path: Path) -> Path:
     for name in ("gtasfm", "virtualkitti"):
         by_layout[load_spec(name).layout].write(tmp_path / "data" / name)
     (tmp_path / "data" / "spring").mkdir()
+    (tmp_path / "data" / "mvssynth_estimated").mkdir()
+    by_layout[load_spec("mvssynth").layout].write(tmp_path / "data" / "mvssynth")
     return tmp_path / "data"
 
 
@@ -61,6 +65,7 @@ def test_what_is_there_is_trained_on_by_its_share(downloads):
     assert sum(shares.values()) == pytest.approx(1) and sum(map(bool, shares.values())) == 2
     notes = {one.name: one.note for one in found}
     assert "no scene of Spring" in notes["spring"] and "no folder" in notes["waymo"]
+    assert "mvssynth_estimated: is empty" in notes["mvssynth"]
     assert "own geometry alone" in notes["gtasfm"] and len(found) == 15
     assert config.data.scene_share == 1 and len(config.data.scenes) == 2
     sources = TrainingSamples(config, config.network()).sources
@@ -74,7 +79,10 @@ def test_it_does_not_begin_without_scenes(downloads, tmp_path, capsys):
     assert "not a folder" in refused(capsys, *words, "--data", str(tmp_path / "absent"))
     both = refused(capsys, *words, "--data", str(downloads), "--rooms")
     assert "--data and --rooms: expected one" in both
-    for name in ("gtasfm", "virtualkitti"):
+    start = refused(capsys, *words, "--data", str(downloads), "--sheets", "0")
+    assert "needs weights to start from; give --init DIR (gvtools weights fetch)" in start
+    shutil.rmtree(tmp_path / "out")
+    for name in ("gtasfm", "virtualkitti", "mvssynth"):
         shutil.rmtree(downloads / name)
     assert "none of the 15 data sets can be used" in refused(
         capsys, *words, "--data", str(downloads)
@@ -109,7 +117,7 @@ def base_in_small(size: int) -> GeoVerseConfig:
 
     base, micro = named("base"), read(SHIPPED / "micro_model.json")
     assert base.video is not None and base.cascade is not None and micro.cascade is not None
-    video = replace(tiny_wan.CONFIG, prompt="zeros", resolution=(32, 32), dtype=None)
+    video = replace(tiny_wan.CONFIG, resolution=(32, 32))
     return replace(
         base,
         image_size=size,
@@ -135,6 +143,7 @@ def start_of(config: GeoVerseConfig, folder: Path) -> Path:
     save_pretrained(model, folder)
     tiny_wan.transformer().save_pretrained(folder / "video" / "transformer")
     tiny_wan.vae().save_pretrained(folder / "video" / "vae")
+    save_file({"embedding": tiny_wan.prompt()}, folder / "video" / EMPTY_PROMPT)
     return folder
 
 
@@ -198,5 +207,8 @@ def test_all_fifteen_go_through_a_step_of_each_stage(tmp_path, monkeypatch, caps
     assert moved(first, second) == {"level1", "control"}
     # The video model ran once a sample, also where a student has a teacher.
     assert sum(given) == step + 8
+    packed = tmp_path / "packed"
+    assert main(["weights", "pack", str(out), str(packed)]) == 0
+    assert from_pretrained(packed).video is not None and (packed / "log_reflow.jsonl").is_file()
     said = capsys.readouterr().out
     assert all(f"of {load_spec(name).name}" in said for name in names)

@@ -155,8 +155,7 @@ def velocity_from_clean(
 def guide(both: Velocity, scale: float) -> Velocity:
     """Classifier-free guidance u = unconditional + scale (conditional - unconditional).
 
-    ``both`` takes every sample twice, in one batch: all without the condition, then all with it;
-    at a scale of 1 once, with it.
+    ``both`` takes a batch twice in one, first without the condition; at a scale of 1 once.
     """
     check_range("cfg_scale", scale, ge=0, lt=math.inf)
     if scale == 1:
