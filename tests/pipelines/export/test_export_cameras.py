@@ -16,7 +16,7 @@ from gvtools.errors import OptionError, ProjectError
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.store.views import SourceView
 from gvtools.scenes.project import open_project
-from pipelines.export import cameras
+from pipelines.export import source
 
 ORIGIN = (431_000.0, 5_650_000.0, 120.0)
 
@@ -172,7 +172,7 @@ def test_absent_pictures_are_taken_from_the_runs_project_or_said(
     frame = replace(scene["view_2.png"].load(), rgb=np.full((72, 96, 3), 7, np.uint8))
     changed = replace(scene["view_2.png"], load=lambda: frame)
     project = replace(scene, views=(scene["view_0.png"], changed))
-    monkeypatch.setattr(cameras, "load_run", lambda path: SimpleNamespace(scenes=(project, None)))
+    monkeypatch.setattr(source, "load_run", lambda path: SimpleNamespace(scenes=(project, None)))
     export_run(saved, "transforms", tmp_path / "out")
     again = open_project(tmp_path / "out")
     by_name = {view.name.split("/")[-1]: view.load().rgb for view in again}
