@@ -22,9 +22,9 @@ PROBES, GAPS, PIXELS = 4, (1, 4, 16), 800
 # Depth is wrong when another factor makes so many agree, and it has less than the share of that.
 AGREE, SHARE, FAR = 0.2, 0.8, 1.3
 # Of so many pixels that a second view does not hide, so few that are nearly alike in one pair, or
-# two, tell of maps that are not of their cameras. On seven recordings it is 0.92 at the least;
-# mirrored, or those of other frames, 0.2; along the rays 0.75.
-NEARLY, LEAST, ONE_PAIR, TWO_PAIRS = 0.05, 100, 0.5, 0.8
+# two, tell of maps that are not of their cameras. On seven recordings it is 0.92 at the least, and
+# 0.1 to 0.3 of mirrored maps and those of other frames; what moves takes a part of it away.
+NEARLY, LEAST, ONE_PAIR, TWO_PAIRS = 0.05, 100, 0.3, 0.6
 
 Pair = tuple[Depth, Depth, tuple[Cameras, Cameras]]
 
@@ -50,8 +50,7 @@ def unit_findings(scene: Scene) -> list[Finding]:
     best, factor = agreeing.max(), float(FACTORS[agreeing.argmax()])
     shares = _nearly(compared)
     straight = [(_of_rays(one, a), _of_rays(other, b), (a, b)) for one, other, (a, b) in compared]
-    by_rays = _wrong(shares) and not _wrong(_nearly(straight))
-    by_rays = by_rays and _agreeing(straight, np.ones(1))[0].mean() > best
+    by_rays = SHARE * _agreeing(straight, np.ones(1))[0].mean() > max(best, AGREE)
     if not by_rays and now < SHARE * best >= SHARE * AGREE and max(factor, 1 / factor) > FAR:
         times = f"{float(f'{factor:.2g}'):g}"
         line = (
@@ -61,7 +60,7 @@ def unit_findings(scene: Scene) -> list[Finding]:
             "integer_depth_scale of transforms.json) or give poses in the same unit"
         )
         return [Finding("warning", line)]
-    if not _wrong(shares):
+    if not (by_rays or _wrong(shares)):
         return []
     worst = int(np.nanargmin(shares))
     reason = "; it fits as distances along the rays" if by_rays else ""

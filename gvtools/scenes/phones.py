@@ -121,16 +121,13 @@ class LidarMaps:
 
 _CORRECTED = "corrected_cameras", "corrected_images"
 _RECORDED = "cameras", "images"
+_CAMERAS = _CORRECTED[0], _RECORDED[0]
 _BLACK = 8  # the compression of a JPEG leaves no more of a black border
 
 
 def _keyframes(root: Path) -> Path:
     """The folder of the keyframes, which may be given itself."""
     return root if root.name == "keyframes" else root / "keyframes"
-
-
-def _is_polycam(root: Path) -> bool:
-    return any((_keyframes(root) / cameras).is_dir() for cameras, _ in (_CORRECTED, _RECORDED))
 
 
 def _read_polycam(root: Path) -> Scene:
@@ -187,7 +184,7 @@ def _read_undistorted(path: Path) -> Frame:
 POLYCAM = Layout.of_folder(
     "Polycam",
     "raw data: keyframes/ with cameras, images, depth",
-    matches=_is_polycam,
+    matches=lambda root: any((_keyframes(root) / kind).is_dir() for kind in _CAMERAS),
     read=_read_polycam,
 )
 
@@ -261,10 +258,6 @@ _VIDEO, _ODOMETRY, _MATRIX = "rgb.mp4", "odometry.csv", "camera_matrix.csv"
 _MOST_FRAMES = 3e10  # of a recording: a year at a thousand a second
 
 
-def _is_stray_scanner(root: Path) -> bool:
-    return (root / _ODOMETRY).is_file() and (root / _VIDEO).is_file()
-
-
 def _read_stray_scanner(root: Path) -> Scene:
     rows = _odometry(root / _ODOMETRY)
     video, lidar = root / _VIDEO, LidarMaps()
@@ -328,7 +321,7 @@ def _odometry(path: Path) -> list[dict[str, float]]:
 STRAY_SCANNER = Layout.of_folder(
     "Stray Scanner",
     f"{_VIDEO}, {_ODOMETRY}, {_MATRIX}, depth",
-    matches=_is_stray_scanner,
+    matches=lambda root: all((root / name).is_file() for name in (_ODOMETRY, _VIDEO)),
     read=_read_stray_scanner,
 )
 

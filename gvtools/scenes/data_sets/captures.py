@@ -228,11 +228,6 @@ def _arkit_scenes(root: Path) -> tuple[str, ...]:
     )
 
 
-def _arkit_variants(root: Path) -> tuple[str, ...]:
-    scenes = _arkit_scenes(root)
-    return tuple(f"{scene}/{HIGH}" for scene in scenes if (root / scene / HIGH).is_dir())
-
-
 def _read_arkit(root: Path, scene: str) -> Scene:
     from scipy.spatial.transform import Rotation
 
@@ -296,10 +291,6 @@ def _pincams(folder: Path) -> dict[int, LensParameters]:
 # height. Withheld poses of the test split are all 0. The data set holds no depth; maps that were
 # estimated beside a picture (``NAME.METHOD.png`` in millimetres, ``NAME[.METHOD].npy`` in metres)
 # are read.
-
-
-def _mapfree_scenes(root: Path) -> tuple[str, ...]:
-    return scenes_holding(root, "*/intrinsics.txt", "*/*/intrinsics.txt")
 
 
 def _read_mapfree(root: Path, scene: str) -> Scene:
@@ -482,12 +473,14 @@ LAYOUTS = (
         f"FOLD/VIDEO/{TRAJECTORY} with {LOW}, {LOW}_intrinsics and lowres_depth",
         _arkit_scenes,
         _read_arkit,
-        _arkit_variants,
+        lambda root: tuple(
+            f"{s}/{HIGH}" for s in _arkit_scenes(root) if (root / s / HIGH).is_dir()
+        ),
     ),
     Layout(
         "mapfree",
         "SPLIT/SCENE/poses.txt and intrinsics.txt with seq0 and seq1",
-        _mapfree_scenes,
+        lambda root: scenes_holding(root, "*/intrinsics.txt", "*/*/intrinsics.txt"),
         _read_mapfree,
     ),
     Layout(

@@ -321,10 +321,6 @@ def _read_spring(root: Path, scene: str) -> Scene:
 MIRRORED = np.diag([1.0, -1.0, 1.0, 1.0])
 
 
-def _synth_scenes(root: Path) -> tuple[str, ...]:
-    return scenes_holding(root, "*/images", "*/poses", "*/*/images", "*/*/poses")
-
-
 def _synth_camera(path: Path) -> tuple[Float64, tuple[float, ...]]:
     """cam_from_world and fx, fy, cx, cy of a pose file."""
     with reading(path, "expected extrinsic, f_x, f_y, c_x and c_y; copy it again"):
@@ -492,7 +488,7 @@ LAYOUTS = (
     Layout(
         "mvs_synth",
         "NNNN or GTAV_NNN/NNNN with images, depths and poses",
-        _synth_scenes,
+        lambda root: scenes_holding(root, "*/images", "*/poses", "*/*/images", "*/*/poses"),
         _read_synth,
     ),
     Layout(
