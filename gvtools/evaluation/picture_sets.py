@@ -96,33 +96,35 @@ def match_pictures(
     if by_name:
         partners, like = _by_name(pictures, views, what, others=others)
     found = sum(number is not None for number in partners)
+    of, view, problem = f"of {len(pictures)} pictures", f"(such as {views[0]!r})", ""
     if rule == "auto" and like and not found:
-        raise OptionError(
-            f"{what}: {len(like)} of {len(pictures)} pictures (such as {pictures[like[0]]!r}) "
-            f"are named like views that are not judged, and none like one that is (such as "
-            f"{views[0]!r}); give those views' pictures, or, where names count, --match order"
+        problem = (
+            f"{len(like)} {of} (such as {pictures[like[0]]!r}) are named like views that are not "
+            f"judged, and none like one that is {view}; give those views' pictures, or, where "
+            "names count, --match order"
         )
-    if rule == "name" and not found:
-        raise OptionError(
-            f"{what}: none of {len(pictures)} pictures (first {pictures[0]!r}) is named like one "
-            f"of {len(views)} views (first {views[0]!r}); rename them, or give --match order"
+    elif rule == "name" and not found:
+        problem = (
+            f"none {of} (first {pictures[0]!r}) is named like one of {len(views)} views {view}; "
+            "rename them, or give --match order"
         )
-    if rule == "auto" and 0 < found < len(pictures) == len(views):
-        raise OptionError(
-            f"{what}: {found} of {len(pictures)} pictures are named like views, the others are "
-            "not, and the order would give other partners; say --match name or --match order"
+    elif rule == "auto" and 0 < found < len(pictures) == len(views):
+        problem = (
+            f"{found} {of} are named like views, the others are not, and the order would give "
+            "other partners; say --match name or --match order"
         )
-    if rule == "auto" and by_name and not found and _first_number(pictures) is None:
-        raise OptionError(
-            f"{what}: the pictures' numbers (such as {pictures[0]!r}) are none of the views' (such "
-            f"as {views[0]!r}) and do not count on by 1; give pictures named like the views, or, "
-            "where the order is right, --match order"
+    elif rule == "auto" and by_name and not found and _first_number(pictures) is None:
+        problem = (
+            f"the pictures' numbers (such as {pictures[0]!r}) are none of the views' {view} and "
+            "do not count on by 1; name them like the views, or, for the order, give --match order"
         )
-    if not found and len(pictures) != len(views):
-        raise OptionError(
-            f"{what}: {len(pictures)} pictures (first {pictures[0]!r}) for {len(views)} views "
-            f"(first {views[0]!r}); expected names like the views', or as many pictures as views"
+    elif not found and len(pictures) != len(views):
+        problem = (
+            f"{len(pictures)} pictures (first {pictures[0]!r}) for {len(views)} views {view}; "
+            "expected names like the views', or as many pictures as views"
         )
+    if problem:
+        raise OptionError(f"{what}: {problem}")
     if not found:
         in_order = sorted(range(len(views)), key=views.__getitem__) if alphabetical else None
         in_order = in_order or _natural_order(views)

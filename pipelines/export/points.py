@@ -152,12 +152,9 @@ def write_usd(source: ExportSource, path: Path, options: ExportOptions) -> str:
         ("displayColor", Sdf.ValueTypeNames.Color3fArray, Vt.Vec3fArray.FromNumpy(colors)),
         ("confidence", Sdf.ValueTypeNames.FloatArray,
          Vt.FloatArray.FromNumpy(columns.confidence[rows])),
-        ("round", Sdf.ValueTypeNames.IntArray,
-         Vt.IntArray.FromNumpy(columns.round[rows].astype(np.int32))),
-        ("generated", Sdf.ValueTypeNames.IntArray,
-         Vt.IntArray.FromNumpy(columns.generated[rows].astype(np.int32))),
-        ("scanned", Sdf.ValueTypeNames.IntArray,
-         Vt.IntArray.FromNumpy(memory.scanned[rows].astype(np.int32))),
+        *((name, Sdf.ValueTypeNames.IntArray, Vt.IntArray.FromNumpy(whole[rows].astype(np.int32)))
+          for name, whole in (("round", columns.round), ("generated", columns.generated),
+                              ("scanned", memory.scanned))),
     ):  # fmt: skip
         primvars.CreatePrimvar(name, kind, UsdGeom.Tokens.vertex).Set(values)
     with replaced_when_written(path, suffix=path.suffix.lower()) as temporary:

@@ -148,9 +148,8 @@ def _other_unit(
             return 0
 
     as_given, least = pairs(1), max(3, min(len(reference), len(estimate)) / 2)
-    powers = {3: "thousandths", 6: "millionths", 9: "billionths"}
-    names = {10.0**-n: name for n, name in powers.items()}
-    names |= {10.0**n: f"10^{n} fold" for n in powers}
+    names = {1e-3: "thousandths", 1e-6: "millionths", 1e-9: "billionths"}
+    names |= {10.0**n: f"10^{n} fold" for n in (3, 6, 9)}
     for factor, name in names.items():
         if (count := pairs(factor)) >= least and count > 2 * as_given:
             return factor, name
