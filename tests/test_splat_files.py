@@ -272,6 +272,8 @@ def test_a_file_is_converted_and_the_suffix_tells_the_format(tmp_path, capsys):
     assert "a .spz has no place for it" in said
     said = refused(capsys, "export", file, "--out", tmp_path / "c.ply", "--observed")
     assert "--observed" in said and "leave it out" in said
+    said = refused(capsys, "export", file, "--out", tmp_path / "c.sog", "--spz-version", "3")
+    assert "is no .spz" in said
     assert "give --format" in refused(capsys, "export", tmp_path, "--out", tmp_path / "c.usdc")
 
 

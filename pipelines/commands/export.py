@@ -62,6 +62,8 @@ class ExportCommand(Arguments, ExportOptions):
                     f"{self.key(name)}: --format {form.name} does not take it ({takers} do); leave "
                     "it out"
                 )
+        if "spz_version" in self.model_fields_set and self.out.suffix.lower() != ".spz":
+            raise OptionError(f"--spz-version: --out {self.out} is no .spz; leave it out")
         form.check_path(self.out, self.memory)
         if splats and form.name in ("splat", "spz", "html"):
             self._convert(console, form)

@@ -206,7 +206,7 @@ class FilmCommand(LensArguments):
     PATH@SELECTION). [PATH]"""
     out: Path
     """FILE.mp4, FILE.gif or FILE.webp. [FILE]"""
-    fps: float = Field(24.0, gt=0, le=240)
+    fps: float = Field(24.0, ge=0.01, le=240)
     """Frames a second. [N]"""
     round: int | None = None
     """The memory as it was after round R. [R]"""

@@ -98,7 +98,7 @@ def test_a_caption_changes_the_corner_alone() -> None:
         (["--out", "f.gif", "--path", "orbit:0"], "N >= 1"),
         (["--out", "f.gif", "--path", "nowhere"], "expected orbit:N"),
         (["--out", "f.gif", "--compare", "memory,colour"], "expected two or more of"),
-        (["--out", "f.gif", "--fps", "0"], "--fps 0"),
+        (["--out", "f.gif", "--fps", "0.001"], "at least 0.01"),
         (["--out", "f.gif", "--width", "4"], "--width 4"),
         (["--out", "f.gif", "--growth", "--round", "0"], "leave --round out"),
     ],
