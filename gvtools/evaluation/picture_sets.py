@@ -96,16 +96,16 @@ def match_pictures(
     if by_name:
         partners, like = _by_name(pictures, views, what, others=others)
     found = sum(number is not None for number in partners)
-    of, view, problem = f"of {len(pictures)} pictures", f"(such as {views[0]!r})", ""
+    of, such, problem = f"of {len(pictures)} pictures", f"(such as {views[0]!r})", ""
     if rule == "auto" and like and not found:
         problem = (
             f"{len(like)} {of} (such as {pictures[like[0]]!r}) are named like views that are not "
-            f"judged, and none like one that is {view}; give those views' pictures, or, where "
+            f"judged, and none like one that is {such}; give those views' pictures, or, where "
             "names count, --match order"
         )
     elif rule == "name" and not found:
         problem = (
-            f"none {of} (first {pictures[0]!r}) is named like one of {len(views)} views {view}; "
+            f"none {of} (first {pictures[0]!r}) is named like one of {len(views)} views {such}; "
             "rename them, or give --match order"
         )
     elif rule == "auto" and 0 < found < len(pictures) == len(views):
@@ -115,12 +115,12 @@ def match_pictures(
         )
     elif rule == "auto" and by_name and not found and _first_number(pictures) is None:
         problem = (
-            f"the pictures' numbers (such as {pictures[0]!r}) are none of the views' {view} and "
+            f"the pictures' numbers (such as {pictures[0]!r}) are none of the views' {such} and "
             "do not count on by 1; name them like the views, or, for the order, give --match order"
         )
     elif not found and len(pictures) != len(views):
         problem = (
-            f"{len(pictures)} pictures (first {pictures[0]!r}) for {len(views)} views {view}; "
+            f"{len(pictures)} pictures (first {pictures[0]!r}) for {len(views)} views {such}; "
             "expected names like the views', or as many pictures as views"
         )
     if problem:
