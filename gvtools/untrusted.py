@@ -27,7 +27,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, Protocol
+from typing import IO, TYPE_CHECKING, Any, Protocol, cast
 
 from gvtools.errors import ProjectError
 
@@ -293,9 +293,8 @@ def _files_of(path: Path) -> Iterator[tuple[str, IO[bytes]]]:
             # As a stream, of which nothing is skipped unread.
             stream: Any = LimitedReader(packed, most)
             with tarfile.open(fileobj=stream, mode="r|") as tar:
-                for member in tar:
-                    if (content := tar.extractfile(member)) is not None:
-                        yield member.name, content
+                for member in filter(tarfile.TarInfo.isfile, tar):  # links may lead anywhere
+                    yield member.name, cast("IO[bytes]", tar.extractfile(member))
         return
     with archive(path) as opened:
         for item in opened.infolist():
