@@ -1,7 +1,7 @@
 """Splat files of any format, read into ``Splats``: the one reader of them.
 
-PLY, ``.splat``, ``.ksplat`` and glTF are read here, with counts that the file's size explains. SPZ,
-SOG and compressed PLY are unpacked by gaussforge (SPZ without it by Open3D), and USD by OpenUSD, in
+PLY, ``.splat``, ``.ksplat``, glTF and SOG are read here, with counts that the file's size explains.
+SPZ and compressed PLY are unpacked by gaussforge (SPZ without it by Open3D), and USD by OpenUSD, in
 a child process. Axes stay the file's, but for SPZ, which has right, up, back: its Gaussians are
 turned half around x, as a PLY's mostly are right, down, forward.
 """

@@ -27,7 +27,7 @@ from gvtools.ply import up_comment, write_ply
 from gvtools.runs.layout import RECORD
 from gvtools.runs.run import load_run
 from pipelines.export.formats import ExportOptions
-from pipelines.export.points import UNLIT, glb_of, linear, unlit
+from pipelines.export.points import UNLIT, linear, save_glb, unlit
 from pipelines.export.source import ExportSource
 from pipelines.export.texture import TEXELS, Texture, texture_of
 
@@ -332,13 +332,11 @@ def _save_glb(triangles: Triangles, path: Path, up: Up) -> None:
         attributes = {"TEXCOORD_0": uv.astype(np.float32)}
         material = unlit(baseColorTexture={"index": 0})
         Image.fromarray(texture.image).save(png, "PNG")
-    packed = glb_of(
-        triangles.vertices, attributes, name=NODE, up=up, primitive={"material": 0},
+    save_glb(
+        path, triangles.vertices, attributes, name=NODE, up=up, primitive={"material": 0},
         indices=triangles.faces.astype(np.uint32), picture=png.getvalue(),
         materials=[material], extensionsUsed=[UNLIT],
     )  # fmt: skip
-    with replaced_when_written(path) as temporary:
-        temporary.write_bytes(packed)
 
 
 def _save_obj(triangles: Triangles, path: Path, up: Up) -> None:

@@ -196,18 +196,18 @@ def linear(colors: NDArray[Any]) -> NDArray[np.float32]:
 def write_glb(source: ExportSource, path: Path, options: ExportOptions) -> str:
     """Write one point a voxel with its colour; the node's extras tell origin, frame and up."""
     points = source.points(options, most=MAX_POINTS)
-    packed = glb_of(
+    save_glb(
+        path,
         points.positions,
         {"COLOR_0": linear(points.colors / 255)},
         name=NODE, up=source.up, extras={"voxel": points.edge},
         primitive={"mode": 0, "material": 0}, materials=[unlit()], extensionsUsed=[UNLIT],
     )  # fmt: skip
-    with replaced_when_written(path) as temporary:
-        temporary.write_bytes(packed)
     return f"{source.points_summary(points)} in {path}, in the input's axes"
 
 
-def glb_of(
+def save_glb(
+    path: Path,
     positions: NDArray[np.floating[Any]],
     attributes: Mapping[str, NDArray[Any]],
     *,
@@ -215,8 +215,8 @@ def glb_of(
     up: NDArray[np.float64] | None,
     extras: Mapping[str, Any] | None = None,
     **rest: Any,
-) -> bytes:
-    """A GLB whose node moves positions (N, 3) around 0 to where they are, see ``pack_glb``.
+) -> None:
+    """Write a GLB whose node moves positions (N, 3) around 0 to where they are, see ``pack_glb``.
 
     Its extras tell that move, the frame, and what is up.
     """
@@ -225,7 +225,9 @@ def glb_of(
     told |= {} if up is None else {"up": up.tolist()}
     node = {"name": name, "translation": center.tolist(), "extras": told}
     local = (positions - center).astype(np.float32)
-    return pack_glb({"POSITION": local, **attributes}, node=node, **rest)
+    packed = pack_glb({"POSITION": local, **attributes}, node=node, **rest)
+    with replaced_when_written(path) as temporary:
+        temporary.write_bytes(packed)
 
 
 def unlit(**physical: Any) -> dict[str, Any]:

@@ -30,7 +30,7 @@ from gvtools.sog import META
 from gvtools.splat_files import KHR, RESTS, SRGB, numbered
 from gvtools.splats import SH, TERMS, TO_RUB, Splats, box_middle, turn_gaussians
 from pipelines.export.formats import ExportOptions
-from pipelines.export.points import glb_of, linear, save_usd, usd_stage
+from pipelines.export.points import linear, save_glb, save_usd, usd_stage
 from pipelines.export.source import ExportSource
 
 # Of SPZ's positions: bits with their sign, the most behind the point, and those that its writers
@@ -56,14 +56,9 @@ def write_file(splats: Splats, path: Path, options: ExportOptions) -> str:
     if options.up is not None and path.suffix.lower() in SILENT:
         raise OptionError(f"--up: a {path.suffix} has no place for it; leave it out")
     with replaced_when_written(path, suffix="".join(path.suffixes[-2:]).lower()) as temporary:
-        note = writer_of(path)(splats, temporary, options)
+        ends = (end for end in WRITERS if path.name.lower().endswith(end))
+        note = WRITERS[next(ends)](splats, temporary, options)
     return f"{splats.summary()} in {path}{note}"
-
-
-def writer_of(path: Path) -> Callable[[Splats, Path, ExportOptions], str]:
-    """The function that writes a file of a name."""
-    name = path.name.lower()
-    return next(writer for end, writer in WRITERS.items() if name.endswith(end))
 
 
 def _write_ply(splats: Splats, path: Path, options: ExportOptions) -> str:
@@ -165,20 +160,15 @@ def _write_by_open3d(splats: Splats, path: Path, options: ExportOptions) -> str:
 
 
 def _write_sog(splats: Splats, path: Path, options: ExportOptions) -> str:
-    packed = BytesIO(_by_gaussforge(splats, "sog"))
+    packed, told = BytesIO(_by_gaussforge(splats, "sog")), {"antialias": splats.mode == "mip"}
+    told |= {} if splats.up is None else {"up": splats.up.tolist()}
     with ZipFile(packed) as members, ZipFile(path, "w") as out:
         for item in members.infolist():
             content = members.read(item)
             if item.filename == META:
-                content = json.dumps({**json.loads(content), **told_of(splats)}).encode()
+                content = json.dumps({**json.loads(content), **told}).encode()
             out.writestr(item, content)
     return ""
-
-
-def told_of(splats: Splats) -> dict[str, Any]:
-    """What an SOG's ``meta.json`` says beside the Gaussians."""
-    up = {} if splats.up is None else {"up": splats.up.tolist()}
-    return {"antialias": splats.mode == "mip", **up}
 
 
 def _write_compressed(splats: Splats, path: Path, options: ExportOptions) -> str:
@@ -248,11 +238,10 @@ def _write_glb(splats: Splats, path: Path, options: ExportOptions) -> str:
             name = f"{KHR}:SH_DEGREE_{degree}_COEF_{term}"
             parts[name] = splats.harmonics[:, degree**2 + term]
     extension = {KHR: {"kernel": "ellipse", "colorSpace": SRGB}}
-    packed = glb_of(
-        splats.positions + splats.origin, parts, name="gvtools_splats", up=splats.up,
+    save_glb(
+        path, splats.positions + splats.origin, parts, name="gvtools_splats", up=splats.up,
         primitive={"mode": 0, "extensions": extension}, extensionsUsed=[KHR],
     )  # fmt: skip
-    path.write_bytes(packed)
     return ", in the input's axes"
 
 
