@@ -62,6 +62,8 @@ def _cache_somewhere() -> None:
         folder = tempfile.mkdtemp(prefix="gvtools-kernels-")
         atexit.register(shutil.rmtree, folder, ignore_errors=True)
         os.environ["NUMBA_CACHE_DIR"] = folder
+        # Where one has changed, numba reads all its variables again (see gvtools.memory).
+        os.environ.setdefault("NUMBA_THREADING_LAYER_PRIORITY", "omp tbb workqueue")
         numba.config.CACHE_DIR = folder  # type: ignore[attr-defined]
         cached_here_alone = True
 

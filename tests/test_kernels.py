@@ -63,7 +63,10 @@ def test_where_nothing_can_be_written_the_cache_is_a_folder_that_goes(tmp_path):
     code = (
         "from gvtools import kernels; import os; from pathlib import Path;"
         "from gvtools.memory.store import voxel_index;"
-        "assert kernels.cached_here_alone and Path(os.environ['NUMBA_CACHE_DIR']).is_dir()"
+        "assert kernels.cached_here_alone and Path(os.environ['NUMBA_CACHE_DIR']).is_dir();"
+        # An older TBB is warned of where it comes first.
+        "import numba; numba.config.reload_config();"
+        "assert numba.config.THREADING_LAYER_PRIORITY[0] == 'omp'"
     )
     # As numba finds no place beside the sources and none in the home.
     alone = {"NUMBA_CACHE_LOCATOR_CLASSES": "UserProvidedCacheLocator", "TMPDIR": str(tmp_path)}
