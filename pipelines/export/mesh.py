@@ -26,6 +26,7 @@ from gvtools.optional import require
 from gvtools.ply import up_comment, write_ply
 from gvtools.runs.layout import RECORD
 from gvtools.runs.run import load_run
+from gvtools.scenes.faces import DIRECTIONS, face_rotation
 from pipelines.export.formats import ExportOptions
 from pipelines.export.points import UNLIT, linear, save_glb, unlit
 from pipelines.export.source import ExportSource
@@ -150,27 +151,17 @@ def _cameras(memory: SpatialMemory, *, observed: bool) -> Iterator[Cameras]:
     for view in memory.views:
         camera = view.camera
         if view.scanned:
-            yield from _around(camera.centers[0], camera.names[0])
+            for face in DIRECTIONS:
+                pose = np.eye(4)
+                pose[:3, :3] = face_rotation(face)
+                pose[:3, 3] = -pose[:3, :3] @ camera.centers[0]
+                yield Cameras.pinhole(FACE, FACE, focal=FACE / 2, cam_from_world=pose, name=face)
             continue
         arrays = (camera.K, camera.cam_from_world, camera.width, camera.height)
         key = tuple(array.tobytes() for array in arrays)
         if key not in seen and not (observed and view.generated):
             seen.add(key)
             yield camera
-
-
-def _around(center: NDArray[np.float64], name: str) -> Iterator[Cameras]:
-    """Six cameras that together see all around a place, (3,) in the world."""
-    half = FACE / 2
-    K = np.array([[[half, 0, half], [0, half, half], [0, 0, 1.0]]])
-    axes, size = np.eye(3), np.array([FACE])
-    for k in range(3):
-        for forward in (axes[k], -axes[k]):
-            right = axes[k - 1]
-            pose = np.eye(4)
-            pose[:3, :3] = right, np.cross(forward, right), forward
-            pose[:3, 3] = -pose[:3, :3] @ center
-            yield Cameras(K, pose[None], size, size, (f"{name} {forward.tolist()}",))
 
 
 def poisson_mesh(
