@@ -25,6 +25,7 @@ from gvtools.completers.geoverse.video_prior import VideoPrior
 from gvtools.completers.geoverse.wan import (
     EMPTY_PROMPT,
     dtype_of,
+    empty_network,
     expected_tensors,
     load_network,
     network_class,
@@ -295,6 +296,10 @@ def test_impossible_numbers_of_blocks_are_refused(diffusers_source: Path, tmp_pa
     for blocks in (0, 7):
         with pytest.raises(OptionError, match=f"blocks {blocks}; expected 1 to 6"):
             truncate(diffusers_source, tmp_path / "out", blocks=blocks)
+    # They would be built for hours before anything is compared.
+    for part, name in (("transformer", "num_layers"), ("vae", "num_res_blocks")):
+        with pytest.raises(CheckpointError, match=f"{name} 100000000; expected at most 1000"):
+            empty_network(part, {name: 10**8})
 
 
 def test_a_full_disk_is_noticed_before_anything_is_written(diffusers_source, tmp_path, monkeypatch):
