@@ -396,7 +396,9 @@ def _read(
 
     poses[:, :3, :3] = Rotation.from_quat(turns).as_matrix()
     poses[:, :3, 3] = values[:, 1:4]
-    return values[:, 0] + 1e-9 * values[:, 8:].sum(axis=1), poses
+    fraction = 1e-9 * values[:, 8:].sum(axis=1)
+    # A whole time in nanoseconds beside that in seconds says the same again.
+    return values[:, 0] + fraction * (np.abs(fraction).max() < 1), poses
 
 
 def _matrix(words: list[str], count: int, *, where: str) -> tuple[float, Float64]:
