@@ -276,13 +276,13 @@ def _read_ksplat(path: Path) -> Splats:
         )
     low, high = struct.unpack_from("<2f", data, 36)
     low, high = (low, high) if low < high else (-KSPLAT_RANGE, KSPLAT_RANGE)
-    offset, parts = KSPLAT_HEAD + KSPLAT_SECTION * sections, []
+    offset = KSPLAT_HEAD + KSPLAT_SECTION * sections
+    parts = list[tuple[NDArray[np.float32], NDArray[np.float64]]]()
     for number in range(sections):
         place = KSPLAT_HEAD + KSPLAT_SECTION * number
         part, offset = _ksplat_section(data, place, offset, level=level, sh_range=(low, high))
-        parts.append(part)
-    width = min((part.shape[1] for part in parts), default=0)
-    return _splats(np.concatenate([part[:, :width] for part in parts]))
+        parts.append((part, np.zeros(3)))
+    return _splats(_joined(parts)[0])
 
 
 def _ksplat_section(
