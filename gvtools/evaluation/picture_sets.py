@@ -30,6 +30,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -150,11 +151,11 @@ def _by_name(
 
     Names with and without folders, and without what all views share: what finds most partners is
     taken, among all views where any is found, else among those to be judged. Zeros in front of
-    numbers count where the pictures' numbers may merely count them, from 0 or 1.
+    numbers do not count, unless the pictures' numbers may merely count them, from 0 or 1.
     """
     every, best = (*views, *others), list[list[int]]()
-    padded = _first_number(pictures) in (0, 1)
-    for judged in (len(every), len(views)):
+    forms = (True,) if _first_number(pictures) in (0, 1) else (True, False)
+    for judged, padded in product((len(every), len(views)), forms):
         best = [[] for _ in every[:judged]]
         for view_folders in (True, False):
             whole = [_key(name, folders=view_folders, padded=padded) for name in every]
@@ -180,14 +181,14 @@ def _by_name(
 
 
 def _first_number(names: Sequence[str]) -> int | None:
-    """From where numbered names count on; None where they do not, as times and dates.
+    """From where names count that are numbers; None where they do not; -1 of others.
 
-    >>> _first_number(["r_2.png", "r_3.png"]), _first_number(["r_4.png", "r_8.png"])
-    (2, None)
+    >>> [_first_number([f"r_{n}.png" for n in pair]) for pair in ("23", "48", "ab")]
+    [2, None, -1]
     """
     numbers = _without_affixes([_key(name, folders=False) for name in names])
     if not all(re.fullmatch(r"\d[\d._-]*", number) for number in numbers):
-        return 0
+        return -1
     if not all(map(str.isdecimal, numbers)):
         return None
     found = sorted(map(int, numbers))

@@ -326,6 +326,13 @@ def test_pictures_of_other_views_and_times_stand_for_none(pictures, views, other
     assert match_pictures(names[0], names[1], rule="order").picture_of == (0, 1, 2)
 
 
+def test_names_of_other_views_without_their_zeros_are_refused():
+    with pytest.raises(OptionError, match="views that are not judged"):
+        match_pictures(
+            ["a_1.png", "b_1.png"], ["a_00.jpg", "b_00.jpg"], others=["a_01.jpg", "b_01.jpg"]
+        )
+
+
 def test_numbers_without_zeros_and_folders_that_are_joined_find_their_views():
     found = match_pictures(["4.png", "12.png"], ["f_0012.jpg", "f_0004.jpg"], others=["f_0000.jpg"])
     assert (found.rule, found.picture_of) == ("name", (1, 0))
