@@ -41,7 +41,8 @@ FEW_COLORS = 4
 # called blurred. [pixels]
 JUDGED_HEIGHT, BLURRED = 480, 0.15
 # Pictures at this size [pixels] show the same where they correlate by more; those of a series,
-# which may be alike, by more; others, too, that differ by less on average [grey levels].
+# which may be alike, by more and with less difference on average, by which others are known, too
+# [grey levels].
 THUMBNAIL, SAME, EXACT, NEAR = (32, 32), 0.9985, 0.9999, 1.5
 # Where the median itself is below this, all are called soft (photographs in focus: 100 and more).
 SOFT = 10.0
@@ -149,11 +150,11 @@ def _copies(found: Sequence[CapturedPhotograph]) -> list[str]:
     copies: list[str] = []
     kept: list[int] = []
     for number, item in enumerate(order):
-        alike = np.array([way[number] @ units[0][kept].T for way in units]) > SAME
+        alike = np.array([way[number] @ units[0][kept].T for way in units])
         series = np.array([_one_form(item, order[row]) for row in kept], np.bool_)
-        apart = np.abs(grey[kept] - grey[number]).mean(axis=(1, 2))
-        alike[0] = np.where(series, units[0][kept] @ units[0][number] > EXACT, alike[0])
-        if alike.any() or (apart < NEAR)[~series].any():
+        near = np.abs(grey[kept] - grey[number]).mean(axis=(1, 2)) < NEAR
+        same = (alike > SAME).any(axis=0) | near
+        if np.where(series, near & (alike[0] > EXACT), same).any():
             copies.append(item.name)
         else:
             kept.append(number)
@@ -161,9 +162,11 @@ def _copies(found: Sequence[CapturedPhotograph]) -> list[str]:
 
 
 def _one_form(a: CapturedPhotograph, b: CapturedPhotograph) -> bool:
-    """Whether pictures may be two of a series: of one size and kind, no name part of the other."""
-    stems = sorted((a.path.stem, b.path.stem), key=len)
-    return (a.size, a.path.suffix) == (b.size, b.path.suffix) and stems[0] not in stems[1]
+    """Whether pictures may be two of a series: of one size and kind, no name made of the other."""
+    short, long = sorted((a.path.stem, b.path.stem), key=len)
+    added = long.replace(short, "", 1)
+    other = short not in long or not added or added.isdigit()
+    return (a.size, a.path.suffix) == (b.size, b.path.suffix) and other
 
 
 def _look_at(path: Path, name: str) -> CapturedPhotograph:

@@ -8,7 +8,7 @@ import os
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from walls import write_project
+from walls import blotches, camera_at, photograph, write_project
 
 from gvtools.scenes.inspection import inspect
 from gvtools.scenes.pose_forms import pose_findings
@@ -50,6 +50,22 @@ def test_the_form_of_poses_is_told_by_the_photographs(room, change, reason):
     found = [item.message for item in pose_findings(open_project(file))]
     assert len(found) == (reason is not None)
     assert all("do not fit the photographs" in line and reason in line for line in found)
+
+
+def test_focal_lengths_of_pictures_that_were_cropped(tmp_path):
+    textures = [blotches(np.random.default_rng(3 + wall)) for wall in range(3)]
+    places = [
+        ((0.5 * i - 1.2, -0.2 * i, 0.35 * i), (5 * i - 5, 25 - 22 * i, 8 * i)) for i in range(3)
+    ]
+    cameras = [camera_at(at, turn=turn, scale=1.6, name=f"{at[0]:.1f}.png") for at, turn in places]
+    file = write_project(tmp_path / "room", [photograph(each, textures) for each in cameras])
+    assert pose_findings(open_project(file)) == []
+    data = json.loads(file.read_text())
+    for frame in data["frames"]:
+        frame |= {key: 0.8 * frame[key] for key in ("fl_x", "fl_y")}
+    file.write_text(json.dumps(data))
+    (found,) = pose_findings(open_project(file))
+    assert "focal lengths 1.25 times as long fit" in found.message
 
 
 def test_a_project_beside_the_working_folder_is_read(room, monkeypatch):
