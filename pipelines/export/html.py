@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 MAX_POINTS = 400_000
 # Pictures beside the scene, and the longer side of each [px].
 MOST_PICTURES, SIDE = 200, 160
+# Browsers hold no text of more than 512 MB; so many Gaussians take 128 at most.
+MOST_IN_GROUP = 1_000_000
 # Nearest that points are drawn, where there is no fit, in typical depths.
 NEAR = 0.01
 
@@ -83,18 +85,15 @@ def _groups(splats: Splats) -> Iterator[PageGroup]:
     fitted = np.arange(len(splats)) < (len(splats) if splats.fitted is None else splats.fitted)
     keys = np.stack([splats.rounds, splats.generated, fitted], axis=1)
     for number, generated, whole in np.unique(keys, axis=0):
-        chosen = (keys == (number, generated, whole)).all(axis=1)
-        part = replace(
+        chosen = np.flatnonzero((keys == (number, generated, whole)).all(axis=1))
+        for rows in np.array_split(chosen, -(-len(chosen) // MOST_IN_GROUP)):
             # Points have one colour each.
-            splats, values=splats.values[chosen, : None if whole else SH + 3],
-            rounds=splats.rounds[chosen],
-            generated=splats.generated[chosen], fitted=int(chosen.sum()) if whole else 0,
-        )  # fmt: skip
-        words = pack_gaussians(
-            part.positions, log_scales=part.log_scales, quaternions=part.quaternions,
-            logits=part.logits, harmonics=part.harmonics,
-        )  # fmt: skip
-        yield PageGroup(int(number), bool(generated), bool(whole), words)
+            part = replace(splats, values=splats.values[rows, : None if whole else SH + 3])
+            words = pack_gaussians(
+                part.positions, log_scales=part.log_scales, quaternions=part.quaternions,
+                logits=part.logits, harmonics=part.harmonics,
+            )  # fmt: skip
+            yield PageGroup(int(number), bool(generated), bool(whole), words)
 
 
 def _cameras(source: ExportSource) -> Iterator[PageCamera]:

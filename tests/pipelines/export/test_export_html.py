@@ -106,13 +106,15 @@ def scene_of(path):
     return json.loads(data), groups
 
 
-def test_groups_tell_rounds_and_sources(fitted_run, bare_run, tmp_path):
+def test_groups_tell_rounds_and_sources(fitted_run, bare_run, tmp_path, monkeypatch):
+    monkeypatch.setattr("pipelines.export.html.MOST_IN_GROUP", 1000)
     for run in (fitted_run, bare_run):
         out = tmp_path / "page.html"
         export_run(run.folder, "html", out)
         data, groups = scene_of(out)
         splats = ExportSource(run.folder, run.memory).splats(ExportOptions(), exposed=False)
         assert sum(words.shape[1] for *_, words in groups) == len(splats)
+        assert max(words.shape[1] for *_, words in groups) <= 1000 < len(splats)
         assert {(r, bool(g)) for r, g, *_ in groups} == set(
             zip(splats.rounds.tolist(), splats.generated.tolist(), strict=True)
         )
@@ -188,7 +190,8 @@ def psnr(one, two):
 
 
 @pytest.mark.slow
-def test_the_page_shows_what_the_run_does(scene, fitted_run, tmp_path):
+def test_the_page_shows_what_the_run_does(scene, fitted_run, tmp_path, monkeypatch):
+    monkeypatch.setattr("pipelines.export.html.MOST_IN_GROUP", 1000)
     out = tmp_path / "page.html"
     export_run(fitted_run.folder, "html", out)
     camera = scene.views[1].camera
