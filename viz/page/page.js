@@ -20,7 +20,7 @@ const view = { position: new Vector3(), turn: new Quaternion(), lens: [1, 1, 1, 
 const shown = { round: scene.rounds.at(-1), observed: true, generated: true };
 const groups = [], keys = new Set();
 let renderer, spark, target, quad, world, camera, controls, flight, saving, written, last;
-let walking = false, dirty = true, size = [0, 0];
+let walking = false, dirty = true, elsewhere = true, size = [0, 0];
 
 function fail(textContent) {
   Object.assign(find("problem"), { textContent, hidden: false });
@@ -147,6 +147,9 @@ function frame(time) {
   dirty = false;
   place();
   expose();
+  // Spark by itself would sort anew after 2.6 degrees or 0.001 scene units alone.
+  if (elsewhere) spark.sortedDir.setScalar(0);
+  elsewhere = false;
   renderer.setRenderTarget(target);
   renderer.render(world, camera);
   renderer.setRenderTarget(null);
@@ -170,7 +173,7 @@ function place() {
 }
 
 function moved() {
-  dirty = true;
+  dirty = elsewhere = true;
   document.querySelector("#photographs [aria-current]")?.removeAttribute("aria-current");
   clearTimeout(saving);
   saving = setTimeout(writeAddress, 300);
