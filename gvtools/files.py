@@ -197,6 +197,20 @@ def make_folder(path: Path) -> None:
         ) from error
 
 
+@contextmanager
+def folder_for_results(path: Path) -> Iterator[None]:
+    """A folder that is made before the work; a failure that leaves a new one empty removes it."""
+    new = not path.exists()
+    make_folder(path)
+    try:
+        yield
+    except BaseException:
+        if new:
+            with suppress(OSError):
+                path.rmdir()
+        raise
+
+
 def write_text(path: Path, text: str) -> None:
     """Write a whole text file (UTF-8) under its final name only when it is complete.
 

@@ -66,7 +66,7 @@ class EvaluateCommand(MeasurementArguments, ProtocolArguments, SceneArguments):
 
     def run(self, console: Console) -> None:
         from gvtools.evaluation.published import benchmark_names
-        from gvtools.files import make_folder, write_json
+        from gvtools.files import folder_for_results, write_json
         from pipelines.scoring import evaluation
 
         shown = benchmark_names() if "all" in self.against else self.against
@@ -79,19 +79,19 @@ class EvaluateCommand(MeasurementArguments, ProtocolArguments, SceneArguments):
         if self.protocol is not None:
             paths = [_run_protocol(self, self.protocol, out, console=console)]
         runs = evaluation.load_runs(paths, project=self.project)
-        make_folder(out)  # before the work, which a folder that cannot be made would cost
-        evaluations = evaluation.evaluate_runs(runs, options, console=console)
-        figures = evaluation.write_evaluation(
-            runs,
-            evaluations,
-            options,
-            name=self.name,
-            data_set=self.data_set,
-            benchmarks=benchmarks,
-            shown=shown,
-            out=out,
-            console=console,
-        )
+        with folder_for_results(out):
+            evaluations = evaluation.evaluate_runs(runs, options, console=console)
+            figures = evaluation.write_evaluation(
+                runs,
+                evaluations,
+                options,
+                name=self.name,
+                data_set=self.data_set,
+                benchmarks=benchmarks,
+                shown=shown,
+                out=out,
+                console=console,
+            )
         if self.json_ is not None:
             write_json(self.json_, figures)
 
@@ -163,24 +163,24 @@ class JudgeCommand(MeasurementArguments, SceneArguments):
     """Views on contact sheets. [N]"""
 
     def run(self, console: Console) -> None:
-        from gvtools.files import make_folder, write_json
+        from gvtools.files import folder_for_results, write_json
         from pipelines.scoring.judging import judge
         from pipelines.scoring.method_pictures import method_names
 
         names = method_names(self.pictures, self.name)
         _check_apart(self.pictures, self.out)
         options = self.measures()
-        make_folder(self.out)
-        figures = judge(
-            self.pictures,
-            names,
-            _reference(self, console),
-            options=options,
-            rule=self.match,
-            sheet_views=self.sheet_views,
-            out=self.out,
-            console=console,
-        )
+        with folder_for_results(self.out):
+            figures = judge(
+                self.pictures,
+                names,
+                _reference(self, console),
+                options=options,
+                rule=self.match,
+                sheet_views=self.sheet_views,
+                out=self.out,
+                console=console,
+            )
         if self.json_ is not None:
             write_json(self.json_, figures)
 

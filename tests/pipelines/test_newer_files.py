@@ -39,7 +39,7 @@ def test_a_newer_memory_asks_for_a_newer_program(tmp_path, capsys):
     ],
 )
 def test_unknown_suffixes_list_what_opens(tmp_path, capsys, words, opened):
-    file = tmp_path / "a.zip"
+    file = tmp_path / "a.rar"
     file.write_bytes(b"PK\x03\x04" + bytes(99))
     assert opened in refused(capsys, *(word.format(file) for word in words))
     assert list(tmp_path.iterdir()) == [file]
