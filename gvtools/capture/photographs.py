@@ -42,8 +42,8 @@ FEW_COLORS = 4
 JUDGED_HEIGHT, BLURRED = 480, 0.15
 # Pictures at this size [pixels] show the same where they correlate by more; those of a series,
 # which may be alike, by more and with less difference on average, by which others are known, too
-# [grey levels].
-THUMBNAIL, SAME, EXACT, NEAR = (32, 32), 0.9985, 0.9999, 1.5
+# [grey levels]. Their detail, freed of what varies slowly, correlates as well: skies are all alike.
+THUMBNAIL, SAME, EXACT, NEAR, DETAIL = (32, 32), 0.9985, 0.9999, 1.5, 0.9
 # Where the median itself is below this, all are called soft (photographs in focus: 100 and more).
 SOFT = 10.0
 
@@ -140,25 +140,32 @@ def find_photographs(folder: Path) -> tuple[list[CapturedPhotograph], list[Findi
 
 def _copies(found: Sequence[CapturedPhotograph]) -> list[str]:
     """Names of pictures that show what larger ones, or as large ones of shorter names, show."""
+    from scipy.ndimage import gaussian_filter
+
     order = sorted(found, key=lambda item: (-item.size[0] * item.size[1], len(item.name)))
     grey = np.array([item.thumbnail for item in order], np.float32).reshape(-1, *THUMBNAIL)
-    # As they stand, turned and mirrored.
-    ways = [np.rot90(side, k, (1, 2)) for side in (grey, grey[:, :, ::-1]) for k in range(4)]
-    flat = [way.reshape(len(order), THUMBNAIL[0] * THUMBNAIL[1]) for way in ways]
-    flat = [way - way.mean(axis=1, keepdims=True) for way in flat]
-    units = [way / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-6) for way in flat]
+    whole, detail = _all_ways(grey), _all_ways(grey - gaussian_filter(grey, (0, 2, 2)))
     copies: list[str] = []
     kept: list[int] = []
     for number, item in enumerate(order):
-        alike = np.array([way[number] @ units[0][kept].T for way in units])
+        alike, fine = (ways[:, number] @ ways[0][kept].T for ways in (whole, detail))
         series = np.array([_one_form(item, order[row]) for row in kept], np.bool_)
         near = np.abs(grey[kept] - grey[number]).mean(axis=(1, 2)) < NEAR
-        same = (alike > SAME).any(axis=0) | near
+        same = ((alike > SAME) & (fine > DETAIL)).any(axis=0) | (near & (fine[0] > DETAIL))
         if np.where(series, near & (alike[0] > EXACT), same).any():
             copies.append(item.name)
         else:
             kept.append(number)
     return sorted(copies, key=natural_key)
+
+
+def _all_ways(pictures: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(8, N, pixels) unit vectors of pictures as they stand, turned and mirrored."""
+    ways = [np.rot90(side, k, (1, 2)) for side in (pictures, pictures[:, :, ::-1])
+            for k in range(4)]  # fmt: skip
+    flat = np.reshape(ways, (8, len(pictures), THUMBNAIL[0] * THUMBNAIL[1]))
+    flat = flat - flat.mean(axis=2, keepdims=True)
+    return flat / np.maximum(np.linalg.norm(flat, axis=2, keepdims=True), np.float32(1e-6))
 
 
 def _one_form(a: CapturedPhotograph, b: CapturedPhotograph) -> bool:

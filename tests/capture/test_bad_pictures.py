@@ -80,6 +80,16 @@ def test_copies_and_pictures_of_systems_are_left_out_by_content(
     assert "3 pictures lie in hidden folders" in said[1]
 
 
+def test_photographs_below_one_sky_upright_and_across_are_no_copies(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    for index in range(4):
+        height, width = (400, 300) if index % 2 else (300, 400)
+        hazy = np.linspace(120, 220, height)[:, None] + rng.normal(0, 3, (height, width))
+        hazy[60 + 30 * index : 100 + 30 * index, 50 + 20 * index : 90 + 20 * index] -= 40
+        Image.fromarray(hazy.astype(np.uint8)).save(tmp_path / f"{index}.jpg")
+    assert len(find_photographs(tmp_path)[0]) == 4
+
+
 def test_what_is_no_photograph_is_left_out_by_content(texture: Image.Image, tmp_path: Path) -> None:
     for index in range(3):
         texture.crop((40 * index, 0, 40 * index + 480, 360)).save(tmp_path / f"{index}.png")
