@@ -1,4 +1,4 @@
-"""What training ``base`` takes on one, eight and sixty-four cards, by counted operations.
+"""Cost of training ``base`` on one, eight and sixty-four cards, by counted operations.
 
     python -m benchmarks.training_cost
 

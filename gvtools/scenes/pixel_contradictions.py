@@ -95,11 +95,13 @@ class PixelCheck:
         """A warning where photographs and detections disagree."""
         judged = self.agreements()
         wrong = [n for n, s in judged.items() if s < AGREE]
-        if not wrong or (self.rough and np.median([*judged.values()]) >= AGREE):
+        if self.rough and np.median([*judged.values()] or [1]) >= AGREE:
             return []
         # Right ones that were compared with wrong ones are cleared.
         judged |= self.agreements(wrong)
         wrong = sorted((n for n in wrong if judged[n] < AGREE), key=lambda n: judged[n])
+        if not wrong:
+            return []
         names = ", ".join(
             f"{self.scene.views[number].name} ({judged[number]:.2f})" for number in wrong[:NAMED]
         )

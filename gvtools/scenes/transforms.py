@@ -54,8 +54,6 @@ PERSPECTIVE = ("", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPEN
 UNBENT = PERSPECTIVE[1:3]
 FISHEYE = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 
-# Keys that list the pictures of splits.
-LISTS = ("train_filenames", "val_filenames", "test_filenames")
 # Keys that each frame has for itself.
 OF_A_FRAME = ("transform_matrix", "mask_path", "depth_file_path", "depth_path")
 # What tells the focal length along an axis: pixels, or a field of view in radians or degrees.
@@ -197,16 +195,14 @@ def _listed(path: Path) -> tuple[list[_Listed], list[Finding]]:
         ]
         cloud = data.get("ply_file_path")
         parts = [name for name in SPLITS.values() if (path.parent / name).is_file()]
-        lists = [key for key in LISTS if data.get(key)]
+        lists = [key for key in data if key.endswith("_filenames") and data[key]]
         unused = {
             f"ply_file_path ({reprlib.repr(cloud)}) is not read: depth comes from pictures": cloud,
             f"{named(parts)} beside {path.name}: not read; give its path to read it": parts,
             f"{named(lists)}: not read; give such names by --context and --targets": lists,
         }
-        return listed, [
-            *findings,
-            *(Finding("info", line) for line, there in unused.items() if there),
-        ]
+        findings += [Finding("info", line) for line, there in unused.items() if there]
+        return listed, findings
     splits, found = dict[Path, str](), list[_Listed]()
     sizes, findings = dict.fromkeys(SPLITS, 0), list[Finding]()
     for split, name in SPLITS.items():

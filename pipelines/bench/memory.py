@@ -371,14 +371,18 @@ def model_without_numbers(config: GeoVerseConfig) -> GeoVerse:
 GB = 1e9
 
 
+def pass_of(figures: dict[str, Any]) -> str:
+    """The network, its views and steps of a table, for the user."""
+    size = "x".join(map(str, figures["size"]))
+    return (
+        f"{figures['config']}, {figures['context']} + {figures['targets']} views of {size}, "
+        f"{figures['steps']} + {figures['cascade_steps']} steps, {figures['precision']}"
+    )
+
+
 def show_memory(figures: dict[str, Any], console: Console) -> None:
     """Tables of a pass and of a training step in GB (10^9 bytes), and a line about the card."""
-    size = "x".join(map(str, figures["size"]))
-    console.line(
-        f"{figures['config']}, {figures['context']} + {figures['targets']} views of {size}, "
-        f"{figures['steps']} + {figures['cascade_steps']} steps, {figures['precision']}: "
-        "peak memory of a pass, GB"
-    )
+    console.line(f"{pass_of(figures)}: peak memory of a pass, GB")
     for model in dict.fromkeys(row["model"] for row in figures["inference"]):
         _show_pass(model, [r for r in figures["inference"] if r["model"] == model], console)
     console.line(f"a training step of one sample, {figures['training_precision']}: peak memory, GB")

@@ -31,6 +31,7 @@ from pipelines.bench.memory import (
     alone,
     fake_tensors,
     model_without_numbers,
+    pass_of,
     run_without_numbers,
 )
 from pipelines.bench.options import CompleteOptions
@@ -197,12 +198,7 @@ def _pass(options: CompleteOptions, config: GeoVerseConfig) -> dict[str, Counter
 
 def show_prediction(figures: dict[str, Any], console: Console) -> None:
     """One table, in ms."""
-    size = "x".join(map(str, figures["size"]))
-    console.line(
-        f"{figures['config']}, {figures['context']} + {figures['targets']} views of {size}, "
-        f"{figures['steps']} + {figures['cascade_steps']} steps, {figures['precision']}, not "
-        "compiled: predicted ms"
-    )
+    console.line(f"{pass_of(figures)}, not compiled: predicted ms")
     console.table(
         ("stage", "TFLOP", "GB", "kernels", *(card.name for card in CARDS)),
         [

@@ -24,6 +24,10 @@ pytestmark = pytest.mark.usefixtures("unpainted")
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
+def refused_poses(capsys, images, poses, out):
+    return refused(capsys, "capture", images, "--poses", poses, "--out", out)
+
+
 @pytest.fixture(scope="module")
 def truth(room):
     """The room's true cameras and pictures."""
@@ -192,9 +196,7 @@ def test_a_wrong_count_is_refused(truth, depths, room, tmp_path, capsys):
     (tmp_path / "model.safetensors").touch()
     shutil.copytree(room / "images", tmp_path / "fewer")
     next(iter(sorted((tmp_path / "fewer").iterdir()))).unlink()
-    line = refused(
-        capsys, "capture", tmp_path / "fewer", "--poses", poses.parent, "--out", tmp_path / "out"
-    )
+    line = refused_poses(capsys, tmp_path / "fewer", poses.parent, tmp_path / "out")
     assert "10 cameras without names" in line and "9 pictures" in line
     assert not (tmp_path / "out").exists()
 
@@ -210,10 +212,7 @@ def test_pictures_in_another_order_are_refused(truth, room, tmp_path, capsys):
         tmp_path / "x.npz", extrinsics=cameras.cam_from_world, intrinsics=cameras.K,
         images=np.roll(faint, 1, axis=0),
     )  # fmt: skip
-    line = refused(
-        capsys, "capture", tmp_path / "images", "--poses", tmp_path / "x.npz", "--out",
-        tmp_path / "out",
-    )  # fmt: skip
+    line = refused_poses(capsys, tmp_path / "images", tmp_path / "x.npz", tmp_path / "out")
     assert "picture 1 is to be 0.png, which looks like number 2" in line
 
 
@@ -226,19 +225,14 @@ def test_pictures_of_several_shapes_need_those_of_the_network(truth, room, tmp_p
         tmp_path / "x.npz", extrinsics=cameras.cam_from_world, intrinsics=cameras.K,
         depth=np.ones((10, 70, 84)),
     )  # fmt: skip
-    line = refused(
-        capsys, "capture", tmp_path / "images", "--poses", tmp_path / "x.npz", "--out",
-        tmp_path / "out",
-    )  # fmt: skip
+    line = refused_poses(capsys, tmp_path / "images", tmp_path / "x.npz", tmp_path / "out")
     assert "of 84x70 pixels, and the photographs are of several shapes" in line
 
 
 def test_a_name_that_two_cameras_share_is_no_pictures(truth, room, tmp_path, capsys):
     cameras = replace(truth[0], names=tuple(f"{'ab'[row % 2]}/{row // 2}.png" for row in range(10)))
     write_colmap(tmp_path / "sparse", cameras)
-    line = refused(
-        capsys, "capture", room / "images", "--poses", tmp_path, "--out", tmp_path / "out"
-    )
+    line = refused_poses(capsys, room / "images", tmp_path, tmp_path / "out")
     assert "cameras of a/0.png" in line
 
 
@@ -270,9 +264,7 @@ def test_poses_alone_of_pictures_without_features_become_a_project(truth, tmp_pa
 )  # fmt: skip
 def test_other_files_are_refused(arrays, reason, room, tmp_path, capsys):
     np.savez(tmp_path / "x.npz", **arrays)
-    line = refused(
-        capsys, "capture", room / "images", "--poses", tmp_path / "x.npz", "--out", tmp_path / "o"
-    )
+    line = refused_poses(capsys, room / "images", tmp_path / "x.npz", tmp_path / "o")
     assert reason in line
 
 

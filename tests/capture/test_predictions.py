@@ -1,4 +1,4 @@
-"""What networks save of cameras and points, read: layouts, and what is refused."""
+"""Predictions of networks: the layouts that are read, and what is refused."""
 
 from __future__ import annotations
 
