@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from gvtools.errors import GvError, MemoryFileError, OptionError
 from gvtools.glb import drawn_nodes, glb_numbers, split_glb
 from gvtools.optional import installed, require
-from gvtools.ply import Header, read_header, read_ply
+from gvtools.ply import read_header, read_ply
 from gvtools.sandbox import Item, ReaderError, read_apart
 from gvtools.sog import META, read_sog
 from gvtools.splats import (
@@ -179,7 +179,7 @@ def _logarithms(sizes: Any) -> NDArray[np.float64]:
 
 def _read_ply(path: Path) -> Splats:
     header = read_header(path)
-    told = _told(header)
+    told = told_by(header.comments)
     if any(PACKED in dict(item.columns) for item in header.elements):
         return _splats(_unpacked(path, form="compressed.ply"), **told)
     rows = read_ply(path, strict=False)
@@ -216,13 +216,13 @@ def _ply_values(rows: NDArray[np.void], center: ArrayLike = 0) -> NDArray[np.flo
     )  # fmt: skip
 
 
-def _told(header: Header) -> dict[str, Any]:
-    """What a PLY's comments say of its origin, what is up, and how to draw it.
+def told_by(comments: Iterable[str]) -> dict[str, Any]:
+    """What comments of a file say of its origin, what is up, and how to draw it.
 
     Brush writes "SplatRenderMode: mip", Postshot "antialiased 1".
     """
     told: dict[str, Any] = {}
-    for comment in header.comments:
+    for comment in comments:
         name, _, value = comment.lower().partition(" ")
         if name in ("origin", "up"):
             with suppress(ValueError):
@@ -421,7 +421,7 @@ def _joined(
 
 def _read_glb(path: Path) -> Splats:
     tree, body = split_glb(read_bytes(path))
-    parts, up = [], np.array([0.0, 1, 0])
+    parts = []
     for node, matrix in drawn_nodes(tree):
         for part in tree["meshes"][node["mesh"]]["primitives"] if "mesh" in node else ():
             extension = part.get("extensions", {}).get(KHR)
@@ -436,13 +436,23 @@ def _read_glb(path: Path) -> Splats:
                 raise MemoryFileError(
                     f"colours in {extension['colorSpace']!r:.40}; expected {SRGB}; save it in sRGB"
                 )
-            if "up" in node.get("extras", {}):
-                up = matrix[:3, :3] @ np.asarray(node["extras"]["up"], np.float64)
             parts.append(place_gaussians(_glb_rows(tree, body, part["attributes"]), matrix))
             if sum(len(values) for values, _ in parts) * LEAST_BYTES > len(body):
                 raise ValueError("nodes that draw a set several times")
     values, center = _joined(parts)
-    return _splats(values, center=center, up=_unit(up))
+    return _splats(values, center=center, up=glb_up(tree))
+
+
+def glb_up(tree: Mapping[str, Any]) -> NDArray[np.float64] | None:
+    """(3,) what is up in a glTF's scene: what a node's extras say, else y, as the standard has it.
+
+    >>> glb_up({"nodes": [{"extras": {"up": [0, 0, 2]}}]})
+    array([0., 0., 1.])
+    """
+    for node, matrix in drawn_nodes(dict(tree)):
+        if "up" in node.get("extras", {}):
+            return _unit(matrix[:3, :3] @ np.asarray(node["extras"]["up"], np.float64))
+    return np.array([0.0, 1, 0])
 
 
 def _glb_rows(

@@ -10,6 +10,7 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +22,7 @@ from gvtools.glb import GLB, glb_array, join_glb, split_glb
 from gvtools.optional import require
 from gvtools.ply import read_header
 from gvtools.sandbox import ReaderError, read_apart
-from gvtools.splat_files import USD
+from gvtools.splat_files import USD, glb_up, told_by
 from gvtools.untrusted import PIXEL_BYTES, PIXEL_RATIO, read_bytes
 
 if TYPE_CHECKING:
@@ -61,6 +62,18 @@ def load_mesh(path: Path) -> trimesh.Trimesh | trimesh.PointCloud:
             raise MemoryFileError(f"{path}: a triangle of vertices that are not there")
     geometry: trimesh.Trimesh | trimesh.PointCloud = loaded
     return geometry
+
+
+def told_up(path: Path) -> NDArray[np.float64] | None:
+    """(3,) what is up, as a PLY, an OBJ or a GLB says; None where it does not."""
+    suffix = path.suffix.lower()
+    if suffix == ".ply":
+        return told_by(read_header(path).comments).get("up")
+    data = read_bytes(path)
+    if suffix == ".glb":
+        return glb_up(split_glb(data)[0])
+    lines = takewhile(lambda line: line.startswith(b"#"), data.splitlines())
+    return told_by(line[1:].strip().decode(errors="replace") for line in lines).get("up")
 
 
 def _beside(path: Path) -> Any:

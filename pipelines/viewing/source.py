@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,7 +26,7 @@ from gvtools.splat_files import READERS, holds_splats, read_splats
 from pipelines.export.formats import ExportOptions
 from pipelines.export.html import page_of
 from pipelines.export.source import ExportSource
-from pipelines.viewing.readers import GREY, load_mesh, read_usd
+from pipelines.viewing.readers import GREY, load_mesh, read_usd, told_up
 from viz.viewer.run_view import (
     MESH,
     POINTS,
@@ -65,7 +66,11 @@ class ViewSource:
         """The run as it is now."""
         if not (self.path / RECORD).is_file():
             shown = open_file(self.path)
-            return self._run_view(load_memory(self.path)) if shown is None else shown
+            if shown is None:
+                shown = self._run_view(load_memory(self.path))
+                is_ply = self.path.suffix.lower() == ".ply"
+                shown = replace(shown, told_up=told_up(self.path) if is_ply else None)
+            return shown
         run = load_growing_run(self.path, project=self.project)
         if self._frames.run is None:
             self._frames = ProjectFrames(run)
@@ -185,10 +190,13 @@ def _open_mesh(path: Path) -> RunView:
     loaded = load_mesh(path)
     if isinstance(loaded, trimesh.PointCloud):
         colors = np.asarray(loaded.colors)[:, :3] if len(loaded.colors) else None
-        return _points_view(path, np.asarray(loaded.vertices), colors)
+        return _points_view(path, np.asarray(loaded.vertices), colors, up=told_up(path))
     vertices, colors = np.asarray(loaded.vertices, np.float64), _vertex_colors(loaded)
     mesh = ColoredMesh(vertices, np.asarray(loaded.faces), colors)
-    return RunView(path, _memory(path, vertices, colors), looks=(MESH, POINTS), surface=mesh)
+    return RunView(
+        path, _memory(path, vertices, colors), looks=(MESH, POINTS), surface=mesh,
+        told_up=told_up(path),
+    )  # fmt: skip
 
 
 def _vertex_colors(mesh: trimesh.Trimesh) -> NDArray[np.uint8]:

@@ -268,6 +268,16 @@ def test_a_runs_gaussians_are_those_of_its_export(run, exported):
     assert fitted < len(drawn(shown, 20)[0]) <= fitted + 20
 
 
+@pytest.mark.parametrize(
+    ("name", "form"),
+    [("up.ply", "ply"), ("mesh.ply", "mesh"), ("mesh.obj", "mesh"), ("mesh.glb", "mesh"),
+     ("up.glb", "glb"), ("splats.glb", "splat")],
+)  # fmt: skip
+def test_what_a_file_says_is_up_is_up(exported, name, form):
+    shown = ViewSource(exported(name, form, "--up", 0, -3, 4)).read()
+    np.testing.assert_allclose(shown.up(), [0, -0.6, 0.8], atol=1e-12)
+
+
 def test_a_splat_file_without_what_it_needs_is_refused(exported, tmp_path):
     with pytest.raises(MemoryFileError, match="without Gaussians"):
         read_splats(exported("points.ply", "ply"))
