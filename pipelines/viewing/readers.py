@@ -23,7 +23,7 @@ from gvtools.optional import require
 from gvtools.ply import read_header
 from gvtools.sandbox import ReaderError, read_apart
 from gvtools.splat_files import USD, glb_up, told_by
-from gvtools.untrusted import PIXEL_BYTES, PIXEL_RATIO, read_bytes
+from gvtools.untrusted import PIXEL_BYTES, PIXEL_RATIO, read_bytes, read_text
 
 if TYPE_CHECKING:
     import trimesh
@@ -66,14 +66,17 @@ def load_mesh(path: Path) -> trimesh.Trimesh | trimesh.PointCloud:
 
 def told_up(path: Path) -> NDArray[np.float64] | None:
     """(3,) what is up, as a PLY, an OBJ or a GLB says; None where it does not."""
-    suffix = path.suffix.lower()
-    if suffix == ".ply":
-        return told_by(read_header(path).comments).get("up")
-    data = read_bytes(path)
+    suffix, comments = path.suffix.lower(), tuple[str, ...]()
     if suffix == ".glb":
-        return glb_up(split_glb(data)[0])
-    lines = takewhile(lambda line: line.startswith(b"#"), data.splitlines())
-    return told_by(line[1:].strip().decode(errors="replace") for line in lines).get("up")
+        return glb_up(split_glb(read_bytes(path))[0])
+    if suffix == ".ply":
+        comments = read_header(path).comments
+    elif suffix == ".obj":
+        lines = takewhile(
+            lambda line: line.startswith("#"), read_text(path, errors="replace").splitlines()
+        )
+        comments = tuple(line[1:].strip() for line in lines)
+    return told_by(comments).get("up")
 
 
 def _beside(path: Path) -> Any:

@@ -66,11 +66,9 @@ class ViewSource:
         """The run as it is now."""
         if not (self.path / RECORD).is_file():
             shown = open_file(self.path)
-            if shown is None:
-                shown = self._run_view(load_memory(self.path))
-                is_ply = self.path.suffix.lower() == ".ply"
-                shown = replace(shown, told_up=told_up(self.path) if is_ply else None)
-            return shown
+            if shown is not None:
+                return shown
+            return replace(self._run_view(load_memory(self.path)), told_up=told_up(self.path))
         run = load_growing_run(self.path, project=self.project)
         if self._frames.run is None:
             self._frames = ProjectFrames(run)
