@@ -428,16 +428,24 @@ def test_a_fit_worse_than_the_memory_is_not_used(bare, monkeypatch, capsys):
     assert "colours: the memory's own" in told.out and "the fit is not used" in told.err
 
 
-def test_ctrl_c_ends_a_fit_and_a_second_one_the_run(capsys):
+@pytest.fixture
+def heeds_ctrl_c():
+    """As in a terminal: where tests run in the background, Ctrl-C is ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield signal.default_int_handler
+    signal.signal(signal.SIGINT, before)
+
+
+def test_ctrl_c_ends_a_fit_and_a_second_one_the_run(heeds_ctrl_c, capsys):
     start = Gaussians(np.zeros((1, VALUES), np.float32))
     view = FitView(np.zeros((16, 16, 3), np.uint8), np.diag([16.0, 16.0, 1.0]), np.eye(4))
-    fit, before = Fit(start, [view]), signal.getsignal(signal.SIGINT)
+    fit = Fit(start, [view])
     with fitting._stopped_by_ctrl_c(fit, Console()):
         signal.raise_signal(signal.SIGINT)
         assert fit.stopped
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
-    assert signal.getsignal(signal.SIGINT) is before
+    assert signal.getsignal(signal.SIGINT) is heeds_ctrl_c
     assert "the run goes on with it" in capsys.readouterr().out
 
 
