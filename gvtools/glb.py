@@ -55,11 +55,12 @@ def pack_glb(
     *,
     node: dict[str, Any],
     primitive: dict[str, Any],
+    around: dict[str, Any] | None = None,
     indices: NDArray[np.uint32] | None = None,
     picture: bytes = b"",
     **tree: Any,
 ) -> bytes:
-    """A GLB of one node with one primitive.
+    """A GLB of one node with one primitive, in a node ``around`` it if there is one.
 
     Args:
         attributes: (N, W) each; whole numbers stand for shares of 1.
@@ -94,6 +95,9 @@ def pack_glb(
         "meshes": [{"primitives": [primitive]}], "accessors": accessors, "bufferViews": views,
         "buffers": [{"byteLength": len(body)}],
     }  # fmt: skip
+    if around:
+        tree["nodes"].append({**around, "children": [0]})
+        tree["scenes"] = [{"nodes": [1]}]
     return join_glb(tree, bytes(body))
 
 

@@ -436,22 +436,33 @@ def _read_glb(path: Path) -> Splats:
                 raise MemoryFileError(
                     f"colours in {extension['colorSpace']!r:.40}; expected {SRGB}; save it in sRGB"
                 )
+            matrix[:3] = _turn_back(node.get("extras", {})) @ matrix[:3]
             parts.append(place_gaussians(_glb_rows(tree, body, part["attributes"]), matrix))
             if sum(len(values) for values, _ in parts) * LEAST_BYTES > len(body):
                 raise ValueError("nodes that draw a set several times")
     values, center = _joined(parts)
-    return _splats(values, center=center, up=glb_up(tree))
+    return _splats(values, center=center, up=glb_up(tree, back=True))
 
 
-def glb_up(tree: Mapping[str, Any]) -> NDArray[np.float64] | None:
+def _turn_back(told: Mapping[str, Any]) -> NDArray[np.float64]:
+    """(3, 3) from the upright axes of an exported file to the input's, see ``turn_upright``."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_quat(told.get("turn", (0, 0, 0, 1))).as_matrix().T
+
+
+def glb_up(tree: Mapping[str, Any], *, back: bool = False) -> NDArray[np.float64] | None:
     """(3,) what is up in a glTF's scene: what a node's extras say, else y, as the standard has it.
+
+    Turned ``back``, it is what was up before an export turned the scene upright.
 
     >>> glb_up({"nodes": [{"extras": {"up": [0, 0, 2]}}]})
     array([0., 0., 1.])
     """
     for node, matrix in drawn_nodes(dict(tree)):
         if "up" in node.get("extras", {}):
-            return _unit(matrix[:3, :3] @ np.asarray(node["extras"]["up"], np.float64))
+            axes = _turn_back(node["extras"] if back else {}) @ matrix[:3, :3]
+            return _unit(axes @ np.asarray(node["extras"]["up"], np.float64))
     return np.array([0.0, 1, 0])
 
 
@@ -479,9 +490,14 @@ def _glb_rows(
 def _read_usd(path: Path) -> Splats:
     require("pxr", extra="export", purpose=f"{path}: {path.suffix}")
     facts, parts = zip(*read_apart(USD, path), strict=True)
-    placed = [place_gaussians(part["values"], part["matrix"]) for part in parts if "values" in part]
+    back = np.eye(4)
+    back[:3, :3] = _turn_back(facts[0])
+    placed = [
+        place_gaussians(part["values"], back @ part["matrix"]) for part in parts if "values" in part
+    ]
     values, center = _joined(placed)
-    return _splats(values, center=center, up=_unit(facts[0].get("up")))
+    up = _unit(facts[0].get("up"))
+    return _splats(values, center=center, up=None if up is None else back[:3, :3] @ up)
 
 
 def usd(path: Path) -> Iterator[Item]:
@@ -497,9 +513,11 @@ def usd(path: Path) -> Iterator[Item]:
     if layer is None or layer.GetCompositionAssetDependencies():
         raise MemoryFileError("damaged, or names other files; expected one USD layer")
     cache, stage = UsdGeom.XformCache(), Usd.Stage.Open(layer)
-    up = layer.customLayerData.get("up") or [0, *map(float, (
-        UsdGeom.GetStageUpAxis(stage) == "Y", UsdGeom.GetStageUpAxis(stage) == "Z"))]  # fmt: skip
-    yield {"up": [float(number) for number in up]}, {}
+    told, axis = layer.customLayerData, UsdGeom.GetStageUpAxis(stage)
+    turn = {"turn": [float(number) for number in told["turn"]]} if "turn" in told else {}
+    # Where an export turned the scene, up is the stage's axis; earlier ones only told it.
+    up = (0, axis == "Y", axis == "Z") if turn or "up" not in told else told["up"]
+    yield {"up": [float(number) for number in up], **turn}, {}
     for prim in stage.Traverse():
         matrix = np.array(cache.GetLocalToWorldTransform(prim)).T
         if prim.IsA(UsdGeom.Points):

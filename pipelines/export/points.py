@@ -41,7 +41,10 @@ TO_16_BITS = 257
 MAX_POINTS = 2_000_000
 ROOT, CLOUD = "/gvtools", "/gvtools/memory"
 NODE = "gvtools_memory"
-FRAME = "input world frame, scene units, axes as in the input (not turned to y up)"
+FRAME = "input world frame and axes, scene units; a node around this one turns what is up to y"
+UPRIGHT = "upright"
+# What is up is along an axis from this share of its length on.
+LEVEL = 1 - 1e-9
 
 
 def write_ply(source: ExportSource, path: Path, options: ExportOptions) -> str:
@@ -159,22 +162,45 @@ def write_usd(source: ExportSource, path: Path, options: ExportOptions) -> str:
         primvars.CreatePrimvar(name, kind, UsdGeom.Tokens.vertex).Set(values)
     with replaced_when_written(path, suffix=path.suffix.lower()) as temporary:
         save_usd(stage, temporary)
-    return f"{source.points_summary(points)} in {path}, in the input's axes"
+    return f"{source.points_summary(points)} in {path}{axes_of(source.up)}"
+
+
+def turn_upright(up: NDArray[np.float64] | None) -> list[float]:
+    """Quaternion x, y, z, w of the shortest turn that takes ``up`` to y; none where none is needed.
+
+    >>> turn_upright(np.array([0.0, -1, 0])), turn_upright(np.array([0.0, 1, 0]))
+    ([1.0, 0.0, 0.0, 0.0], [])
+    """
+    if up is None or up[1] > LEVEL:
+        return []
+    # Half around x where up is down.
+    turn = np.array([-up[2], 0, up[0], 1 + up[1]]) if up[1] > -LEVEL else np.array([1.0, 0, 0, 0])
+    return (turn / np.linalg.norm(turn)).tolist()
+
+
+def axes_of(up: NDArray[np.float64] | None) -> str:
+    """What is said of the axes of a GLB or USD."""
+    return ", in the input's axes" if up is None else ", turned upright"
 
 
 def usd_stage(center: NDArray[np.float64], up: NDArray[np.float64] | None) -> Any:
-    """A stage with the input's axes, and a root that moves what it holds to ``center``."""
+    """A stage whose root moves what it holds to ``center`` and turns it upright, see its data."""
     from pxr import Gf, Usd, UsdGeom
 
     stage = Usd.Stage.CreateInMemory()
     # Where a stage does not say, its unit is a centimetre: rooms would open far too small.
     UsdGeom.SetStageMetersPerUnit(stage, UsdGeom.LinearUnits.meters)
-    # USD knows these two; the nearer one to the cameras' up, which stands beside it.
-    upright = up is not None and abs(up[1]) > abs(up[2])
-    UsdGeom.SetStageUpAxis(stage, "Y" if upright else "Z")
+    root, told = UsdGeom.Xform.Define(stage, ROOT), dict[str, Any]()
+    # USD knows y and z.
+    upright = up is None or up[2] > LEVEL
+    UsdGeom.SetStageUpAxis(stage, "Z" if upright else "Y")
+    turn = [] if upright else turn_upright(up)
+    if turn:
+        x, y, z, w = turn
+        root.AddOrientOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Quatd(w, x, y, z))
+        told["turn"] = Gf.Vec4d(*turn)
     if up is not None:
-        stage.GetRootLayer().customLayerData = {"up": Gf.Vec3d(*up.tolist())}
-    root = UsdGeom.Xform.Define(stage, ROOT)
+        stage.GetRootLayer().customLayerData = told | {"up": Gf.Vec3d(*up.tolist())}
     root.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*center.tolist()))
     stage.SetDefaultPrim(root.GetPrim())
     stage.SetMetadata("comment", "gvtools, input world frame and axes, scene units")
@@ -203,7 +229,7 @@ def write_glb(source: ExportSource, path: Path, options: ExportOptions) -> str:
         name=NODE, up=source.up, extras={"voxel": points.edge},
         primitive={"mode": 0, "material": 0}, materials=[unlit()], extensionsUsed=[UNLIT],
     )  # fmt: skip
-    return f"{source.points_summary(points)} in {path}, in the input's axes"
+    return f"{source.points_summary(points)} in {path}{axes_of(source.up)}"
 
 
 def save_glb(
@@ -218,14 +244,17 @@ def save_glb(
 ) -> None:
     """Write a GLB whose node moves positions (N, 3) around 0 to where they are, see ``pack_glb``.
 
-    Its extras tell that move, the frame, and what is up.
+    Its extras tell that move, the frame, what is up, and how a node around it turns that to y.
     """
     center = box_middle(positions.astype(np.float64))
-    told = {"origin": center.tolist(), "frame": FRAME, **(extras or {})}
+    told, around = {"origin": center.tolist(), "frame": FRAME, **(extras or {})}, None
     told |= {} if up is None else {"up": up.tolist()}
+    turn = turn_upright(up)
+    if turn:
+        told["turn"], around = turn, {"name": UPRIGHT, "rotation": turn}
     node = {"name": name, "translation": center.tolist(), "extras": told}
     local = (positions - center).astype(np.float32)
-    packed = pack_glb({"POSITION": local, **attributes}, node=node, **rest)
+    packed = pack_glb({"POSITION": local, **attributes}, node=node, around=around, **rest)
     with replaced_when_written(path) as temporary:
         temporary.write_bytes(packed)
 

@@ -1,9 +1,10 @@
 """3D Gaussians in the formats that viewers take; the suffix tells which.
 
 PLY is as "3D Gaussian Splatting" writes it. SPZ's axes are right, up, back: Gaussians are turned
-half around x, and its readers turn them back where theirs are right, down, forward, as a PLY's. All
-other files have the input's axes. SPZ is written by gsply or, without it, by Open3D; ``.splat`` by
-Open3D; SOG, ``.ksplat``, compressed PLY and SPZ of version 2 by gaussforge; USD by OpenUSD.
+half around x, and its readers turn them back where theirs are right, down, forward, as a PLY's.
+glTF and USD stand upright where up is known; all other files have the input's axes. SPZ is written
+by gsply or, without it, by Open3D; ``.splat`` by Open3D; SOG, ``.ksplat``, compressed PLY and SPZ
+of version 2 by gaussforge; USD by OpenUSD.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from gvtools.sog import META
 from gvtools.splat_files import KHR, RESTS, SRGB, numbered
 from gvtools.splats import SH, TERMS, TO_RUB, Splats, box_middle, turn_gaussians
 from pipelines.export.formats import ExportOptions
-from pipelines.export.points import linear, save_glb, save_usd, usd_stage
+from pipelines.export.points import axes_of, linear, save_glb, save_usd, usd_stage
 from pipelines.export.source import ExportSource
 
 # Of SPZ's positions: bits with their sign, the most behind the point, and those that its writers
@@ -242,7 +243,7 @@ def _write_glb(splats: Splats, path: Path, options: ExportOptions) -> str:
         path, splats.positions + splats.origin, parts, name="gvtools_splats", up=splats.up,
         primitive={"mode": 0, "extensions": extension}, extensionsUsed=[KHR],
     )  # fmt: skip
-    return ", in the input's axes"
+    return axes_of(splats.up)
 
 
 def _write_usd(splats: Splats, path: Path, options: ExportOptions) -> str:
@@ -266,7 +267,7 @@ def _write_usd(splats: Splats, path: Path, options: ExportOptions) -> str:
     field.CreateRadianceSphericalHarmonicsCoefficientsAttr(Vt.Vec3fArray.FromNumpy(sh))
     field.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(corners.astype(np.float32)))
     save_usd(stage, path)
-    return ", in the input's axes"
+    return axes_of(splats.up)
 
 
 # By the end of a name, longer ones first.
@@ -278,6 +279,5 @@ WRITERS: Mapping[str, Callable[[Splats, Path, ExportOptions], str]] = {
     ".ksplat": _write_ksplat,
     ".splat": _write_by_open3d,
     ".glb": _write_glb,
-    ".usdc": _write_usd,
-    ".usda": _write_usd,
+    **dict.fromkeys((".usdc", ".usda"), _write_usd),
 }

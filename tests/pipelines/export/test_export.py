@@ -7,7 +7,7 @@ import numpy as np
 import pycolmap
 import pytest
 from box_project import VOXEL, fused
-from export_runs import export_run, glb_colors
+from export_runs import Y_UP, export_run, glb_colors
 from memory_scenes import points
 from PIL import Image
 from plyfile import PlyData
@@ -156,7 +156,7 @@ def test_transforms_open_as_a_project(scene, memory, saved, tmp_path):
 
 def test_glb_is_what_trimesh_reads(memory, saved, tmp_path):
     trimesh = pytest.importorskip("trimesh")
-    export_run(saved, "glb", tmp_path / "cloud.glb")
+    export_run(saved, "glb", tmp_path / "cloud.glb", *Y_UP)
     scene = trimesh.load_scene(tmp_path / "cloud.glb")
     (cloud,) = scene.dump()
     kept = thin(memory, None)

@@ -6,7 +6,7 @@ import numpy as np
 import open3d as o3d
 import pytest
 from box_project import VOXEL
-from export_runs import export_run, glb_colors
+from export_runs import Y_UP, export_run, glb_colors
 
 from gvtools.errors import DegenerateError, OptionError
 from gvtools.memory.spatial_memory import SpatialMemory
@@ -72,7 +72,7 @@ def test_all_suffixes_hold_one_mesh(bare_run, tmp_path):
     read = []
     for suffix in (".ply", ".obj", ".glb"):
         out = tmp_path / f"out{suffix}"
-        export_run(bare_run.folder, "mesh", out)
+        export_run(bare_run.folder, "mesh", out, *Y_UP)
         read.append(trimesh.load(out, process=False, force="mesh"))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out.glb", "out.obj", "out.ply"]
     colors = [np.asarray(mesh.visual.vertex_colors, int)[:, :3] for mesh in read[:2]]
@@ -101,7 +101,7 @@ def test_a_mesh_far_from_the_origin_keeps_its_digits(scene, tmp_path):
     for name in ("near", "far"):
         for suffix in (".ply", ".glb"):
             out = tmp_path / f"{name}{suffix}"
-            export_run(tmp_path / f"{name}.npz", "mesh", out)
+            export_run(tmp_path / f"{name}.npz", "mesh", out, *Y_UP)
             read[name, suffix] = trimesh.load(out, process=False, force="mesh").vertices
     for suffix in (".ply", ".glb"):
         one, two = read["near", suffix], read["far", suffix] - ORIGIN
@@ -188,7 +188,7 @@ def error(mesh, view):
 def test_few_triangles_show_the_photographs(scene, reconstructed_run, tmp_path, suffix):
     plain, out = tmp_path / "plain.ply", tmp_path / f"a box{suffix}"
     export_run(reconstructed_run.path, "mesh", plain, *FEW)
-    export_run(reconstructed_run.path, "mesh", out, "--texture", 512, *FEW)
+    export_run(reconstructed_run.path, "mesh", out, "--texture", 512, *FEW, *Y_UP)
     mesh = trimesh.load(out, process=False, force="mesh")
     assert len(mesh.faces) == len(trimesh.load(plain, process=False).faces)
     files = {"a box.glb"} if suffix == ".glb" else {"a box.obj", "a_box.mtl", "a_box.png"}

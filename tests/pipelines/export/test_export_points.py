@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from box_project import fused
 from command_line import run_command
-from export_runs import export_run
+from export_runs import Y_UP, export_run
 from plyfile import PlyData
 from scan_files import write_las
 
@@ -16,6 +16,7 @@ from gvtools.errors import OptionError
 from gvtools.memory.store.local_frame import LocalFrame
 from gvtools.memory.thinning import thin
 from gvtools.scans.read import read_scan
+from gvtools.splat_files import read_splats
 from pipelines.export import points
 
 ORIGIN = (431_000.0, 5_650_000.0, 120.0)
@@ -61,7 +62,7 @@ def test_pxr_reads_the_points(bare_run, tmp_path, suffix):
     from pxr import Usd, UsdGeom
 
     out = tmp_path / f"out{suffix}"
-    export_run(bare_run.folder, "usd", out)
+    export_run(bare_run.folder, "usd", out, "--up", 0, 0, 1)
     assert sorted(tmp_path.iterdir()) == [out]
     stage = Usd.Stage.Open(str(out))
     assert UsdGeom.GetStageMetersPerUnit(stage) == 1 and stage.HasAuthoredMetadata("upAxis")
@@ -158,7 +159,7 @@ def test_positions_far_from_the_origin_keep_their_digits(far, tmp_path, name, re
     memory, positions = far
     forms = {".usdc": "usd", ".ply": "splat"}
     out = tmp_path / name
-    export_run(memory, forms.get(out.suffix, out.suffix[1:]), out)
+    export_run(memory, forms.get(out.suffix, out.suffix[1:]), out, *Y_UP)
     found = np.asarray(read(out))
     assert found.shape == positions.shape
     np.testing.assert_allclose(found, positions, atol=off)
@@ -253,6 +254,50 @@ def test_every_format_tells_what_is_up(bare_run, tmp_path, capsys, form, name, t
     else:
         found = told(out)
     assert found == [0, -1, 0]
+
+
+def upright_glb(path):
+    """Matrix from the node's frame, in which the input's axes are, to the scene's."""
+    loaded = pytest.importorskip("trimesh").load_scene(path)
+    return loaded.graph[loaded.graph.nodes_geometry[0]][0]
+
+
+def upright_usd(path):
+    """Likewise, of the prim."""
+    pytest.importorskip("pxr")
+    from pxr import Usd, UsdGeom
+
+    stage = Usd.Stage.Open(str(path))
+    assert UsdGeom.GetStageUpAxis(stage) == "Y"
+    (prim,) = (prim for prim in stage.Traverse() if prim.GetName() not in {"gvtools"})
+    return np.array(UsdGeom.XformCache().GetLocalToWorldTransform(prim)).T
+
+
+UP = np.array([2.0, -6, 3]) / 7
+
+
+@pytest.mark.parametrize(
+    ("form", "name", "read"),
+    [("glb", "a.glb", upright_glb), ("mesh", "a.glb", upright_glb), ("splat", "a.glb", upright_glb),
+     ("usd", "a.usdc", upright_usd), ("splat", "a.usdc", upright_usd)],
+)  # fmt: skip
+def test_gltf_and_usd_stand_upright_in_other_programs(bare_run, tmp_path, form, name, read):
+    run_command("export", bare_run.folder, "--format", form, "--out", tmp_path / name, "--up", *UP)
+    np.testing.assert_allclose(read(tmp_path / name)[:3, :3] @ UP, [0, 1, 0], atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["a.glb", "a.usdc"])
+def test_splats_that_stand_upright_are_read_in_the_inputs_axes(bare_run, tmp_path, name):
+    plain, turned = tmp_path / "a.ply", tmp_path / name
+    for out in (plain, turned):
+        run_command("export", bare_run.folder, "--format", "splat", "--out", out, "--up", *UP)
+    expected, found = read_splats(plain), read_splats(turned)
+    assert found.up is not None
+    np.testing.assert_allclose(found.up, UP, atol=1e-9)
+    np.testing.assert_allclose(
+        found.positions + found.origin, expected.positions + expected.origin, atol=1e-5
+    )
+    np.testing.assert_allclose(found.quaternions, expected.quaternions, atol=1e-6)
 
 
 WKT = 'LOCAL_CS["site",UNIT["metre",1]]'
