@@ -89,7 +89,6 @@ def find_photographs(folder: Path) -> tuple[list[CapturedPhotograph], list[Findi
             found.append(_look_at(files[name], name))
         except UNREADABLE:
             damaged.append(name)
-    total = len(names)
     # All pictures of a camera may be so; beside others they are masks, and depth maps.
     shown = [item for item in found if not item.few_colors]
     shown = shown if len(shown) > 1 else found
@@ -99,36 +98,27 @@ def find_photographs(folder: Path) -> tuple[list[CapturedPhotograph], list[Findi
     depth = [item.name for item in shown if item not in found]
     again = _copies(found)
     found = [item for item in found if item.name not in again]
-    warnings = [
-        f"{len(some)} of {total} pictures {reason}: left out ({named(some)})"
-        for some, reason in (
-            (damaged, "cannot be read"),
-            (copies, "are copies of others"),
-            (masks, f"have at most {FEW_COLORS} colours, as masks (give these with --masks)"),
-            (depth, "are grey of 16 bits beside others of 8, as depth maps"),
-            (again, "are others again: reduced, turned, edited or saved once more"),
-        )
-        if some
-    ]
-    if hidden:
-        warnings.append(
-            f"{len(hidden)} pictures lie in hidden folders or those of systems: left out "
-            f"({named(hidden)})"
-        )
-    if foreign:
-        warnings.append(
-            f"{len(foreign)} pictures are HEIC, AVIF or raw: left out ({named(foreign)}); convert "
-            "them to JPEG"
-        )
     stems = {path.with_suffix("") for path in map(files.__getitem__, [*names, *foreign])}
     videos = [
         name for name, path in files.items()
         if path.suffix.lower() in VIDEOS and path.with_suffix("") not in stems
     ]  # fmt: skip
-    if videos:
-        warnings.append(
-            f"{len(videos)} videos are left out ({named(videos)}); give one instead of the folder"
+    some_of = f"of {len(names)} pictures"
+    warnings = [
+        f"{len(some)} {what} left out ({named(some)}){advice}"
+        for some, what, advice in (
+            (damaged, f"{some_of} cannot be read:", ""),
+            (copies, f"{some_of} are copies of others:", ""),
+            (masks, f"{some_of} have at most {FEW_COLORS} colours, as masks (give these with "
+             "--masks):", ""),
+            (depth, f"{some_of} are grey of 16 bits beside others of 8, as depth maps:", ""),
+            (again, f"{some_of} are others again: reduced, turned, edited or saved once more:", ""),
+            (hidden, "pictures lie in hidden folders or those of systems:", ""),
+            (foreign, "pictures are HEIC, AVIF or raw:", "; convert them to JPEG"),
+            (videos, "videos are", "; give one instead of the folder"),
         )
+        if some
+    ]  # fmt: skip
     if len(found) < 2:
         met = f" ({'; '.join(warnings)})" if warnings else ""
         raise ProjectError(

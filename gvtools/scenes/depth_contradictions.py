@@ -60,7 +60,9 @@ def unit_findings(scene: Scene) -> list[Finding]:
             "integer_depth_scale of transforms.json) or give poses in the same unit"
         )
         return [Finding("warning", line)]
-    if not (by_rays or _wrong(shares)):
+    known = np.sort(shares[np.isfinite(shares)])
+    wrong = (known[:1] < ONE_PAIR).any() or (known[1:2] < TWO_PAIRS).any()
+    if not (by_rays or wrong):
         return []
     worst = int(np.nanargmin(shares))
     reason = "; it fits as distances along the rays" if by_rays else ""
@@ -83,21 +85,13 @@ def frame_there(scene: Scene, number: int) -> Frame | None:
 
 def _of_rays(depth: Depth, camera: Cameras) -> Depth:
     """(H, W) z-depth of distances along the rays."""
-    rows, columns = np.indices(depth.shape) + 0.5
-    fx, fy, cx, cy = camera.K[0][[0, 1, 0, 1], [0, 1, 2, 2]]
-    length = np.sqrt(1 + ((columns - cx) / fx) ** 2 + ((rows - cy) / fy) ** 2)
-    return np.asarray(depth / length, np.float32)
+    return np.asarray(depth / np.linalg.norm(camera.rays(), axis=-1), np.float32)
 
 
 def _nearly(pairs: Sequence[Pair]) -> Float64:
     """(P,) of what the second view of a pair shows, what agrees nearly; NaN of too little."""
     agreed, shared = (part[:, 0] for part in _agreeing(pairs, np.ones(1), same=NEARLY))
     return np.where(shared * PIXELS < LEAST, np.nan, agreed / np.maximum(shared, 1e-9))
-
-
-def _wrong(shares: Float64) -> bool:
-    known = np.sort(shares[np.isfinite(shares)])
-    return bool((known[:1] < ONE_PAIR).any() or (known[1:2] < TWO_PAIRS).any())
 
 
 def _agreeing(

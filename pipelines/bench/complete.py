@@ -21,7 +21,7 @@ from gvtools.completers.geoverse.flow import interval_bounds
 from gvtools.completers.geoverse.model import DECODE, DECODING, LEVEL0, LEVEL1, GeoVerse, no_clock
 from gvtools.completers.geoverse.video_prior import VideoFeatures
 from gvtools.completers.geoverse.weights import from_pretrained
-from gvtools.networks.compute import autocast, name_of
+from gvtools.networks.compute import autocast
 from pipelines.bench.options import CompleteOptions
 from pipelines.bench.random_model import random_features, random_model, random_video, random_views
 from pipelines.machine import load_average, process_peak_bytes
@@ -221,16 +221,10 @@ def _conditions(options: CompleteOptions, config: GeoVerseConfig) -> dict[str, A
     gpu = options.place.type == "cuda"
     return {
         "bench": "complete",
-        "config": config.name,
+        **options.conditions(config),
         "weights": "random" if options.weights is None else str(options.weights),
-        "size": list(options.picture(config)),
-        "context": options.context,
-        "targets": options.targets,
-        "steps": options.steps,
-        "cascade_steps": options.cascade_steps,
         "device": options.place.type,
         "device_name": torch.cuda.get_device_name(options.place) if gpu else None,
-        "precision": name_of(options.compute_type),
         "video": options.runs_video(config),
         "video_stand_in": config.video is not None and not options.runs_video(config),
         "compiled": options.compile,

@@ -281,13 +281,7 @@ def memory_figures(options: CompleteOptions) -> dict[str, Any]:
         configs[WITH] = config
     figures: dict[str, Any] = {
         "bench": "memory",
-        "config": config.name,
-        "size": list(options.picture(config)),
-        "context": options.context,
-        "targets": options.targets,
-        "steps": options.steps,
-        "cascade_steps": options.cascade_steps,
-        "precision": name_of(options.compute_type),
+        **options.conditions(config),
         "training_precision": name_of(_trained_type(options)),
         "card_gb": options.card,
         "inference": [],

@@ -99,6 +99,18 @@ class CompleteOptions(Settings):
 
         return named(self.config or "tiny") if self.weights is None else config_of(self.weights)
 
+    def conditions(self, config: GeoVerseConfig) -> dict[str, Any]:
+        """What every kind of figures says of the passes."""
+        from gvtools.networks.compute import name_of
+
+        counts = ("context", "targets", "steps", "cascade_steps")
+        return {
+            "config": config.name,
+            "size": list(self.picture(config)),
+            "precision": name_of(self.compute_type),
+            **{name: getattr(self, name) for name in counts},
+        }
+
     def picture(self, config: GeoVerseConfig) -> tuple[int, int]:
         """(H, W), px."""
         return self.size or (config.image_size, config.image_size)

@@ -24,7 +24,7 @@ from torch.utils.flop_counter import flop_registry, sdpa_backward_flop_count, sd
 from gvtools.completers.geoverse.config import GeoVerseConfig
 from gvtools.completers.geoverse.flow import interval_bounds
 from gvtools.completers.geoverse.model import DECODING
-from gvtools.networks.compute import autocast, name_of
+from gvtools.networks.compute import autocast
 from pipelines.bench.complete import BETWEEN, CPU_ATTENTION, INSIDE, PASS
 from pipelines.bench.memory import (
     CPU,
@@ -153,13 +153,7 @@ def prediction_figures(options: CompleteOptions) -> dict[str, Any]:
     stages[PASS] = sum(stages.values(), Counter())
     return {
         "bench": "prediction",
-        "config": config.name,
-        "size": list(options.picture(config)),
-        "precision": name_of(options.compute_type),
-        "context": options.context,
-        "targets": options.targets,
-        "steps": options.steps,
-        "cascade_steps": options.cascade_steps,
+        **options.conditions(config),
         "results": [row_of(stage, work) for stage, work in stages.items()],
     }
 

@@ -23,11 +23,7 @@ if TYPE_CHECKING:
 
 POINTS = {"fuse": 3_200_000, "splat": 4_000_000}
 # Options of ``CompleteOptions`` that bear its fields' names; --repeat is of all benchmarks.
-COMPLETE = {
-    name: name
-    for name in ("config", "weights", "size", "context", "targets", "steps", "cascade_steps",
-                 "device", "precision", "video", "compile", "memory", "predict", "card")
-}  # fmt: skip
+COMPLETE = {name: name for name in CompleteOptions.model_fields if name != "repeat"}
 
 
 class BenchCommand(Arguments):
@@ -75,15 +71,10 @@ class BenchCommand(Arguments):
             names = ", ".join(sorted(f"--{name.replace('_', '-')}" for name in given))
             raise OptionError(f"bench {self.what}: {names} given, which only complete knows")
         points = POINTS[self.what] if self.points is None else self.points
+        from pipelines.bench.side_by_side import fuse_rows, splat_rows
 
-        if self.what == "fuse":
-            from pipelines.bench.side_by_side import fuse_rows
-
-            rows = fuse_rows(points, repeat=self.repeat)
-        else:
-            from pipelines.bench.side_by_side import splat_rows
-
-            rows = splat_rows(points, repeat=self.repeat)
+        measure = fuse_rows if self.what == "fuse" else splat_rows
+        rows = measure(points, repeat=self.repeat)
         report(rows, console, self.json_, bench=self.what, points=points, load=load_average())
 
 

@@ -77,7 +77,14 @@ class EvaluateCommand(MeasurementArguments, ProtocolArguments, SceneArguments):
         options = self.measures()
         paths: Sequence[Path] = self.runs
         if self.protocol is not None:
-            paths = [_run_protocol(self, self.protocol, out, console=console)]
+            paths = [
+                evaluation.run_protocol(
+                    self.open_scene(self.runs[0]), out, protocol=self.protocol,
+                    stride=self.stride, seed=self.seed, completer=self.completer,
+                    profile=self.profile, changes=self.set, reading=self.reading(),
+                    console=console,
+                )
+            ]  # fmt: skip
         runs = evaluation.load_runs(paths, project=self.project)
         with folder_for_results(out):
             evaluations = evaluation.evaluate_runs(runs, options, console=console)
@@ -111,23 +118,6 @@ def _folder(args: EvaluateCommand) -> Path:
     if len(args.runs) > 1:
         raise OptionError("several runs: expected --out for their common figures")
     return args.runs[0] / "evaluation"
-
-
-def _run_protocol(args: EvaluateCommand, protocol: str, out: Path, *, console: Console) -> Path:
-    from pipelines.scoring.evaluation import run_protocol
-
-    return run_protocol(
-        args.open_scene(args.runs[0]),
-        out,
-        protocol=protocol,
-        stride=args.stride,
-        seed=args.seed,
-        completer=args.completer,
-        profile=args.profile,
-        changes=args.set,
-        reading=args.reading(),
-        console=console,
-    )
 
 
 class JudgeCommand(MeasurementArguments, SceneArguments):

@@ -2,9 +2,8 @@
 
 Positions keep their precision in georeferenced scenes: LAS has whole multiples of a step from an
 offset; USD and glTF have float32 around the middle of the cloud, which the parent's translation, or
-the node's, moves to the input's world frame for readers that compute in double. Axes are the
-input's: glTF calls y up, an input's up is its own affair, and a turned cloud would no longer lie on
-the other exports.
+the node's, moves to the input's world frame for readers that compute in double. PLY and LAS have
+the input's axes; glTF and USD stand upright where it is known what is up.
 """
 
 from __future__ import annotations
