@@ -208,6 +208,14 @@ def invert_rigid(transform: ArrayLike) -> Float64:
     return inverse
 
 
+def rigid_poses(rotation: ArrayLike, translation: ArrayLike = (0, 0, 0)) -> Float64:
+    """(..., 4, 4) float64 transforms of (..., 3, 3) rotations and (..., 3) translations."""
+    turn = np.asarray(rotation, np.float64)
+    poses = np.zeros((*turn.shape[:-2], 4, 4))
+    poses[..., :3, :3], poses[..., :3, 3], poses[..., 3, 3] = turn, translation, 1
+    return poses
+
+
 def rigid_transform(matrix: ArrayLike, *, what: str) -> tuple[Float64, float]:
     """A rigid transform read from outside, with its rotation made exactly orthonormal.
 
@@ -236,7 +244,4 @@ def rigid_transform(matrix: ArrayLike, *, what: str) -> tuple[Float64, float]:
             f"{ROTATION_TOLERANCE:g} and determinant 1; divide the scale out or export again"
         )
     u, _, vt = np.linalg.svd(rotation)
-    rigid = np.eye(4)
-    rigid[:3, :3] = u @ vt
-    rigid[:3, 3] = matrix[:3, 3]
-    return rigid, defect
+    return rigid_poses(u @ vt, matrix[:3, 3]), defect

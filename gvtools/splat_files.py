@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from gvtools.cameras import rigid_poses
 from gvtools.errors import GvError, MemoryFileError, OptionError
 from gvtools.glb import drawn_nodes, glb_numbers, split_glb
 from gvtools.optional import installed, require
@@ -490,8 +491,7 @@ def _glb_rows(
 def _read_usd(path: Path) -> Splats:
     require("pxr", extra="export", purpose=f"{path}: {path.suffix}")
     facts, parts = zip(*read_apart(USD, path), strict=True)
-    back = np.eye(4)
-    back[:3, :3] = _turn_back(facts[0])
+    back = rigid_poses(_turn_back(facts[0]))
     placed = [
         place_gaussians(part["values"], back @ part["matrix"]) for part in parts if "values" in part
     ]

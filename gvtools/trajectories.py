@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gvtools.cameras import Cameras, invert_rigid
+from gvtools.cameras import Cameras, invert_rigid, rigid_poses
 from gvtools.errors import DegenerateError, OptionError
 
 Float64 = NDArray[np.float64]
@@ -59,10 +59,8 @@ def interpolate(cameras: Cameras, count: int) -> Cameras:
     at = np.linspace(0, length[-1], count)
     # PCHIP has no cross-talk between coordinates: centred first for large offsets.
     origin = world[0, :3, 3]
-    pose = np.tile(np.eye(4), (count, 1, 1))
-    centers = world[keep, :3, 3] - origin
-    pose[:, :3, 3] = PchipInterpolator(length, centers)(at) + origin
-    pose[:, :3, :3] = Slerp(length, rotation[keep])(at).as_matrix()
+    centers = PchipInterpolator(length, world[keep, :3, 3] - origin)(at) + origin
+    pose = rigid_poses(Slerp(length, rotation[keep])(at).as_matrix(), centers)
     segment = np.clip(np.searchsorted(length, at, side="right") - 1, 0, len(length) - 2)
     share = (at - length[segment]) / (length[segment + 1] - length[segment])
     K = cameras.K[index]
@@ -162,11 +160,7 @@ def look_at(centers: ArrayLike, target: ArrayLike, *, up: ArrayLike) -> Float64:
     if (norm < 1e-6).any():
         raise DegenerateError("look at: a camera looks along the up vector; choose another up")
     right /= norm
-    pose = np.tile(np.eye(4), (len(centers), 1, 1))
-    pose[:, :3, 0], pose[:, :3, 2] = right, forward
-    pose[:, :3, 1] = np.cross(forward, right)
-    pose[:, :3, 3] = centers
-    return pose
+    return rigid_poses(np.stack([right, np.cross(forward, right), forward], axis=2), centers)
 
 
 def orbit(cameras: Cameras, count: int, *, center: ArrayLike | None = None) -> Cameras:

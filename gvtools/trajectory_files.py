@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.cameras import ROTATION_ROUNDING, Cameras, invert_rigid, rigid_transform
+from gvtools.cameras import ROTATION_ROUNDING, Cameras, invert_rigid, rigid_poses, rigid_transform
 from gvtools.errors import ProjectError, ShapeError
 from gvtools.notebook import html_table, path_sketch
 from gvtools.untrusted import read_text
@@ -367,9 +367,8 @@ def _read(
     rows: list[tuple[int, list[str]]], columns: tuple[int, ...] | None, *, more: bool, path: Path
 ) -> tuple[Float64, Float64]:
     """Stamps, and (N, 4, 4) poses."""
-    poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    stamps = np.empty(len(rows))
     if columns is None:
+        stamps, poses = np.empty(len(rows)), np.empty((len(rows), 4, 4))
         for i, (number, words) in enumerate(rows):
             where = f"{path}:{number}"
             stamps[i], poses[i] = _matrix(words, len(rows[0][1]), where=where)
@@ -394,8 +393,7 @@ def _read(
         )
     from scipy.spatial.transform import Rotation
 
-    poses[:, :3, :3] = Rotation.from_quat(turns).as_matrix()
-    poses[:, :3, 3] = values[:, 1:4]
+    poses = rigid_poses(Rotation.from_quat(turns).as_matrix(), values[:, 1:4])
     fraction = 1e-9 * values[:, 8:].sum(axis=1)
     # A whole time in nanoseconds beside that in seconds says the same again.
     return values[:, 0] + fraction * (np.abs(fraction).max() < 1), poses

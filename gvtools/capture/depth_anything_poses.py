@@ -10,7 +10,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from gvtools.cameras import Cameras, invert_rigid
+from gvtools.cameras import Cameras, invert_rigid, rigid_poses
 from gvtools.capture.photographs import CapturedPhotograph
 from gvtools.capture.predictions import Predictions, sample_points
 from gvtools.completers.geoverse.views import model_size, resample
@@ -60,9 +60,8 @@ def predict(photographs: Sequence[CapturedPhotograph], weights: Path) -> Predict
 def decode_cameras(encoding: Tensor, size: tuple[int, int], *, names: tuple[str, ...]) -> Cameras:
     """Cameras of (V, 9) encodings, see ``encode_cameras``; ``size`` is height and width [px]."""
     values = encoding.double().cpu().numpy()
-    pose, K = (np.tile(np.eye(side), (len(values), 1, 1)) for side in (4, 3))
-    pose[:, :3, :3] = Rotation.from_quat(values[:, 3:7]).as_matrix()
-    pose[:, :3, 3] = values[:, :3]
+    pose = rigid_poses(Rotation.from_quat(values[:, 3:7]).as_matrix(), values[:, :3])
+    K = np.tile(np.eye(3), (len(values), 1, 1))
     half = np.array(size[::-1]) / 2
     K[:, :2, 2] = half
     K[:, [0, 1], [0, 1]] = half / np.tan(np.clip(values[:, [8, 7]], 0.05, 3.0) / 2)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.cameras import Cameras, concatenate
+from gvtools.cameras import Cameras, concatenate, rigid_poses
 from gvtools.glb import drawn_nodes, glb_numbers, split_glb
 from gvtools.untrusted import PIXEL_BYTES, PIXEL_RATIO, open_picture, read_bytes
 
@@ -97,8 +97,7 @@ def _camera(
     off = np.abs([x @ y, sides[0] / sides[1] * height / width - 1]).max()
     if not (off < EXACT and np.linalg.norm(middle - tip - distance * ahead) < EXACT * sides[1]):
         raise ValueError("a picture that no camera is drawn behind")
-    pose = np.eye(4)
-    pose[:3, :3] = x, y, ahead
-    pose[:3, 3] = -pose[:3, :3] @ tip
+    rotation = np.array([x, y, ahead])
+    pose = rigid_poses(rotation, -rotation @ tip)
     focal = float(distance / sides[1] * height)
     return Cameras.pinhole(width, height, focal=focal, cam_from_world=pose), picture

@@ -19,13 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gvtools.capture.matching import (
-    MappingTask,
-    flat_pairs,
-    match_pictures,
-    only_turned,
-    verified,
-)
+from gvtools.capture.matching import MappingTask, flat_pairs, match_pictures, only_turned, verified
 from gvtools.errors import ProjectError
 from gvtools.features import quiet_colmap
 from gvtools.poses.colmap import SEED, adjust, fix_cameras

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from gvtools.cameras import Cameras
+from gvtools.cameras import Cameras, rigid_poses
 from gvtools.capture.matching import Say
 from gvtools.capture.project import REPORT, replaced_folder
 from gvtools.errors import ProjectError
@@ -265,8 +265,7 @@ def points_from_above(scene: Scene, keyframes: Sequence[str]) -> tuple[Cameras, 
     """
     cameras = scene.cameras
     turn = Rotation.align_vectors([[0, 0, 1]], [level_up(cameras)])[0]
-    whole = np.eye(4)
-    whole[:3, :3] = turn.as_matrix()
+    whole = rigid_poses(turn.as_matrix())
     shown = [name for name in keyframes if name in set(scene.names)]
     points = []
     for name in shown[:: max(1, len(shown) // DRAWN)]:

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.cameras import invert_rigid
+from gvtools.cameras import invert_rigid, rigid_poses
 from gvtools.features import mutual_nearest, root_sift
 from gvtools.poses.motions import Pair, turn_of, within
 from gvtools.scenes.scene import Scene
@@ -321,9 +321,7 @@ def start_from_features(source: FrameFeatures, target: FrameFeatures, K: Float64
         return None
     if not found or inliers is None or len(inliers) < LEAST_INLIERS:
         return None
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(turn)[0], shift.ravel()
-    return pose
+    return rigid_poses(cv2.Rodrigues(turn)[0], shift.ravel())
 
 
 def register(

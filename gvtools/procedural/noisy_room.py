@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 from scipy.special import ndtr
 
-from gvtools.cameras import Cameras, invert_rigid
+from gvtools.cameras import Cameras, invert_rigid, rigid_poses
 from gvtools.procedural.builder import ProceduralScene
 from gvtools.procedural.ray_cast import BOX, cast
 from gvtools.procedural.render import Look, radiance, to_srgb
@@ -198,10 +198,8 @@ def jitter_poses(cam_from_world: Float64, rng: np.random.Generator) -> Float64:
     drift = drift[margin : margin + count] / np.sqrt((weights**2).sum())
     error = (drift + rng.standard_normal((count, 6))) / np.sqrt(2)
     error /= np.sqrt(3)  # of three components each, so that lengths have the stated mean square
-    moved = np.tile(np.eye(4), (count, 1, 1))
-    moved[:, :3, :3] = Rotation.from_rotvec(np.radians(POSE_DEGREES) * error[:, 3:]).as_matrix()
-    moved[:, :3, 3] = POSE_METRES * error[:, :3]
-    return np.asarray(moved @ cam_from_world)
+    turns = Rotation.from_rotvec(np.radians(POSE_DEGREES) * error[:, 3:]).as_matrix()
+    return np.asarray(rigid_poses(turns, POSE_METRES * error[:, :3]) @ cam_from_world)
 
 
 def _measured(

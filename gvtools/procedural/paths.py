@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.cameras import Cameras
+from gvtools.cameras import Cameras, rigid_poses
 from gvtools.procedural.ray_cast import RoomGeometry, cast, clearance
 
 Float64 = NDArray[np.float64]
@@ -182,11 +182,8 @@ def _looking(place: Float64, forward: Float64) -> Float64:
     z = forward / np.linalg.norm(forward, axis=1, keepdims=True)
     x = np.cross(z, [0.0, 0.0, 1.0])
     x /= np.linalg.norm(x, axis=1, keepdims=True)
-    pose = np.zeros((len(z), 4, 4))
-    pose[:, :3, :3] = np.stack([x, np.cross(z, x), z], 1)
-    pose[:, :3, 3] = -np.einsum("vij,vj->vi", pose[:, :3, :3], place)
-    pose[:, 3, 3] = 1
-    return pose
+    turn = np.stack([x, np.cross(z, x), z], 1)
+    return rigid_poses(turn, -np.einsum("vij,vj->vi", turn, place))
 
 
 def _cameras(K: Float64, poses: Float64, size: tuple[int, int]) -> Cameras:

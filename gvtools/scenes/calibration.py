@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from gvtools.cameras import rigid_poses
 from gvtools.errors import ProjectError
 from gvtools.scenes.scene import Finding
 from gvtools.scenes.undistort import LensParameters, camera_of
@@ -260,14 +261,6 @@ def quaternion_pose(wxyz: ArrayLike, translation: ArrayLike) -> Float64:
     if not np.isfinite([w, x, y, z]).all() or w == x == y == z == 0:
         return np.full((4, 4), np.nan)
     return rigid_poses(Rotation.from_quat([x, y, z, w]).as_matrix(), translation)
-
-
-def rigid_poses(rotation: ArrayLike, translation: ArrayLike) -> Float64:
-    """(..., 4, 4) float64 transforms of (..., 3, 3) rotations and (..., 3) translations."""
-    turn = np.asarray(rotation, np.float64)
-    poses = np.zeros((*turn.shape[:-2], 4, 4))
-    poses[..., :3, :3], poses[..., :3, 3], poses[..., 3, 3] = turn, translation, 1
-    return poses
 
 
 def opencv_pose(world_from_cam: ArrayLike) -> Float64:

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from gvtools.cameras import rigid_poses
 from gvtools.errors import ProjectError
 from gvtools.scenes.undistort import ROUND_TRIP_TOLERANCE, Undistortion, camera_of, undistortion
 
@@ -113,9 +114,7 @@ class Face(Undistortion):
 
     def pose(self, cam_from_world: ArrayLike) -> Float64:
         """(4, 4) of the face from (4, 4) of the recorded camera."""
-        turn = np.eye(4)
-        turn[:3, :3] = self.rotation
-        return turn @ np.asarray(cam_from_world, np.float64)
+        return rigid_poses(self.rotation) @ np.asarray(cam_from_world, np.float64)
 
     def image(self, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """(h, w, 3) uint8 recorded picture as (H, W, 3) uint8 of the face; 0 where unseen."""

@@ -13,6 +13,7 @@ from urllib.parse import unquote
 import numpy as np
 from numpy.typing import NDArray
 
+from gvtools.cameras import rigid_poses
 from gvtools.errors import DegenerateError, ProjectError
 from gvtools.scenes.images import IMAGE_SUFFIXES
 from gvtools.scenes.scene import Finding, natural_key
@@ -305,7 +306,5 @@ def pose_at(
     pair = poses[after - 1 : after + 1]
     share = (time - times[after - 1]) / (times[after] - times[after - 1])
     centers = -np.einsum("nji,nj->ni", pair[:, :3, :3], pair[:, :3, 3])
-    pose = np.eye(4)
-    pose[:3, :3] = Slerp([0, 1], Rotation.from_matrix(pair[:, :3, :3]))(share).as_matrix()
-    pose[:3, 3] = -pose[:3, :3] @ (centers[0] + share * (centers[1] - centers[0]))
-    return pose
+    turn = Slerp([0, 1], Rotation.from_matrix(pair[:, :3, :3]))(share).as_matrix()
+    return rigid_poses(turn, -turn @ (centers[0] + share * (centers[1] - centers[0])))

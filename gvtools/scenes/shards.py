@@ -226,7 +226,8 @@ def encoded(
     ``about`` is what else the camera's file tells.
     """
     lossy = any(path.suffix.lower() in LOSSY for path in view.files[:1])
-    members = {"jpg" if lossy else "png": _picture(frame.rgb, lossy=lossy)}
+    picture = Image.fromarray(frame.rgb)
+    members = {"jpg": _saved(picture, "JPEG", **JPEG)} if lossy else {"png": _saved(picture)}
     unit = None
     if frame.depth is not None:
         unit = exact_unit(frame.depth)
@@ -234,9 +235,9 @@ def encoded(
             members[DEPTH_NPZ] = _arrays(depth=frame.depth)
         else:
             stored = np.rint(frame.depth / np.float32(unit)).astype(np.uint16)
-            members[DEPTH_PNG] = _png(Image.fromarray(stored))
+            members[DEPTH_PNG] = _saved(Image.fromarray(stored))
     if frame.mask is not None:
-        members[MASK] = _png(Image.fromarray(frame.mask))
+        members[MASK] = _saved(Image.fromarray(frame.mask))
     camera = {
         "name": view.name,
         "width": int(view.camera.width[0]),
@@ -276,17 +277,9 @@ def exact_unit(depth: NDArray[np.float32]) -> float | None:
     return None
 
 
-def _picture(rgb: NDArray[np.uint8], *, lossy: bool) -> bytes:
-    if not lossy:
-        return _png(Image.fromarray(rgb))
+def _saved(image: Image.Image, form: str = "PNG", **options: int) -> bytes:
     file = io.BytesIO()
-    Image.fromarray(rgb).save(file, "JPEG", **JPEG)
-    return file.getvalue()
-
-
-def _png(image: Image.Image) -> bytes:
-    file = io.BytesIO()
-    image.save(file, "PNG")
+    image.save(file, form, **options)
     return file.getvalue()
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from gvtools.cameras import Cameras
+from gvtools.cameras import Cameras, rigid_poses
 from gvtools.settings import Settings
 
 Float32 = NDArray[np.float32]
@@ -122,9 +122,7 @@ def corrupted_camera(
 
     turn = np.radians(strength.rotation) * rng.standard_normal(3)
     shift = strength.translation * unit * rng.standard_normal(3)
-    error = np.eye(4)
-    error[:3, :3] = Rotation.from_rotvec(turn).as_matrix()
-    error[:3, 3] = shift
+    error = rigid_poses(Rotation.from_rotvec(turn).as_matrix(), shift)
     return replace(camera, cam_from_world=error @ camera.cam_from_world)
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.cameras import Cameras
+from gvtools.cameras import Cameras, rigid_poses
 from gvtools.memory.store.local_frame import LocalFrame
 from gvtools.memory.store.views import PointSet
 
@@ -68,10 +68,9 @@ def inside_camera(size: Float64, *, turn: float, width: int, height: int) -> Cam
     focal = 0.82 * width
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
     cosine, sine = np.cos(turn), np.sin(turn)
-    pose = np.eye(4)
-    pose[:3, :3] = [[cosine, 0, -sine], [0, 1, 0], [sine, 0, cosine]]
+    rotation = np.array([[cosine, 0, -sine], [0, 1, 0], [sine, 0, cosine]])
     center = 0.08 * size * np.array([np.cos(turn), np.sin(3 * turn), np.sin(turn)])
-    pose[:3, 3] = -pose[:3, :3] @ center
+    pose = rigid_poses(rotation, -rotation @ center)
     return Cameras(K[None], pose[None], np.array([width]), np.array([height]), (f"{turn:.4f}",))
 
 

@@ -10,12 +10,7 @@ from typing import TYPE_CHECKING
 from pydantic import Field
 
 from gvtools.errors import OptionError
-from pipelines.commands.arguments import (
-    EMPTY,
-    LensArguments,
-    LpipsArguments,
-    SceneArguments,
-)
+from pipelines.commands.arguments import EMPTY, LensArguments, LpipsArguments, SceneArguments
 
 if TYPE_CHECKING:
     import numpy as np

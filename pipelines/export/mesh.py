@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from gvtools.cameras import Cameras
+from gvtools.cameras import Cameras, rigid_poses
 from gvtools.errors import DegenerateError, OptionError
 from gvtools.files import replaced_when_written, write_text
 from gvtools.memory.spatial_memory import SpatialMemory
@@ -152,9 +152,8 @@ def _cameras(memory: SpatialMemory, *, observed: bool) -> Iterator[Cameras]:
         camera = view.camera
         if view.scanned:
             for face in DIRECTIONS:
-                pose = np.eye(4)
-                pose[:3, :3] = face_rotation(face)
-                pose[:3, 3] = -pose[:3, :3] @ camera.centers[0]
+                turn = face_rotation(face)
+                pose = rigid_poses(turn, -turn @ camera.centers[0])
                 yield Cameras.pinhole(FACE, FACE, focal=FACE / 2, cam_from_world=pose, name=face)
             continue
         arrays = (camera.K, camera.cam_from_world, camera.width, camera.height)

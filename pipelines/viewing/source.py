@@ -1,7 +1,7 @@
 """Sources of ``gvtools view``: a run's folder, also while it grows, a memory, or an exported file.
 
 An exported file becomes a memory of its points, and keeps its Gaussians or its mesh beside it. Axes
-are the file's, which for exports are the input's.
+are the file's; Gaussians that an export turned upright are turned back to the input's.
 """
 
 from __future__ import annotations
@@ -27,15 +27,7 @@ from pipelines.export.formats import ExportOptions
 from pipelines.export.html import page_of
 from pipelines.export.source import ExportSource
 from pipelines.viewing.readers import GREY, load_mesh, read_usd, told_up
-from viz.viewer.run_view import (
-    MESH,
-    POINTS,
-    RENDERED,
-    SPLATS,
-    ColoredMesh,
-    RunView,
-    cameras_of,
-)
+from viz.viewer.run_view import MESH, POINTS, RENDERED, SPLATS, ColoredMesh, RunView, cameras_of
 
 if TYPE_CHECKING:
     import trimesh

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.cameras import Cameras, invert_rigid
+from gvtools.cameras import Cameras, invert_rigid, rigid_poses
 from gvtools.memory.store.local_frame import LocalFrame
 from gvtools.trajectories import look_at
 
@@ -158,9 +158,8 @@ class PageFrame:
         width = max(1, round(seen.image_width * factor))
         height = max(1, round(seen.image_height * factor))
         rotation = SO3(np.array(seen.wxyz)).as_matrix().T
-        pose = np.eye(4)
-        pose[:3, :3] = rotation
-        pose[:3, 3] = -rotation @ (np.array(seen.position) / self.scale + self.origin)
+        place = np.array(seen.position) / self.scale + self.origin
+        pose = rigid_poses(rotation, -rotation @ place)
         return pinhole(pose, (width, height), seen.fov, name="viewer")
 
 

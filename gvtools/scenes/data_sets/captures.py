@@ -17,7 +17,7 @@ from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 
-from gvtools.cameras import rigid_transform
+from gvtools.cameras import rigid_poses, rigid_transform
 from gvtools.errors import ProjectError
 from gvtools.scenes.calibration import (
     INTRINSICS,
@@ -27,7 +27,6 @@ from gvtools.scenes.calibration import (
     number_table,
     pinhole_lens,
     quaternion_pose,
-    rigid_poses,
     sky_findings,
 )
 from gvtools.scenes.images import decode_picture, read_depth, readings

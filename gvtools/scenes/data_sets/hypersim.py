@@ -30,8 +30,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gvtools.cameras import rigid_poses
 from gvtools.errors import ProjectError
-from gvtools.scenes.calibration import Float64, csv_rows, opencv_pose, pinhole_lens, rigid_poses
+from gvtools.scenes.calibration import Float64, csv_rows, opencv_pose, pinhole_lens
 from gvtools.scenes.images import hdf5_array, read_image, readings
 from gvtools.scenes.layout import Layout
 from gvtools.scenes.matching import natural

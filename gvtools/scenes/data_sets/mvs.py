@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gvtools.cameras import rigid_poses
 from gvtools.errors import ProjectError
 from gvtools.scenes.calibration import MILLIMETRES, Float64, load_matrix, pinhole_lens
 from gvtools.scenes.colmap_model import find_model
@@ -186,9 +187,7 @@ def decomposed(projection: Float64) -> MvsCamera:
     # K [R t] is the matrix up to a factor, which the first block tells.
     unit = K @ R
     scale = float((unit * projection[:, :3]).sum() / (unit * unit).sum())
-    pose = np.eye(4)
-    pose[:3, :3] = R
-    pose[:3, 3] = np.linalg.solve(K, projection[:, 3]) / scale
+    pose = rigid_poses(R, np.linalg.solve(K, projection[:, 3]) / scale)
     # Text and double precision leave a trace of skew.
     K[0, 1] = 0.0 if abs(K[0, 1]) < 1e-3 * K[0, 0] else K[0, 1]
     return MvsCamera(K, pose)

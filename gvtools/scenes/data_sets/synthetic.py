@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from gvtools.cameras import rigid_poses
 from gvtools.errors import ProjectError
 from gvtools.scenes.calibration import (
     Float64,
@@ -21,7 +22,6 @@ from gvtools.scenes.calibration import (
     number_table,
     pinhole_lens,
     renderer_lens,
-    rigid_poses,
 )
 from gvtools.scenes.images import (
     UNREADABLE,
