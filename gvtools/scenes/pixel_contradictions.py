@@ -21,9 +21,10 @@ from gvtools.scenes.scene import Finding, Scene, SparsePoints
 Grey = NDArray[np.float32]
 
 # A view with so many tracks in common with others is judged, and disagrees below this correlation.
-# On real scenes it is 0.92 and more; renumbered or mirrored it is 0.5 at most, and cropped by a
-# tenth at each border 0.2 to 0.6 in the middle of a scene's views.
-TRACKS, AGREE = 20, 0.7
+# On real scenes it is 0.92 and more, with noisy detections of fine texture 0.67; renumbered or
+# mirrored it is 0.5 at most, and cropped by a tenth at each border 0.2 to 0.6 in the middle of a
+# scene's views.
+TRACKS, AGREE = 20, 0.65
 # Nothing is told by detail of a smaller deviation than this, grey levels.
 CONTRAST = 2.0
 # Detail is what a blur over this share of the longer side takes away.
