@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.scenes.depth_contradictions import frame_there
+from gvtools.scenes.depth_contradictions import frame_there, unit_findings
 from gvtools.scenes.scene import Finding, Scene, SparsePoints
 
 Grey = NDArray[np.float32]
@@ -97,6 +97,9 @@ class PixelCheck:
         judged = self.agreements()
         wrong = [n for n, s in judged.items() if s < AGREE]
         if self.rough and np.median([*judged.values()] or [1]) >= AGREE:
+            return []
+        # Depth of a wrong unit says of no place where it is.
+        if self.rough and wrong and unit_findings(self.scene):
             return []
         # Right ones that were compared with wrong ones are cleared.
         judged |= self.agreements(wrong)

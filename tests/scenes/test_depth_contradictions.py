@@ -35,7 +35,7 @@ def warned(root: Path, depth_of: Callable[[int], np.ndarray]) -> list[str]:
     return [item.message for item in found if "contradicts the poses" in item.message]
 
 
-@pytest.mark.parametrize("lacking", [1, 1000, 0.001, 5, 0.2])
+@pytest.mark.parametrize("lacking", [1, 1000, 0.001, 5, 0.2, 1.2])
 def test_depth_whose_unit_contradicts_the_poses(tmp_path, lacking):
     said = warned(tmp_path, lambda i: slanted(i) / lacking)
     assert len(said) == (lacking != 1)
