@@ -331,7 +331,8 @@ def _joined(rows: list[tuple[int, list[str]]]) -> list[tuple[int, list[str]]]:
     lengths = [len(words) for _, words in rows]
     for step in (4, 5):
         pattern = [*lengths[: step - 4], 4, 4, 4, 4]
-        if pattern[0] < 5 and lengths == pattern * (len(rows) // step):
+        alike = pattern[0] < 5 and lengths == pattern * (len(rows) // step)
+        if alike and all(map(_ZERO.fullmatch, rows[step - 1][1][:3])):
             starts = range(step - 4, len(rows), step)
             return [(rows[k][0], [w for _, line in rows[k : k + 4] for w in line]) for k in starts]
     return rows

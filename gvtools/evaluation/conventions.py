@@ -16,6 +16,8 @@ FEW, HELD = 8, 3
 # A reading explains an error where it leaves less than this share of it; errors are worth it from
 # this share of the path's extent, and from so many degrees.
 EXPLAINED, NOTABLE, TURNED = 0.2, 0.01, 10.0
+# Places by which an estimate may be late or early, and rows of each path that are compared then.
+PLACES, ROWS = 60, 500
 # Where the path's spread across itself is less than so many errors, the turn of the fit is open.
 ACROSS = 10.0
 
@@ -25,8 +27,9 @@ def wrong_conventions(
 ) -> tuple[str, ...]:
     """A line for each convention of which another reading would take most of the error away.
 
-    Tried are camera from world, another unit, the other order of quaternions and other axes of the
-    cameras; and poses that stay exactly one while the reference moves are counted.
+    Tried are camera from world, another unit, other places in time, the other order of quaternions
+    and other axes of the cameras; and poses that stay exactly one while the reference moves are
+    counted.
 
     Args:
         reference: (N, 4, 4) world_from_cam, scene units.
@@ -59,6 +62,13 @@ def wrong_conventions(
                 f"another unit: with the estimate times {scaled.scale:.4g}, ATE would be "
                 f"{scaled.translation.rmse:.4g} instead of {left:.4g} (--align sim3)"
             )
+        elif (moved := _moved_in_time(first, second, align=align))[0] < EXPLAINED * left:
+            side = "later" if moved[1] > 0 else "earlier"
+            notes.append(
+                f"the estimate's poses seem to belong {abs(moved[1])} places {side}: ATE would be "
+                f"{moved[0]:.4g} instead of {left:.4g}; clocks that differ (--offset), or frames "
+                "that are numbered otherwise"
+            )
     centers = first[:, :3, 3] - first[:, :3, 3].mean(axis=0)
     across = np.linalg.svd(centers, compute_uv=False)[1] / np.sqrt(len(first))
     if found.rotation_deg.rmse > TURNED and left * ACROSS < across:
@@ -73,6 +83,19 @@ def wrong_conventions(
             "leave poses out where tracking was lost"
         )
     return tuple(notes)
+
+
+def _moved_in_time(first: Float64, second: Float64, *, align: str) -> tuple[float, int]:
+    """The least ATE of an estimate some places later (or earlier: below 0), and how many."""
+    tried = [(np.inf, 0)]
+    for places in range(1, min(PLACES, len(first) // 3) + 1):
+        every = max(1, (len(first) - places) // ROWS)
+        for sign, late, early in ((1, first, second), (-1, second, first)):
+            pair = late[places::every], early[:-places:every]
+            found = absolute_errors(*pair[::sign], align=align, refuse_mirrored=False)
+            if found.translation is not None:
+                tried.append((found.translation.rmse, sign * places))
+    return min(tried)
 
 
 def _other_turn(first: Float64, second: Float64, found: PoseErrors, *, align: str) -> list[str]:

@@ -273,6 +273,12 @@ def test_decimal_commas_are_refused_by_name(tmp_path, capsys, between):
     assert "decimal commas" in refused(capsys, "trajectory", "ate", file, file)
 
 
+def test_times_and_centres_alone_are_no_matrices(tmp_path, capsys):
+    file = tmp_path / "a.txt"
+    file.write_text("\n".join(" ".join(row[:4]) for row in rows(path())))
+    assert "a.txt:1: 4 numbers; expected 8" in refused(capsys, "trajectory", "ate", file, file)
+
+
 def lost(poses: np.ndarray) -> np.ndarray:
     poses = poses.copy()
     poses[10:15] = np.eye(4)
@@ -301,6 +307,7 @@ def other_order(poses: np.ndarray) -> np.ndarray:
         (mounted, "se3", "another sensor"),
         (lambda poses: moved(poses, scale=1000), "se3", "times 0.001"),
         (other_order, "none", "other order"),
+        (lambda poses: np.roll(poses, -5, axis=0), "se3", "belong 5 places later"),
         (lost, "se3", "5 poses of the estimate are exactly one"),
         (lambda poses: moved(poses, scale=1000), "sim3", ""),
         (lambda poses: disturbed(poses, metres=0.3, degrees=10), "se3", ""),
