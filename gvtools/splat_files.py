@@ -422,7 +422,7 @@ def _joined(
 
 def _read_glb(path: Path) -> Splats:
     tree, body = split_glb(read_bytes(path))
-    parts = []
+    parts, (back, up) = [], glb_told(tree)
     for node, matrix in drawn_nodes(tree):
         for part in tree["meshes"][node["mesh"]]["primitives"] if "mesh" in node else ():
             extension = part.get("extensions", {}).get(KHR)
@@ -437,34 +437,35 @@ def _read_glb(path: Path) -> Splats:
                 raise MemoryFileError(
                     f"colours in {extension['colorSpace']!r:.40}; expected {SRGB}; save it in sRGB"
                 )
-            matrix[:3] = _turn_back(node.get("extras", {})) @ matrix[:3]
+            matrix[:3] = back @ matrix[:3]
             parts.append(place_gaussians(_glb_rows(tree, body, part["attributes"]), matrix))
             if sum(len(values) for values, _ in parts) * LEAST_BYTES > len(body):
                 raise ValueError("nodes that draw a set several times")
     values, center = _joined(parts)
-    return _splats(values, center=center, up=glb_up(tree, back=True))
+    return _splats(values, center=center, up=up)
 
 
-def _turn_back(told: Mapping[str, Any]) -> NDArray[np.float64]:
+def turn_back(told: Mapping[str, Any]) -> NDArray[np.float64]:
     """(3, 3) from the upright axes of an exported file to the input's, see ``turn_upright``."""
     from scipy.spatial.transform import Rotation
 
     return Rotation.from_quat(told.get("turn", (0, 0, 0, 1))).as_matrix().T
 
 
-def glb_up(tree: Mapping[str, Any], *, back: bool = False) -> NDArray[np.float64] | None:
-    """(3,) what is up in a glTF's scene: what a node's extras say, else y, as the standard has it.
+def glb_told(tree: Mapping[str, Any]) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
+    """(3, 3) from a glTF's axes to those that it was exported from, and (3,) what is up there.
 
-    Turned ``back``, it is what was up before an export turned the scene upright.
+    Both as a node's extras say; else the axes are the same and y is up, as the standard has it.
 
-    >>> glb_up({"nodes": [{"extras": {"up": [0, 0, 2]}}]})
+    >>> glb_told({"nodes": [{"extras": {"up": [0, 0, 2]}}]})[1]
     array([0., 0., 1.])
     """
     for node, matrix in drawn_nodes(dict(tree)):
-        if "up" in node.get("extras", {}):
-            axes = _turn_back(node["extras"] if back else {}) @ matrix[:3, :3]
-            return _unit(axes @ np.asarray(node["extras"]["up"], np.float64))
-    return np.array([0.0, 1, 0])
+        told = node.get("extras", {})
+        if "up" in told:
+            back = turn_back(told)
+            return back, _unit(back @ matrix[:3, :3] @ np.asarray(told["up"], np.float64))
+    return np.eye(3), np.array([0.0, 1, 0])
 
 
 def _glb_rows(
@@ -491,7 +492,7 @@ def _glb_rows(
 def _read_usd(path: Path) -> Splats:
     require("pxr", extra="export", purpose=f"{path}: {path.suffix}")
     facts, parts = zip(*read_apart(USD, path), strict=True)
-    back = rigid_poses(_turn_back(facts[0]))
+    back = rigid_poses(turn_back(facts[0]))
     placed = [
         place_gaussians(part["values"], back @ part["matrix"]) for part in parts if "values" in part
     ]

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from box_project import write_box
 from command_line import refused
-from export_runs import export_run, saved_run
+from export_runs import Y_UP, export_run, saved_run
 from PIL import Image
 
 from gvtools.errors import MemoryFileError, OptionError
@@ -77,7 +77,7 @@ def test_points_lie_where_they_were_in_their_colours(run, exported, name, form, 
 @pytest.mark.parametrize("name", ["m.ply", "m.glb", "m.obj"])
 def test_meshes_have_their_triangles_and_colours(run, exported, name):
     trimesh = pytest.importorskip("trimesh")
-    file = exported(name, "mesh")
+    file = exported(name, "mesh", *Y_UP)
     shown = ViewSource(file).read()
     assert shown.looks == (MESH, POINTS)
     surface = shown.surface
@@ -271,7 +271,7 @@ def test_a_runs_gaussians_are_those_of_its_export(run, exported):
 @pytest.mark.parametrize(
     ("name", "form"),
     [("up.ply", "ply"), ("mesh.ply", "mesh"), ("mesh.obj", "mesh"), ("mesh.glb", "mesh"),
-     ("up.glb", "glb"), ("splats.glb", "splat")],
+     ("up.glb", "glb"), ("splats.glb", "splat"), ("up.usda", "usd")],
 )  # fmt: skip
 def test_what_a_file_says_is_up_is_up(exported, name, form):
     shown = ViewSource(exported(name, form, "--up", 0, -3, 4)).read()
