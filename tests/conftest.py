@@ -45,6 +45,24 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     )
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Compile kernels before workers begin: each would compile what others are at, too."""
+    if not getattr(session.config.option, "numprocesses", None) or hasattr(
+        session.config, "workerinput"
+    ):
+        return
+    from gvtools import kernels
+    from gvtools.appearance.compile_kernels import kernel_sets
+    from gvtools.completers.inpaint import InpaintCompleter
+    from gvtools.depth import source
+    from gvtools.memory import compile_kernels as memory
+    from gvtools.procedural import room_sample
+
+    sets = [*kernel_sets(), memory.KERNELS, room_sample.KERNELS, *InpaintCompleter.kernels]
+    kernels.compile_side_by_side([each for each in (*sets, source.KERNELS) if not each.cached])
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     if not config.getoption("--runslow"):
         slow = pytest.mark.skip(reason="slow; run with --runslow")
