@@ -437,8 +437,8 @@ def _read_glb(path: Path) -> Splats:
                 raise MemoryFileError(
                     f"colours in {extension['colorSpace']!r:.40}; expected {SRGB}; save it in sRGB"
                 )
-            matrix[:3] = back @ matrix[:3]
-            parts.append(place_gaussians(_glb_rows(tree, body, part["attributes"]), matrix))
+            rows = _glb_rows(tree, body, part["attributes"])
+            parts.append(place_gaussians(rows, rigid_poses(back) @ matrix))
             if sum(len(values) for values, _ in parts) * LEAST_BYTES > len(body):
                 raise ValueError("nodes that draw a set several times")
     values, center = _joined(parts)
