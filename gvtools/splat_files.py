@@ -42,6 +42,9 @@ from gvtools.splats import (
 )
 from gvtools.untrusted import DAMAGED, other_version, read_bytes, regular
 
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+
 # From 0 and from 1, of opacities that are read: their logits are finite.
 LEAST = 1e-4
 # Of a file's bytes, what Gaussians of it take in the child; rows that it sends at once.
@@ -55,6 +58,8 @@ KSPLAT_HEAD, KSPLAT_SECTION = 4096, 1024
 KSPLAT_RANGE = 1.5
 # glTF's extension, whose name the attributes' names begin with, and its colours that are read.
 KHR, SRGB = "KHR_gaussian_splatting", "srgb_rec709_display"
+# The node by which an exported glTF stands upright.
+UPRIGHT = "gvtools_upright"
 # Of a GLB, in which the extensions that it uses are named.
 GLB_HEAD = 1 << 20
 # Of a Gaussian in a glTF, in bytes.
@@ -121,11 +126,11 @@ def numbered(name: str, count: int) -> tuple[str, ...]:
 def _splats(
     values: NDArray[np.floating[Any]],
     *,
-    origin: NDArray[np.float64] | None = None,
-    center: NDArray[np.float64] | None = None,
-    up: NDArray[np.float64] | None = None,
+    origin: Float64 | None = None,
+    center: Float64 | None = None,
+    up: Float64 | None = None,
     mode: str = "",
-    axes: NDArray[np.float64] | None = None,
+    axes: Float64 | None = None,
 ) -> Splats:
     """Rows of a file without those that are no numbers, turned to where its axes are ``axes``.
 
@@ -154,27 +159,25 @@ def _splats(
     return Splats(kept, origin, None, 0, rounds, generated, up, mode, dropped)
 
 
-def _rows(
-    positions: Any, log_scales: Any, quaternions: Any, *, logits: Any, sh: Any
-) -> NDArray[np.float32]:
+def _rows(positions: Any, log_scales: Any, quaternions: Any, *, logits: Any, sh: Any) -> Float32:
     """Rows of the parts of N Gaussians; ``sh`` (N, H, 3)."""
     count = len(positions)
     parts = (positions, log_scales, quaternions, np.reshape(logits, (count, 1)))
     return np.concatenate([*parts, np.reshape(sh, (count, -1))], axis=1, dtype=np.float32)
 
 
-def _logits(shares: Any) -> NDArray[np.float64]:
+def _logits(shares: Any) -> Float64:
     """Before the sigmoid, what shares from 0 to 1 are behind it."""
     shares = np.clip(np.asarray(shares, np.float64), LEAST, 1 - LEAST)
     return np.log(shares / (1 - shares))
 
 
-def _dc(colors: Any) -> NDArray[np.float64]:
+def _dc(colors: Any) -> Float64:
     """Coefficients of degree 0 of colours from 0 to 1."""
     return (np.asarray(colors, np.float64) - 0.5) / HARMONICS[0]
 
 
-def _logarithms(sizes: Any) -> NDArray[np.float64]:
+def _logarithms(sizes: Any) -> Float64:
     return np.log(np.asarray(sizes, np.float64))
 
 
@@ -191,12 +194,12 @@ def _read_ply(path: Path) -> Splats:
     return _splats(_ply_values(rows, told.get("center", 0)), **told)
 
 
-def _ply_values(rows: NDArray[np.void], center: ArrayLike = 0) -> NDArray[np.float32]:
+def _ply_values(rows: NDArray[np.void], center: ArrayLike = 0) -> Float32:
     names = rows.dtype.names or ()
     if not is_splat(names):
         raise MemoryFileError("a PLY without Gaussians; expected f_dc_0, scale_0, rot_0")
 
-    def columns(of: tuple[str, ...]) -> NDArray[np.float32]:
+    def columns(of: tuple[str, ...]) -> Float32:
         return np.stack([rows[name].astype(np.float32) for name in of], axis=1)
 
     count = sum(name.startswith("f_rest_") for name in names)
@@ -237,10 +240,13 @@ def told_by(comments: Iterable[str]) -> dict[str, Any]:
     return told
 
 
-def _unit(vector: Any) -> NDArray[np.float64] | None:
-    """A direction of length 1; None where it is none."""
-    vector = np.zeros(3) if vector is None else np.asarray(vector, np.float64)
-    length = float(np.linalg.norm(vector)) if vector.shape == (3,) else 0.0
+def _unit(told: Any, size: int = 3) -> Float64 | None:
+    """A direction or a quaternion of length 1; None for what it is not, as of other programs."""
+    try:
+        vector = np.asarray(told, np.float64)
+    except (TypeError, ValueError, OverflowError):
+        return None
+    length = float(np.linalg.norm(vector)) if vector.shape == (size,) else 0.0
     return vector / length if 0 < length < np.inf else None
 
 
@@ -278,7 +284,7 @@ def _read_ksplat(path: Path) -> Splats:
     low, high = struct.unpack_from("<2f", data, 36)
     low, high = (low, high) if low < high else (-KSPLAT_RANGE, KSPLAT_RANGE)
     offset = KSPLAT_HEAD + KSPLAT_SECTION * sections
-    parts = list[tuple[NDArray[np.float32], NDArray[np.float64]]]()
+    parts = list[tuple[Float32, Float64]]()
     for number in range(sections):
         place = KSPLAT_HEAD + KSPLAT_SECTION * number
         part, offset = _ksplat_section(data, place, offset, level=level, sh_range=(low, high))
@@ -288,7 +294,7 @@ def _read_ksplat(path: Path) -> Splats:
 
 def _ksplat_section(
     data: bytes, place: int, offset: int, *, level: int, sh_range: tuple[float, float]
-) -> tuple[NDArray[np.float32], int]:
+) -> tuple[Float32, int]:
     """Rows of the section with its head at ``place`` and its data at ``offset``; where it ends."""
     used, count, size, buckets = struct.unpack_from("<4I", data, place)
     edge, bucket_bytes, steps = struct.unpack_from("<fH2xI", data, place + 16)
@@ -324,7 +330,7 @@ def _ksplat_section(
     return values, offset + count * row.itemsize
 
 
-def _unpacked(path: Path, *, form: str) -> NDArray[np.float32]:
+def _unpacked(path: Path, *, form: str) -> Float32:
     """Rows of a file that a package unpacks in a child process; opacities are of 8 bits there."""
     reader = "unpacked"
     if form == "spz" and not installed("gaussforge"):
@@ -404,9 +410,7 @@ def _read_spz(path: Path) -> Splats:
     return _splats(values, mode="mip" if flags & ANTIALIASED else "", axes=TO_RUB)
 
 
-def _joined(
-    parts: list[tuple[NDArray[np.float32], NDArray[np.float64]]],
-) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+def _joined(parts: list[tuple[Float32, Float64]]) -> tuple[Float32, Float64]:
     """Rows of several sets with origins of their own: with that of the first, and it."""
     if not parts:
         raise MemoryFileError("no Gaussians; expected some")
@@ -422,7 +426,8 @@ def _joined(
 
 def _read_glb(path: Path) -> Splats:
     tree, body = split_glb(read_bytes(path))
-    parts, (back, up) = [], glb_told(tree)
+    up, back = glb_axes(tree)
+    parts = []
     for node, matrix in drawn_nodes(tree):
         for part in tree["meshes"][node["mesh"]]["primitives"] if "mesh" in node else ():
             extension = part.get("extensions", {}).get(KHR)
@@ -445,33 +450,43 @@ def _read_glb(path: Path) -> Splats:
     return _splats(values, center=center, up=up)
 
 
-def turn_back(told: Mapping[str, Any]) -> NDArray[np.float64]:
+def _turn_back(turn: Any) -> Float64:
     """(3, 3) from the upright axes of an exported file to the input's, see ``turn_upright``."""
-    from scipy.spatial.transform import Rotation
+    turn = _unit(turn, 4)
+    if turn is None:
+        return np.eye(3)
+    # Without scipy, which the child process may not load any more.
+    cross = np.cross(np.eye(3), turn[:3])
+    return np.asarray(np.eye(3) - 2 * turn[3] * cross + 2 * cross @ cross)
 
-    return Rotation.from_quat(told.get("turn", (0, 0, 0, 1))).as_matrix().T
 
+def glb_axes(tree: Mapping[str, Any]) -> tuple[Float64 | None, Float64]:
+    """(3,) what is up in a glTF: what a node's extras say, else y, as the standard has it.
 
-def glb_told(tree: Mapping[str, Any]) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
-    """(3, 3) from a glTF's axes to those that it was exported from, and (3,) what is up there.
+    It is in the axes that the scene had before an export turned it upright; beside it (3, 3) from
+    the scene's axes to those.
 
-    Both as a node's extras say; else the axes are the same and y is up, as the standard has it.
-
-    >>> glb_told({"nodes": [{"extras": {"up": [0, 0, 2]}}]})[1]
+    >>> glb_axes({"nodes": [{"extras": {"up": [0, 0, 2]}}]})[0]
     array([0., 0., 1.])
     """
-    for node, matrix in drawn_nodes(dict(tree)):
-        told = node.get("extras", {})
-        if "up" in told:
-            back = turn_back(told)
-            return back, _unit(back @ matrix[:3, :3] @ np.asarray(told["up"], np.float64))
-    return np.eye(3), np.array([0.0, 1, 0])
+    nodes = list(drawn_nodes(dict(tree)))
+    for node, matrix in nodes:
+        told = extras if isinstance(extras := node.get("extras"), dict) else {}
+        up = _unit(told.get("up"))
+        if up is not None:
+            shown = _unit(matrix[:3, :3] @ up)
+            # A node taken out of the one that turns it has the axes from before.
+            turned = shown is not None and shown[1] > shown @ up
+            back = _turn_back(told.get("turn") if turned else None)
+            return None if shown is None else back @ shown, back
+    # Many programs keep the node that turns, but no extras.
+    turns = [matrix[:3, :3] for node, matrix in nodes if node.get("name") == UPRIGHT]
+    back = turns[0].T / np.cbrt(np.linalg.det(turns[0])) if turns else np.eye(3)
+    return back[:, 1], back
 
 
-def _glb_rows(
-    tree: dict[str, Any], body: bytes, attributes: Mapping[str, int]
-) -> NDArray[np.float32]:
-    def array(name: str) -> NDArray[np.float32]:
+def _glb_rows(tree: dict[str, Any], body: bytes, attributes: Mapping[str, int]) -> Float32:
+    def array(name: str) -> Float32:
         return glb_numbers(tree, body, attributes[name])
 
     sh = [
@@ -492,20 +507,16 @@ def _glb_rows(
 def _read_usd(path: Path) -> Splats:
     require("pxr", extra="export", purpose=f"{path}: {path.suffix}")
     facts, parts = zip(*read_apart(USD, path), strict=True)
-    back = rigid_poses(turn_back(facts[0]))
-    placed = [
-        place_gaussians(part["values"], back @ part["matrix"]) for part in parts if "values" in part
-    ]
+    placed = [place_gaussians(part["values"], part["matrix"]) for part in parts if "values" in part]
     values, center = _joined(placed)
-    up = _unit(facts[0].get("up"))
-    return _splats(values, center=center, up=None if up is None else back[:3, :3] @ up)
+    return _splats(values, center=center, up=_unit(facts[0].get("up")))
 
 
 def usd(path: Path) -> Iterator[Item]:
     """What is up, and what each prim of Gaussians or of points holds, for ``read_apart``.
 
     Rows and frame of each ParticleField3DGaussianSplat; positions and linear colours of each
-    UsdGeom.Points, in the file's frame.
+    UsdGeom.Points, in the file's frame, before an export turned that upright.
     """
     from pxr import Sdf, Usd, UsdGeom
 
@@ -515,12 +526,13 @@ def usd(path: Path) -> Iterator[Item]:
         raise MemoryFileError("damaged, or names other files; expected one USD layer")
     cache, stage = UsdGeom.XformCache(), Usd.Stage.Open(layer)
     told, axis = layer.customLayerData, UsdGeom.GetStageUpAxis(stage)
-    turn = {"turn": [float(number) for number in told["turn"]]} if "turn" in told else {}
+    back, up = rigid_poses(_turn_back(told.get("turn"))), _unit(told.get("up"))
     # Where an export turned the scene, up is the stage's axis; earlier ones only told it.
-    up = (0, axis == "Y", axis == "Z") if turn or "up" not in told else told["up"]
-    yield {"up": [float(number) for number in up], **turn}, {}
+    if "turn" in told or up is None:
+        up = back[:3, :3] @ (0, axis == "Y", axis == "Z")
+    yield {"up": up.tolist()}, {}
     for prim in stage.Traverse():
-        matrix = np.array(cache.GetLocalToWorldTransform(prim)).T
+        matrix = back @ np.array(cache.GetLocalToWorldTransform(prim)).T
         if prim.IsA(UsdGeom.Points):
             local = np.asarray(UsdGeom.Points(prim).GetPointsAttr().Get(), np.float64)
             positions = local.reshape(-1, 3) @ matrix[:3, :3].T + matrix[:3, 3]

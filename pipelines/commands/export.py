@@ -147,4 +147,4 @@ class ExportCommand(Arguments, ExportOptions):
 
 
 def _said(up: NDArray[np.float64] | None) -> str:
-    return "" if up is None else "; up is " + " ".join(f"{x:.3g}" for x in up)
+    return "" if up is None else "; up is " + " ".join(f"{round(x, 3) + 0:g}" for x in up)

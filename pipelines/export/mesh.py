@@ -28,7 +28,7 @@ from gvtools.runs.layout import RECORD
 from gvtools.runs.run import load_run
 from gvtools.scenes.faces import DIRECTIONS, face_rotation
 from pipelines.export.formats import ExportOptions
-from pipelines.export.points import UNLIT, linear, save_glb, unlit
+from pipelines.export.points import UNLIT, axes_of, linear, save_glb, unlit
 from pipelines.export.source import ExportSource
 from pipelines.export.texture import TEXELS, Texture, texture_of
 
@@ -254,9 +254,10 @@ def write_mesh(source: ExportSource, path: Path, options: ExportOptions) -> str:
     fewer = f", simplified from {made}" if count < made else ""
     fewer += f", without {islands} small pieces (--least-piece)" if islands else ""
     colors = "" if size is None else f", a texture of {size} x {size}"
+    axes = axes_of(source.up) if path.suffix.lower() == ".glb" else ""
     return (
         f"{count} triangles{fewer}, {len(mesh.vertex.positions)} vertices{colors} ({method}, "
-        f"voxels of {voxel:.4g}) in {path}"
+        f"voxels of {voxel:.4g}) in {path}{axes}"
     )
 
 

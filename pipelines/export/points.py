@@ -22,6 +22,7 @@ from gvtools.glb import pack_glb
 from gvtools.memory.ply import export_memory_ply
 from gvtools.ply import up_comment
 from gvtools.runs.run import load_run
+from gvtools.splat_files import UPRIGHT
 from gvtools.splats import box_middle
 from pipelines.export.formats import ExportOptions
 from pipelines.export.source import ExportSource
@@ -40,8 +41,7 @@ TO_16_BITS = 257
 MAX_POINTS = 2_000_000
 ROOT, CLOUD = "/gvtools", "/gvtools/memory"
 NODE = "gvtools_memory"
-FRAME = "input world frame and axes, scene units; a node around this one turns what is up to y"
-UPRIGHT = "upright"
+FRAME = "input world frame and axes, scene units; any node around this one turns what is up to y"
 # What is up is along an axis from this share of its length on.
 LEVEL = 1 - 1e-9
 
@@ -202,7 +202,7 @@ def usd_stage(center: NDArray[np.float64], up: NDArray[np.float64] | None) -> An
         stage.GetRootLayer().customLayerData = told | {"up": Gf.Vec3d(*up.tolist())}
     root.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*center.tolist()))
     stage.SetDefaultPrim(root.GetPrim())
-    stage.SetMetadata("comment", "gvtools, input world frame and axes, scene units")
+    stage.SetMetadata("comment", f"gvtools, scene units, input world frame and axes below {ROOT}")
     return stage
 
 

@@ -12,17 +12,18 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import takewhile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gvtools.cameras import rigid_poses
 from gvtools.errors import MemoryFileError
 from gvtools.glb import GLB, glb_array, join_glb, split_glb
 from gvtools.optional import require
 from gvtools.ply import read_header
 from gvtools.sandbox import ReaderError, read_apart
-from gvtools.splat_files import USD, glb_told, told_by, turn_back
+from gvtools.splat_files import USD, glb_axes, told_by
 from gvtools.untrusted import PIXEL_BYTES, PIXEL_RATIO, read_bytes, read_text
 
 if TYPE_CHECKING:
@@ -37,21 +38,23 @@ COLOR_TYPES = (5123, 5126)
 
 
 def load_mesh(path: Path) -> trimesh.Trimesh | trimesh.PointCloud:
-    """The triangles or the points of a file, in one; of an export in the input's axes."""
+    """The triangles or the points of a file, in one, before an export turned them upright."""
     import trimesh
 
     data = read_bytes(path)
     if data.startswith(b"ply"):
         read_header(path)
-    back, place = np.eye(4), cast("Any", path)
+    place: Any = path
+    back = np.eye(3)
     kind = path.suffix.lower().removeprefix(".")
     if data.startswith(GLB):
         place, kind = io.BytesIO(_checked_glb(path, data)), "glb"
-        back[:3, :3] = glb_told(split_glb(data)[0])[0]
+        _, back = glb_axes(split_glb(data)[0])
     del data
     with _small_pictures(path.stat().st_size):
         scene = trimesh.load_scene(place, process=False, resolver=_beside(path), file_type=kind)
         loaded: Any = scene.to_geometry()
+    loaded.apply_transform(rigid_poses(back))
     points = isinstance(loaded, trimesh.PointCloud)
     if not points and not (isinstance(loaded, trimesh.Trimesh) and len(loaded.faces)):
         raise MemoryFileError(f"{path}: no triangles and no points; expected either")
@@ -62,7 +65,6 @@ def load_mesh(path: Path) -> trimesh.Trimesh | trimesh.PointCloud:
         if faces.min() < 0 or faces.max() >= len(loaded.vertices):
             raise MemoryFileError(f"{path}: a triangle of vertices that are not there")
     geometry: trimesh.Trimesh | trimesh.PointCloud = loaded
-    geometry.apply_transform(back)
     return geometry
 
 
@@ -70,7 +72,7 @@ def told_up(path: Path) -> NDArray[np.float64] | None:
     """(3,) what is up, as a PLY, an OBJ or a GLB says; None where it does not."""
     suffix, comments = path.suffix.lower(), tuple[str, ...]()
     if suffix == ".glb":
-        return glb_told(split_glb(read_bytes(path))[0])[1]
+        return glb_axes(split_glb(read_bytes(path))[0])[0]
     if suffix == ".ply":
         comments = read_header(path).comments
     elif suffix == ".obj":
@@ -188,7 +190,7 @@ def _with_plain_colors(tree: dict[str, Any], body: bytes) -> bytes | None:
 
 
 def read_usd(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8], NDArray[np.float64]]:
-    """(N, 3) positions and colours of all UsdGeom.Points, in the input's axes; (3,) what is up."""
+    """(N, 3) positions and colours of all UsdGeom.Points, in the file's frame; (3,) what is up."""
     require("pxr", extra="export", purpose=f"{path}: {path.suffix}")
     try:
         (facts, _), *items = read_apart(USD, path)
@@ -196,9 +198,8 @@ def read_usd(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8], NDArra
         grey = np.full((1, 3), GREY / 255)
         colors = [np.broadcast_to(part.get("colors", grey), part["positions"].shape)
                   for part in parts]  # fmt: skip
-        back = turn_back(facts)
-        positions = np.concatenate([part["positions"] for part in parts]) @ back.T
-        return positions, _srgb(np.concatenate(colors)), back @ facts["up"]
+        positions = np.concatenate([part["positions"] for part in parts])
+        return positions, _srgb(np.concatenate(colors)), np.array(facts["up"])
     except (ReaderError, OSError, ValueError, KeyError):
         raise MemoryFileError(
             f"{path}: no USD with UsdGeom.Points, or one that is damaged or names other files; "

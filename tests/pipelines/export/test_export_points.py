@@ -11,8 +11,10 @@ from command_line import run_command
 from export_runs import Y_UP, export_run
 from plyfile import PlyData
 from scan_files import write_las
+from scipy.spatial.transform import Rotation
 
 from gvtools.errors import OptionError
+from gvtools.glb import join_glb, split_glb
 from gvtools.memory.store.local_frame import LocalFrame
 from gvtools.memory.thinning import thin
 from gvtools.scans.read import read_scan
@@ -298,6 +300,65 @@ def test_splats_that_stand_upright_are_read_in_the_inputs_axes(bare_run, tmp_pat
         found.positions + found.origin, expected.positions + expected.origin, atol=1e-5
     )
     np.testing.assert_allclose(found.quaternions, expected.quaternions, atol=1e-6)
+
+
+def twice(nodes, meshes, scene):
+    meshes[0]["primitives"] *= 2
+
+
+def beside_another(nodes, meshes, scene):
+    nodes.append({"mesh": 0, "translation": [5, 0, 0], "rotation": nodes[1]["rotation"]})
+    scene["nodes"].append(2)
+
+
+def taken_out(nodes, meshes, scene):
+    scene["nodes"] = [0]
+
+
+def without_extras(nodes, meshes, scene):
+    nodes[0]["extras"] = None
+
+
+def with_others_extras(nodes, meshes, scene):
+    nodes[0]["extras"] = {"up": "y", "turn": 90}
+
+
+@pytest.mark.parametrize(
+    "change", [twice, beside_another, taken_out, without_extras, with_others_extras]
+)
+def test_upright_splats_stay_right_where_another_program_saved_them(bare_run, tmp_path, change):
+    plain, turned = tmp_path / "a.ply", tmp_path / "a.glb"
+    for out in (plain, turned):
+        run_command("export", bare_run.folder, "--format", "splat", "--out", out, "--up", *UP)
+    expected = read_splats(plain)
+    tree, body = split_glb(turned.read_bytes())
+    change(tree["nodes"], tree["meshes"], tree["scenes"][0])
+    turned.write_bytes(join_glb(tree, body))
+    found = read_splats(turned)
+    assert found.up is not None
+    np.testing.assert_allclose(found.up, UP, atol=1e-9)
+    there = expected.positions + expected.origin
+    *more, here = (found.positions + found.origin).reshape(-1, *there.shape)
+    np.testing.assert_allclose(here, there, atol=1e-5)
+    for others in more:
+        # What is 5 beside it on the screen is so in the input's axes; that node moves nothing else.
+        turn = Rotation.from_quat(tree["nodes"][1]["rotation"])
+        aside = turn.inv().apply([5, 0, 0]) - tree["nodes"][0]["translation"]
+        off = aside if change is beside_another else np.zeros(3)
+        np.testing.assert_allclose(others, there + off, atol=1e-5)
+
+
+@pytest.mark.parametrize("data", [{"up": "y"}, {"turn": 90.0}])
+def test_data_of_other_programs_in_usd_is_passed_over(bare_run, tmp_path, data):
+    pytest.importorskip("pxr")
+    from pxr import Sdf
+
+    out = tmp_path / "a.usda"
+    export_run(bare_run.folder, "splat", out, *Y_UP)
+    layer = Sdf.Layer.FindOrOpen(str(out))
+    layer.customLayerData = data
+    layer.Save()
+    assert read_splats(out).up.tolist() == [0, 1, 0]
 
 
 WKT = 'LOCAL_CS["site",UNIT["metre",1]]'
