@@ -344,15 +344,9 @@ def nerfstudio_dataset(path: Path) -> PictureSet | None:
     notes = []
     if len(splits) > 1:
         notes.append(f"split {folder.name} taken; also there: {', '.join(list(splits)[1:])}")
-    return PictureSet(
-        path,
-        "nerfstudio, ns-render dataset",
-        tuple(
-            _beside_truth(file, folder / "rgb", folder / "gt-rgb")
-            for file in image_files(folder / "rgb")
-        ),
-        notes=tuple(notes),
-    )
+    files = image_files(folder / "rgb")
+    pictures = tuple(_beside_truth(file, folder / "rgb", folder / "gt-rgb") for file in files)
+    return PictureSet(path, "nerfstudio, ns-render dataset", pictures, notes=tuple(notes))
 
 
 def nerfstudio_evaluation(path: Path) -> PictureSet | None:
@@ -360,13 +354,9 @@ def nerfstudio_evaluation(path: Path) -> PictureSet | None:
     canvases = [file for file in path.iterdir() if _CANVAS.fullmatch(file.name)]
     if not canvases:
         return None
-    return PictureSet(
-        path,
-        "nerfstudio, ns-eval",
-        tuple(canvas_picture(file, path) for file in in_natural_order(canvases, path)),
-        alphabetical=True,
-        notes=("renders are the right halves of the pictures, which are JPEG",),
-    )
+    pictures = tuple(canvas_picture(file, path) for file in in_natural_order(canvases, path))
+    notes = ("renders are the right halves of the pictures, which are JPEG",)
+    return PictureSet(path, "nerfstudio, ns-eval", pictures, alphabetical=True, notes=notes)
 
 
 def gsplat_renders(path: Path) -> PictureSet | None:
@@ -381,19 +371,11 @@ def gsplat_renders(path: Path) -> PictureSet | None:
     # What the trainer's last evaluation gave; pictures of the compressed model only by themselves.
     stage, step = max(found, key=lambda key: (key[0] == "val", key[1]))
     notes = ["renders are the right halves of the pictures"]
-    others = sorted(
-        f"{name}_step{number}" for name, number in found if (name, number) != (stage, step)
-    )
-    if others:
+    if others := sorted(f"{name}_step{number}" for name, number in {*found} - {(stage, step)}):
         notes.append(f"{stage}_step{step} taken; also there: {', '.join(others)}")
     files = in_natural_order(found[stage, step], folder)
-    return PictureSet(
-        path,
-        "gsplat",
-        tuple(canvas_picture(file, folder) for file in files),
-        alphabetical=True,
-        notes=tuple(notes),
-    )
+    pictures = tuple(canvas_picture(file, folder) for file in files)
+    return PictureSet(path, "gsplat", pictures, alphabetical=True, notes=tuple(notes))
 
 
 def nerfbaselines_predictions(path: Path) -> PictureSet | None:
@@ -445,15 +427,12 @@ def open_pictures(path: Path) -> PictureSet:
         if found := reader(path):
             return found
     files = image_files(path)
-    rendered = [file for file in files if file.name.endswith(RENDERED)]
-    if rendered:
-        pictures = tuple(_rendered(file, path, RENDERED) for file in rendered)
-        return PictureSet(path, "gvtools render", pictures)
     if not files:
         raise ProjectError(f"{path}: no pictures; expected PNG or JPEG files")
-    return PictureSet(
-        path, "plain folder", tuple(_rendered(file, path, file.suffix) for file in files)
-    )
+    rendered = [file for file in files if file.name.endswith(RENDERED)]
+    layout = "gvtools render" if rendered else "plain folder"
+    endings = ((file, RENDERED if rendered else file.suffix) for file in rendered or files)
+    return PictureSet(path, layout, tuple(_rendered(file, path, end) for file, end in endings))
 
 
 def _rendered(file: Path, folder: Path, ending: str) -> MethodPicture:

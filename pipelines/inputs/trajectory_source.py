@@ -133,6 +133,12 @@ def associate(
             f"times of pairs differ by {gap:.3g} s (median), and poses are {max(steps):.3g} s "
             "apart: other moments may be paired; give an offset or a smaller largest difference",
         )
+    for stamps in (reference.stamps, estimate.stamps):
+        if len(first) < len(stamps) / 2 and (stamps == np.round(stamps)).all():
+            doubts += (
+                f"{len(stamps)} stamps of one are whole numbers, of which {len(first)} find a time "
+                "of the other: frames' numbers are no seconds; to pair in order, --associate index",
+            )
     return first, second, how, doubts
 
 

@@ -125,6 +125,8 @@ def _print_matching(method: MethodPictures, targets: int, console: Console) -> N
         console.warn(f"{name}: no picture of {len(matching.missing)} views ({listed})")
     if matching.left_over:
         console.line(f"  {len(matching.left_over)} pictures of no judged view left out")
+    if method.doubt:
+        console.warn(f"{name}: {method.doubt}")
     for (width, height), count in sorted(method.resized.items()):
         console.warn(f"{name}: {count} pictures of {width}x{height} pixels resized to their views'")
 

@@ -46,9 +46,8 @@ OWN_LAYOUT = "gvtools run"
 # A picture has its target's aspect when its height differs by at most this from the height that
 # its width and the target's aspect give, pixels.
 SHAPE_TOLERANCE = 1.0
-# The ground truth that a tool wrote beside a render is compared with that of the views, as
-# thumbnails (width, height). Where another view's is nearer by more than this factor than that of
-# the matched view, the match is refused.
+# Pictures are compared with the truths of all views as thumbnails (width, height). They are taken
+# for those of another view where its truth is nearer by more than this factor.
 THUMBNAIL = (32, 24)
 CLEARLY = 2.0
 
@@ -170,6 +169,7 @@ class MethodPictures:
     targets: list[MeasuredTarget]  # those that the method has a picture of, each with this picture
     # Sizes (width, height) of the pictures that were resized to their target's, and how many.
     resized: dict[tuple[int, int], int]
+    doubt: str  # whether they are of these targets; "" where nothing speaks against it
 
     def to_dict(self) -> dict[str, Any]:
         """What was read and how, JSON-ready."""
@@ -193,7 +193,7 @@ class MethodPictures:
                 for size, count in sorted(self.resized.items())
             ],
             "depth": depth,
-            "reading": list(self.pictures.notes),
+            "reading": [*self.pictures.notes, *filter(None, [self.doubt])],
         }
 
 
@@ -244,8 +244,8 @@ def open_method(
             resized[size] = resized.get(size, 0) + 1
         posed = PosedPicture(view.name, view.camera, frame.rgb, frame.depth)
         matched.append(replace(target, picture=posed))
-    _check_truths(pictures, matching, targets)
-    return MethodPictures(name, pictures, matching, matched, resized)
+    doubt = _doubt(pictures, matching, targets, matched=matched)
+    return MethodPictures(name, pictures, matching, matched, resized, doubt)
 
 
 def _run_pictures(path: Path) -> PictureSet:
@@ -282,32 +282,47 @@ def _at_size(frame: Frame, camera: Cameras, *, what: str) -> tuple[Frame, tuple[
     return Frame(rgb, depth), (columns, rows)
 
 
-def _check_truths(
-    pictures: PictureSet, matching: Matching, targets: Sequence[MeasuredTarget]
-) -> None:
-    """Compare the ground truth that a tool wrote beside its renders with that of the targets.
+def _doubt(
+    pictures: PictureSet,
+    matching: Matching,
+    targets: Sequence[MeasuredTarget],
+    *,
+    matched: Sequence[MeasuredTarget],
+) -> str:
+    """What is said where most pictures are nearer to the truth of another target; else nothing.
 
-    Nothing is checked where it is missing beside any render.
+    Where a tool wrote the ground truth beside all of its renders, that is compared, and the first
+    one that is another target's is refused.
     """
     loads = [picture.load_truth for picture in pictures.pictures]
     rows = [row for row, target in enumerate(targets) if target.truth is not None]
-    if not rows or any(load is None for load in loads):
-        return
+    if not rows:
+        return ""
+    own, off = {target.key: target.picture.rgb for target in matched}, list[str]()
     truths = np.stack([_thumbnail(t.truth.rgb) for t in targets if t.truth is not None])
     for row in rows:
         number = matching.picture_of[row]
-        load = None if number is None else loads[number]
-        if number is None or load is None:
+        if number is None:
             continue
-        distance = np.abs(truths - _thumbnail(load())).mean(axis=(1, 2, 3))
+        load = loads[number] if all(loads) else None
+        shown = _thumbnail(own[targets[row].key] if load is None else load())
+        distance = np.abs(truths - shown).mean(axis=(1, 2, 3))
         best = int(distance.argmin())
-        if distance[rows.index(row)] > CLEARLY * distance[best]:
+        if distance[rows.index(row)] <= CLEARLY * distance[best]:
+            continue
+        off.append(
+            f"{pictures.names[number]} stands for {targets[row].picture.name} by its "
+            f"{matching.rule}, but {'it shows' if load is None else 'the truth beside it is'} "
+            f"{targets[rows[best]].picture.name}"
+        )
+        if load is not None:
             raise ProjectError(
-                f"{pictures.path}: {pictures.names[number]} stands for {targets[row].picture.name} "
-                f"by its {matching.rule}, but the truth beside it is "
-                f"{targets[rows[best]].picture.name}; "
-                "expected the same views in the same order; give the same --targets"
+                f"{pictures.path}: {off[0]}; expected the same views in the same order; give the "
+                "same --targets"
             )
+    if len(off) <= len(matched) / 2:
+        return ""
+    return f"{len(off)} of {len(matched)} pictures look like other views ({off[0]})"
 
 
 def _thumbnail(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:

@@ -221,6 +221,16 @@ def test_pairs_of_doubtful_moments_are_warned_of(tmp_path, capsys):
     assert capsys.readouterr().err.count("warning") == 2
 
 
+def test_numbers_of_frames_against_seconds_are_warned_of(tmp_path, capsys):
+    for name, rate in (("a.txt", 10), ("b.txt", 1)):
+        lines = (" ".join([f"{i / rate}", *row[1:]]) for i, row in enumerate(rows(path())))
+        (tmp_path / name).write_text("\n".join(lines))
+    figures = measured(tmp_path, "ate", tmp_path / "a.txt", tmp_path / "b.txt")
+    assert figures["associated"] == 4
+    assert "--associate index" in figures["notes"]["association"][0]
+    assert "warning" in capsys.readouterr().err
+
+
 def test_the_table_is_printed_without_json(tmp_path, capsys):
     write_tum(tmp_path / "a.txt", cameras(path()))
     assert main(["trajectory", "ate", str(tmp_path / "a.txt"), str(tmp_path / "a.txt")]) == 0

@@ -175,6 +175,15 @@ def test_smaller_pictures_are_resized_and_flagged(small_run, tmp_path, capsys):
     assert "4 pictures of 48x36 pixels resized" in capsys.readouterr().err
 
 
+def test_pictures_named_as_the_views_before_them_are_warned_of(small_run, tmp_path, capsys):
+    names, pictures = zip(*noisy(small_run, 1).items(), strict=True)
+    write_pictures(tmp_path / "one off", dict(zip(names, pictures[-1:] + pictures, strict=False)))
+    found = quickly(tmp_path / "one off", "--against", small_run, tmp_path / "out")
+    said = f"4 of 4 pictures look like other views ({names[0]} stands for {names[0]} by its name"
+    assert said in found["methods"][0]["reading"][0]
+    assert f"warning: one off: {said}" in capsys.readouterr().err
+
+
 def test_pictures_of_another_shape_are_refused(small_run, tmp_path, capsys):
     cropped = {name: rgb[:, :80] for name, rgb in truths(small_run).items()}
     write_pictures(tmp_path / "cropped", cropped)
