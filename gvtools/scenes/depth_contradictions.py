@@ -15,14 +15,17 @@ from gvtools.scenes.scene import Finding, Frame, Scene
 
 Float64 = NDArray[np.float64]
 
-# Factors that depth may lack, a tenth apart, near 1 a fortieth, and how far depths that agree may
+# Factors that depth may lack, a tenth apart, near 1 a hundredth, and how far depths that agree may
 # differ.
-FACTORS, SAME = 10 ** np.union1d(np.arange(-96, 97) / 24, np.arange(-24, 25) / 96), 0.01
+FACTORS, SAME = np.append(10 ** (np.arange(-96, 97) / 24), np.geomspace(0.5, 2, 141)), 0.01
 # Views that are compared with those so many places after them, and pixels of each.
 PROBES, GAPS, PIXELS = 4, (1, 4, 16), 800
-# Depth is wrong when another factor makes so many agree, and it has less than the share of that: of
-# depth 1.2 times as large, 0.71 to 0.95 on four recordings, which have 1 as they are.
-AGREE, SHARE, FAR = 0.2, 0.87, 1.1
+# Depth is wrong when another factor makes so many agree, and of the two pairs that tell most, depth
+# as it is has less than these shares of each one's best. On three recordings it is 0.9 at the least.
+AGREE, SHARES, FAR = 0.2, (0.75, 0.92), 1.13
+# As distances along the rays it agrees when this share of that is more than any factor's; and pairs
+# that tell have this share of their best at the factor that is best for all.
+SHARE = 0.8
 # Of so many pixels that a second view does not hide, so few that are nearly alike in one pair, or
 # two, tell of maps that are not of their cameras. On seven recordings it is 0.92 at the least, and
 # 0.1 to 0.3 of mirrored maps and those of other frames; what moves takes a part of it away.
@@ -48,15 +51,20 @@ def unit_findings(scene: Scene) -> list[Finding]:
             names.append(f"{a.name} and {b.name}")
     if not compared:
         return []
-    now, agreeing = (_agreeing(compared, at)[0].mean(0) for at in (np.ones(1), FACTORS))
-    best, factor = agreeing.max(), float(FACTORS[agreeing.argmax()])
+    now, agreeing = (_agreeing(compared, at)[0] for at in (np.ones(1), FACTORS))
+    mean, most = agreeing.mean(0), agreeing.max(1)
+    best, factor = mean.max(), float(FACTORS[mean.argmax()])
+    ratios = np.where(most < AGREE, 1, now[:, 0] / np.maximum(most, AGREE))
+    telling = np.argsort(ratios)[:2]
+    fits = agreeing[telling, mean.argmax()] > SHARE * most[telling]
+    other = fits.all() and (ratios[telling] < SHARES[: len(telling)]).all()
     shares = _nearly(compared)
     straight = [(_of_rays(one, a), _of_rays(other, b), (a, b)) for one, other, (a, b) in compared]
     by_rays = SHARE * _agreeing(straight, np.ones(1))[0].mean() > max(best, AGREE)
-    if not by_rays and now < SHARE * best >= SHARE * AGREE and max(factor, 1 / factor) > FAR:
-        times = f"{float(f'{factor:.2g}'):g}"
+    if not by_rays and other and best >= AGREE and max(factor, 1 / factor) > FAR:
+        times = f"{float(f'{factor:.3g}'):g}"
         line = (
-            f"recorded depth contradicts the poses: {now[0]:.0%} of neighbouring views' depth "
+            f"recorded depth contradicts the poses: {now.mean():.0%} of neighbouring views' depth "
             f"agrees, {best:.0%} if depth were {times} times as large; the unit of one of them is "
             "wrong: state that of depth (--depth-unit of RGB-D folders, depth_unit_scale_factor or "
             "integer_depth_scale of transforms.json) or give poses in the same unit"

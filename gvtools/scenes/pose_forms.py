@@ -1,7 +1,8 @@
 """Poses that contradict the photographs of scenes without tracks: other axes, inverted, shuffled.
 
 Matches of two pictures that fit one epipolar geometry, whichever it is, show the same places. So
-most of them lie on the epipolar lines of the given poses, too, unless these are of another form.
+most of them lie on the epipolar lines of the given poses, too, and in front of both cameras, unless
+these are of another form. Of cameras that go sideways the lines alone do not tell axes apart.
 """
 
 from __future__ import annotations
@@ -37,6 +38,7 @@ LONGER, BENT = (0.7, 0.8, 0.9, 1.1, 1.25, 1.45), 0.75
 # Views farther apart are not looked at where a pair moves by this share.
 ENOUGH = 0.08
 FLIP = OPENCV_FROM_OPENGL
+MIRRORS = {"y": np.diag([1.0, -1, 1, 1]), "z": np.diag([1.0, 1, -1, 1])}
 
 
 def _reordered(pose: Float64, places: int) -> Float64:
@@ -63,6 +65,12 @@ FORMS: Mapping[str, Callable[[Float64], Float64]] = {
     "quaternions have the scalar first, where it is expected last": (
         lambda pose: invert_rigid(_reordered(invert_rigid(pose), -1))
     ),
+    **{
+        f"axes are left-handed, as game engines have them (turn {axis} over in world and camera)": (
+            lambda pose, mirror=mirror: mirror @ pose @ mirror
+        )
+        for axis, mirror in MIRRORS.items()
+    },
 }
 
 
@@ -74,17 +82,24 @@ class _Pair:
     xy: tuple[Float64, Float64]  # (M, 2) each
 
     def share(self, K: Float64, poses: Float64, *, scale: Float64, near: float) -> float:
-        """How many of the matches lie on epipolar lines."""
+        """How many of the matches lie on epipolar lines, and not clearly behind a camera."""
         a, b = self.views
         change = poses[1] @ np.linalg.inv(poses[0])
-        x, y, z = change[:3, 3]
+        x, y, z = shift = change[:3, 3]
         cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
         F = np.linalg.inv(K[b]).T @ cross @ change[:3, :3] @ np.linalg.inv(K[a])
         first, second = (np.column_stack([xy, np.ones(len(xy))]) for xy in self.xy)
         lines, back = first @ F.T, second @ F
         off = np.abs((second * lines).sum(1))
         far = off / np.maximum(np.minimum(*(np.hypot(*r.T[:2]) for r in (lines, back))), 1e-12)
-        return float((far * scale[b] < near).mean())
+        # Rays meet where m one + shift = n other, of which m and n have to be positive.
+        one = first @ (change[:3, :3] @ np.linalg.inv(K[a])).T
+        other = second @ np.linalg.inv(K[b]).T
+        sine = np.cross(one, other) / np.linalg.norm(one, axis=1, keepdims=True)
+        m, n = ((np.cross(ray, shift) * sine).sum(1) for ray in (other, one))
+        apart = np.linalg.norm(sine, axis=1) / np.linalg.norm(other, axis=1)
+        behind = (np.minimum(m, n) < 0) & (apart * K[b, 0, 0] * scale[b] > near)
+        return float(((far * scale[b] < near) & ~behind).mean())
 
 
 @dataclass(frozen=True, eq=False)
