@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from gvtools.cameras import ROTATION_ROUNDING, Cameras, invert_rigid, rigid_poses, rigid_transform
 from gvtools.errors import ProjectError, ShapeError
 from gvtools.notebook import html_table, path_sketch
-from gvtools.untrusted import read_text
+from gvtools.untrusted import load_array, read_text, reading
 
 Float64 = NDArray[np.float64]
 
@@ -72,7 +72,8 @@ def read_poses(path: str | Path, *, layout: str = "auto", lost: bool = False) ->
     r"""The poses of a trajectory file.
 
     Args:
-        path: a text file; blank lines and lines that start with # are passed over.
+        path: a text file, of which blank lines and those that start with # are passed over, or an
+            ``.npy`` with an array of such rows or matrices.
         layout: "tum" (timestamp tx ty tz qx qy qz qw), "kitti" (12 or 16 numbers, a matrix by rows,
             with or without a number or time in front, or a line for each row), "euroc" (CSV:
             nanoseconds, x, y, z, qw, qx, qy, qz, and more that is not read) or "auto": the columns
@@ -302,6 +303,11 @@ def _rows(
     path: Path,
 ) -> tuple[tuple[tuple[int, ...], str] | None, list[tuple[int, list[str]]], bool]:
     """Columns and unit that a head names, line numbers and words, whether commas part them."""
+    if path.suffix == ".npy":
+        with reading(path, "expected an array of N poses, 4x4 or 3x4 each; save it again"):
+            array = load_array(path).astype(np.float64)
+            table = array.reshape(len(array), -1)
+        return None, [(at, [f"{x:.17g}" for x in row]) for at, row in enumerate(table, 1)], False
     try:
         text = read_text(path).replace('"', "")
     except (OSError, UnicodeDecodeError) as error:

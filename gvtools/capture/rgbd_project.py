@@ -26,7 +26,7 @@ from gvtools.files import link_or_copy, write_json
 from gvtools.poses.odometry import RgbdFrames
 from gvtools.poses.recording import RecordingPoses, find_poses
 from gvtools.scenes.calibration import INTRINSICS
-from gvtools.scenes.images import UNREADABLE
+from gvtools.scenes.images import UNREADABLE, read_depth
 from gvtools.scenes.matching import named
 from gvtools.scenes.photographs import PosedFrame
 from gvtools.scenes.rgbd import (
@@ -178,11 +178,11 @@ def _read(source: Path, options: RgbdOptions | None) -> tuple[Recording, Scene]:
 def _readable(frame: PosedFrame) -> bool:
     """Whether both of a frame's files can be decoded."""
     try:
-        for path in (frame.image, frame.depth):
-            if path is not None:
-                with open_picture(path) as picture:
-                    picture.load()
-    except UNREADABLE:
+        with open_picture(frame.image) as picture:
+            picture.load()
+        if frame.depth is not None:
+            read_depth(frame.depth)
+    except (*UNREADABLE, ProjectError):
         return False
     return True
 
@@ -205,7 +205,7 @@ def _write(
         assert frame.depth is not None
         stem = names[number][: names[number].rindex(".color.")]
         link_or_copy(frame.image, work / names[number])
-        link_or_copy(frame.depth, work / f"{stem}.depth.png")
+        link_or_copy(frame.depth, work / f"{stem}.depth{frame.depth.suffix}")
         np.savetxt(work / f"{stem}.pose.txt", pose, fmt=DIGITS)
     options = recording.options
     np.savetxt(work / INTRINSICS, np.asarray(options.color_K)[:3, :3], fmt=DIGITS)

@@ -14,7 +14,7 @@ from gvtools.cameras import rigid_poses
 from gvtools.errors import ProjectError
 from gvtools.scenes.scene import Finding
 from gvtools.scenes.undistort import LensParameters, camera_of
-from gvtools.untrusted import read_json, read_text, reading
+from gvtools.untrusted import load_array, read_json, read_text, reading
 
 Float64 = NDArray[np.float64]
 
@@ -23,6 +23,9 @@ OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 INTRINSICS = "camera-intrinsics.txt"
 # fx, fy, cx, cy of a Kinect-like sensor as PrimeSense's driver and Open3D have them, 640x480.
 SENSOR_DEFAULT, DEFAULT_SIZE = (525.0, 525.0, 319.5, 239.5), (640, 480)
+# A principal point may be so far from the middle, in half sides, and still be of its picture. One
+# of another size tells that by both axes alike, unless that is as good as a whole multiple.
+OFF_CENTER, ALIKE, WHOLE, MOST = 0.15, 0.02, 0.005, 16
 # Where the sky is in a picture, as x and y.
 DIRECTIONS = {"up": (0, -1), "left": (-1, 0), "down": (0, 1), "right": (1, 0)}
 
@@ -48,11 +51,17 @@ def number_table(path: Path, columns: int, *, skip: int = 0, required: bool = Fa
 
 
 def load_matrix(path: Path, *shapes: tuple[int, int]) -> Float64:
-    """A matrix of one of the shapes in a text file."""
+    """A matrix of one of the shapes, in rows or in one line, in a text file or an ``.npy``."""
     expected = " or ".join(f"{rows}x{columns}" for rows, columns in shapes)
     with reading(path, f"expected {expected} numbers"):
-        lines = read_text(path).replace(",", " ").splitlines()
-        matrix = np.loadtxt(lines, np.float64, ndmin=2)
+        if path.suffix == ".npy":
+            matrix = np.atleast_2d(load_array(path).astype(np.float64))
+        else:
+            lines = read_text(path).replace(",", " ").splitlines()
+            matrix = np.loadtxt(lines, np.float64, ndmin=2)
+        by_size = {rows * columns: (rows, columns) for rows, columns in shapes}
+        if 1 in matrix.shape and matrix.size in by_size:
+            matrix = matrix.reshape(by_size[matrix.size])
         if matrix.shape not in shapes:
             raise ValueError(f"{'x'.join(str(length) for length in matrix.shape)} numbers")
         return matrix
@@ -99,17 +108,15 @@ def pinhole(values: Sequence[float]) -> Float64:
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
 
 
-def intrinsics_beside(root: Path, *, above: bool = False) -> tuple[Float64, str] | None:
+def intrinsics_beside(root: Path) -> tuple[Float64, str] | None:
     """(3, 3) as published and the file's name: ``camera-intrinsics.txt`` or Open3D's JSON.
 
-    With ``above``, the text file may also stand in the parent folder. ``camera.json`` has to be of
-    Open3D's form, other JSON may be. Files that differ are refused.
+    The text file may also stand in the parent folder. ``camera.json`` has to be of Open3D's form,
+    other JSON may be. Files that differ are refused.
     """
-    found: list[tuple[Float64, Path]] = []
-    for folder in (root, root.resolve().parent) if above else (root,):
-        if (folder / INTRINSICS).is_file():
-            found.append((load_matrix(folder / INTRINSICS, (3, 3)), folder / INTRINSICS))
-            break
+    places = (root / INTRINSICS, root.resolve().parent / INTRINSICS)
+    texts = [path for path in places if path.is_file()][:1]
+    found = [(load_matrix(path, (3, 3)), path) for path in texts]
     for path in sorted(root.glob("*.json")):
         if path.is_file() and (path.name == "camera.json" or "intrinsic_matrix" in _text(path)):
             found.append((open3d_intrinsics(path), path))
@@ -160,6 +167,22 @@ def _text(path: Path) -> str:
         return read_text(path)
     except (OSError, ValueError):
         return ""
+
+
+def times_as_large(center: ArrayLike, size: tuple[int, int]) -> float:
+    """How many times as large the picture is that a point is the middle of; 1 of this ``size``.
+
+    >>> times_as_large((648, 484), (324, 242)), times_as_large((160, 130), (324, 242))
+    (2.0, 1.0)
+    """
+    x, y = 2 * np.asarray(center, np.float64) / size
+    mean = float(x + y) / 2
+    if not 1 / MOST < mean < MOST or max(abs(x - 1), abs(y - 1)) < OFF_CENTER:
+        return 1.0
+    times = float(round(mean)) if mean > 1 else 1 / round(1 / mean)
+    if abs(x - y) < ALIKE * mean and abs(mean / times - 1) > WHOLE:
+        return mean
+    return times if max(abs(x / times - 1), abs(y / times - 1)) < OFF_CENTER else 1.0
 
 
 def open3d_intrinsics(path: Path) -> Float64:

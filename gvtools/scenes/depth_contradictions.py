@@ -21,7 +21,7 @@ FACTORS, SAME = np.append(10 ** (np.arange(-96, 97) / 24), np.geomspace(0.5, 2, 
 # Views that are compared with those so many places after them, and pixels of each.
 PROBES, GAPS, PIXELS = 4, (1, 4, 16), 800
 # Depth is wrong when another factor makes so many agree, and of the two pairs that tell most, depth
-# as it is has less than these shares of each one's best. On three recordings it is 0.9 at the least.
+# as it is has less than these shares of each one's best. On three recordings it is 0.9 or more.
 AGREE, SHARES, FAR = 0.2, (0.75, 0.92), 1.13
 # As distances along the rays it agrees when this share of that is more than any factor's; and pairs
 # that tell have this share of their best at the factor that is best for all.
@@ -57,11 +57,11 @@ def unit_findings(scene: Scene) -> list[Finding]:
     ratios = np.where(most < AGREE, 1, now[:, 0] / np.maximum(most, AGREE))
     telling = np.argsort(ratios)[:2]
     fits = agreeing[telling, mean.argmax()] > SHARE * most[telling]
-    other = fits.all() and (ratios[telling] < SHARES[: len(telling)]).all()
+    wrong_unit = fits.all() and (ratios[telling] < SHARES[: len(telling)]).all()
     shares = _nearly(compared)
     straight = [(_of_rays(one, a), _of_rays(other, b), (a, b)) for one, other, (a, b) in compared]
     by_rays = SHARE * _agreeing(straight, np.ones(1))[0].mean() > max(best, AGREE)
-    if not by_rays and other and best >= AGREE and max(factor, 1 / factor) > FAR:
+    if not by_rays and wrong_unit and best >= AGREE and max(factor, 1 / factor) > FAR:
         times = f"{float(f'{factor:.3g}'):g}"
         line = (
             f"recorded depth contradicts the poses: {now.mean():.0%} of neighbouring views' depth "

@@ -8,9 +8,10 @@ longer fit its camera.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -206,12 +207,11 @@ def read_depth(
 ) -> NDArray[np.float32]:
     """(H, W) float32 z-depth, scene units, of a depth map whose stored unit is ``unit``.
 
-    It is a 16-bit PNG, PGM or TIFF, float TIFF, ``.npy``, ``.npz`` with the key ``depth``, or
-    COLMAP's ``.bin``. 0 stands where the file says 0, a negative number, NaN, infinity, more than
-    ``maximum``, or, in 16-bit files, 65535.
+    It is a 16-bit PNG, PGM or TIFF, float TIFF, PFM or OpenEXR, ``.npy``, ``.npz`` with the key
+    ``depth``, or COLMAP's ``.bin``. 0 stands where the file says 0, a negative number, NaN,
+    infinity, more than ``maximum``, or, in 16-bit files, 65535.
     """
-    loaders = {".npy": _load_array, ".npz": _load_array, ".bin": _load_colmap}
-    raw = loaders.get(path.suffix, _load_depth_image)(path)
+    raw = _load_depth(path)
     if raw.ndim == 3 and 1 in (raw.shape[0], raw.shape[2]):
         raw = raw[..., 0] if raw.shape[2] == 1 else raw[0]
     if raw.ndim != 2 or raw.dtype.kind not in "uif":
@@ -253,12 +253,21 @@ def _load_array(path: Path) -> NDArray[Any]:
         return load_arrays(path, "depth")["depth"] if packed else load_array(path)
 
 
+def holds_fractions(path: Path) -> bool:
+    """Whether a depth map's numbers are no whole ones, which are metres in most files."""
+    return path.suffix.lower() != ".png" and _load_depth(path).dtype.kind == "f"
+
+
+def _load_depth(path: Path) -> NDArray[Any]:
+    return DEPTH_LOADERS.get(path.suffix.lower(), _load_depth_image)(path)
+
+
 def stored_depth_size(path: Path) -> tuple[int, int] | None:
     """Width and height of a depth map, without its pixels; None for arrays."""
-    if path.suffix in (".npy", ".npz"):
-        return None
-    if path.suffix == ".bin":
+    if path.suffix.lower() == ".bin":
         return _colmap_head(path)[:2]
+    if path.suffix.lower() in DEPTH_LOADERS:
+        return None
     header = read_header(path)
     if header.mode in ("L", "P", "RGB", "RGBA"):
         raise ProjectError(f"{path}: 8-bit depth ({header.mode}); expected 16-bit grey")
@@ -402,3 +411,14 @@ def read_pfm_depth(path: Path, *, unit: float = 1.0) -> Depth:
                 raise ValueError(f"it begins with {kind}, not with Pf")
             values = np.frombuffer(file.read(width * height * 4), dtype).reshape(height, width)
         return readings(values[::-1], unit=unit)
+
+
+# Of depth maps that are no pictures.
+DEPTH_LOADERS: Mapping[str, Callable[[Path], NDArray[Any]]] = {
+    ".npy": _load_array,
+    ".npz": _load_array,
+    ".bin": _load_colmap,
+    ".pfm": read_pfm_depth,
+    ".exr": partial(exr_depth, channels=("Y", "Z", "R", "V")),
+}
+DEPTH_SUFFIXES = (".png", ".pgm", ".tif", ".tiff", *DEPTH_LOADERS)

@@ -162,14 +162,14 @@ def spread(count: int, probes: int | None) -> list[int]:
 def _open(
     scene: Scene, numbers: list[int], findings: list[Finding], *, pixels: PixelCheck
 ) -> list[_Opened]:
-    known = {finding.message for finding in findings}
+    known = {finding.message.partition(": ")[0] for finding in findings}  # files
     opened, empty, blank = [], [], []
     for number in numbers:
         view = scene.views[number]
         try:
             frame = view.load()
         except GvError as error:
-            if str(error) not in known:
+            if str(error).partition(": ")[0] not in known:
                 findings.append(Finding("error", str(error)))
             continue
         pixels.see(number, frame.rgb)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import unicodedata
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from itertools import islice
 from pathlib import Path, PurePosixPath
 from urllib.parse import unquote
@@ -63,11 +63,11 @@ def given_folder(folder: Path, held: str) -> Path:
     return folder
 
 
-def pictures_in(folder: Path) -> list[Path]:
-    """The folder's pictures in natural order of their names; none where it is absent."""
+def pictures_in(folder: Path, suffixes: Collection[str] = PICTURES) -> list[Path]:
+    """The folder's files of the suffixes in natural order of names; none where it is absent."""
     if not folder.is_dir():
         return []
-    paths = (path for path in folder.iterdir() if path.suffix.lower() in PICTURES)
+    paths = (path for path in folder.iterdir() if path.suffix.lower() in suffixes)
     return sorted(paths, key=lambda path: natural_key(path.name))
 
 
@@ -160,9 +160,8 @@ def paired(first: Sequence[str], second: Sequence[str]) -> list[tuple[int, int]]
         if i in pairs:
             continue
         parts = PurePosixPath(stem(name)).parts
-        found = set(tails.get(parts, []))
-        found |= {row for start in range(len(parts)) for row in tails.get(parts[start:], [])
-                  if wholes[row] == parts[start:]}  # fmt: skip
+        found = {row for start in range(len(parts)) for row in tails.get(parts[start:], [])
+                 if start == 0 or wholes[row] == parts[start:]}  # fmt: skip
         for row in found:
             if len(found) > 1 or taken.setdefault(row, i) != i:
                 both = [second[r] for r in sorted(found)[:2]] if len(found) > 1 else [

@@ -392,17 +392,14 @@ def _export(path: Path) -> Path | None:
 
 
 def _read_record3d(path: Path) -> Scene:
-    home = _export(path)
-    if home is None:
-        pictures, bare = _from_recording(path, _metadata(path / "metadata"))
-    else:
-        pictures, bare = _from_export(home, _metadata(home / "metadata.json"))
+    export = _export(path)
+    metadata = _metadata(path / "metadata" if export is None else export / "metadata.json")
+    frames = _frames(export or path, metadata, exported=export is not None)
+    maps = [item.depth for item in frames if item.depth is not None and item.depth.is_file()]
+    bare = sum(not depth.with_suffix(".conf").is_file() for depth in maps)
     line = "the world is where the recording began: which way is up is not said"
-    findings = [Finding("info", line)]
-    if bare:
-        line = f"{bare} depth maps have no confidence map: all of their depth is used"
-        findings.append(Finding("info", line))
-    return phone_scene(path, "Record3D", pictures, upright=False, findings=findings)
+    findings = [Finding("info", line), *LidarMaps(len(maps), bare).findings()]
+    return phone_scene(path, "Record3D", frames, upright=False, findings=findings)
 
 
 def _metadata(path: Path) -> Record3dMetadata:
@@ -416,40 +413,22 @@ def _metadata(path: Path) -> Record3dMetadata:
     return metadata
 
 
-def _from_export(home: Path, metadata: Record3dMetadata) -> tuple[list[PosedFrame], int]:
-    """The frames, and how many depth maps lack confidence."""
-    images = {path.stem: path for path in (home / "rgb").iterdir() if path.suffix in _PHOTOS}
-    pictures, bare = [], 0
+def _frames(home: Path, metadata: Record3dMetadata, *, exported: bool) -> list[PosedFrame]:
+    """The frames of an export of EXR and JPG, or of a recording."""
+    folder = home / ("rgb" if exported else "rgbd")
+    images = {path.stem: path for path in folder.iterdir() if path.suffix in _PHOTOS}
+    frames = []
+    shape = metadata.dh, metadata.dw
     for number in metadata.frames(set(images)):
-        depth = home / "depth" / f"{number}.exr"
-        bare += depth.is_file()
-        pictures.append(
-            PosedFrame(
-                f"{number}.jpg",
-                images.get(str(number), home / "rgb" / f"{number}.jpg"),
-                metadata.lens(number),
-                metadata.pose(number),
-                depth,
-                partial(exr_depth, channels=_CHANNELS),
-            )
-        )
-    return pictures, bare
-
-
-def _from_recording(path: Path, metadata: Record3dMetadata) -> tuple[list[PosedFrame], int]:
-    """The frames, and how many depth maps lack confidence."""
-    stems = {item.stem for item in (path / "rgbd").glob("*.jpg")}
-    pictures, bare = [], 0
-    for number in metadata.frames(stems):
-        image, depth, conf = (path / f"rgbd/{number}.{kind}" for kind in ("jpg", "depth", "conf"))
-        bare += depth.is_file() and not conf.is_file()
-        shape = metadata.dh, metadata.dw
+        depth, conf = folder / f"{number}.depth", folder / f"{number}.conf"
         read = partial(_lzfse_depth, confidence=conf if conf.is_file() else None, shape=shape)
-        pose = metadata.pose(number)
-        pictures.append(
-            PosedFrame(f"{number}.jpg", image, metadata.lens(number), pose, depth, read)
-        )
-    return pictures, bare
+        if exported:
+            depth = home / "depth" / f"{number}.exr"
+            read = partial(exr_depth, channels=_CHANNELS)
+        image = images.get(str(number), folder / f"{number}.jpg")
+        lens, pose = metadata.lens(number), metadata.pose(number)
+        frames.append(PosedFrame(f"{number}.jpg", image, lens, pose, depth, read))
+    return frames
 
 
 def _lzfse_depth(path: Path, *, confidence: Path | None, shape: tuple[int, int]) -> Depth:

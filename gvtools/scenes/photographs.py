@@ -189,7 +189,6 @@ def posed_scene(
     photographs.sort(key=lambda item: natural_key(item.name))
     report += lens_findings([item.lens for item in photographs])
     report += mask_findings([item.frame for item in photographs])
-    report += _mask_sizes(photographs)
     deep = [i.frame.image for i in photographs if i.frame.read is None]
     white = white_of_pictures([path for path in deep if path.suffix.lower() in DEEP])
     if white != WHOLE[-1]:
@@ -198,7 +197,7 @@ def posed_scene(
         report += center_findings([item.lens for item in photographs])
         files = [item for item in photographs if item.frame.read is None]
         report += header_findings([(item.frame.image, item.lens.source_size) for item in files])
-        report += depth_findings(photographs)
+        report += map_findings(photographs)
     if white != WHOLE[-1]:
         report = [item for item in report if not item.message.endswith(UPPER)]
         line = f"16-bit pictures hold no more than {white:g}: all are read as 0 to {white:g}"
@@ -234,20 +233,6 @@ def mask_findings(frames: Sequence[PosedFrame]) -> list[Finding]:
 def _opaque(picture: Path) -> NDArray[np.bool_]:
     mask = read_image(picture).mask if read_header(picture).has_alpha else None
     return np.ones(1, np.bool_) if mask is None else mask
-
-
-def _mask_sizes(photographs: Sequence[Photograph]) -> list[Finding]:
-    """A line for each size of masks that is not the pictures' but of their aspect."""
-    sizes = Counter[str]()
-    for item in photographs:
-        try:
-            header = None if item.frame.mask is None else read_header(item.frame.mask)
-        except GvError:  # said where its view is read
-            continue
-        (w, h), size = item.lens.source_size, header and (header.width, header.height)
-        if size and size != (w, h) and same_aspect(size, (w, h)):
-            sizes[f"masks of {size[0]}x{size[1]} for pictures of {w}x{h}: nearest pixel taken"] += 1
-    return [Finding("info", f"{count} {line}") for line, count in sizes.items()]
 
 
 def _rigid(frame: PosedFrame, sieve: _Sieve, *, unposed: str) -> Float64:
@@ -439,32 +424,31 @@ def conversion_findings(headers: Sequence[ImageHeader]) -> list[Finding]:
     return [Finding("info", f"{count} pictures {kind}") for kind, count in kinds.items()]
 
 
-def depth_findings(photographs: Sequence[Photograph]) -> list[Finding]:
-    """An error for each unreadable depth map or other aspect, and a line a size that differs.
+def map_findings(photographs: Sequence[Photograph]) -> list[Finding]:
+    """An error for each unreadable map or mask or other aspect, and a line a size that differs.
 
     None is decoded. Maps of a depth camera of its own, which may be of any size, are not looked at.
     """
     findings: list[Finding] = []
     resized: Counter[str] = Counter()
-    maps = {
-        item.frame.depth: item.lens.source_size
-        for item in photographs
-        if item.frame.depth is not None and item.frame.registration is None
-    }
-    for path, expected in maps.items():
+    maps = dict[tuple[str, Path], tuple[int, int]]()
+    for item in photographs:
+        if item.frame.depth is not None and item.frame.registration is None:
+            maps["depth maps", item.frame.depth] = item.lens.source_size
+        if item.frame.mask is not None:
+            maps["masks", item.frame.mask] = item.lens.source_size
+    for (noun, path), expected in maps.items():
         try:
-            found = stored_depth_size(path) or expected
+            found = (first_size([path]) if noun == "masks" else stored_depth_size(path)) or expected
         except ProjectError as error:
             findings.append(Finding("error", str(error)))
             continue
         line = f"{found[0]}x{found[1]} for pictures of {expected[0]}x{expected[1]}"
         if found != expected and same_aspect(found, expected):
-            resized[f"depth maps of {line}: nearest pixel taken"] += 1
+            resized[f"{noun} of {line}: nearest pixel taken"] += 1
         elif found != expected:
-            message = (
-                f"{path}: depth of {line}; expected the same aspect, or the depth camera's "
-                "intrinsics (depth_K of RGB-D)"
-            )
+            other = ", or the depth camera's intrinsics (depth_K of RGB-D)" * (noun != "masks")
+            message = f"{path}: {noun} of {line}; expected the same aspect{other}"
             findings.append(Finding("error", message))
     return findings + [Finding("info", f"{count} {line}") for line, count in resized.items()]
 

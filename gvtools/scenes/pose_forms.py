@@ -38,7 +38,7 @@ LONGER, BENT = (0.7, 0.8, 0.9, 1.1, 1.25, 1.45), 0.75
 # Views farther apart are not looked at where a pair moves by this share.
 ENOUGH = 0.08
 FLIP = OPENCV_FROM_OPENGL
-MIRRORS = {"y": np.diag([1.0, -1, 1, 1]), "z": np.diag([1.0, 1, -1, 1])}
+MIRRORED = [np.outer(signs, signs) for signs in ((1, -1, 1, 1), (1, 1, -1, 1))]
 
 
 def _reordered(pose: Float64, places: int) -> Float64:
@@ -65,12 +65,8 @@ FORMS: Mapping[str, Callable[[Float64], Float64]] = {
     "quaternions have the scalar first, where it is expected last": (
         lambda pose: invert_rigid(_reordered(invert_rigid(pose), -1))
     ),
-    **{
-        f"axes are left-handed, as game engines have them (turn {axis} over in world and camera)": (
-            lambda pose, mirror=mirror: mirror @ pose @ mirror
-        )
-        for axis, mirror in MIRRORS.items()
-    },
+    "axes are left-handed (turn y of world and camera over)": lambda pose: pose * MIRRORED[0],
+    "axes are left-handed (turn z of world and camera over)": lambda pose: pose * MIRRORED[1],
 }
 
 

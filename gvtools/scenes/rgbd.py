@@ -36,13 +36,13 @@ from gvtools.scenes.calibration import (
     exported_file,
     exported_intrinsics,
     finite_array,
-    intrinsics_beside,
     load_matrix,
     pinhole,
     pinhole_lens,
     sensor_default,
+    times_as_large,
 )
-from gvtools.scenes.images import read_depth
+from gvtools.scenes.images import DEPTH_SUFFIXES, holds_fractions, read_depth
 from gvtools.scenes.layout import Layout
 from gvtools.scenes.matching import (
     associate,
@@ -112,7 +112,7 @@ class RgbdFolder(ABC):
     name: str
     holds: tuple[str, str]  # with poses and without, for messages
     unit = MILLIMETRES  # metres per stored unit of depth
-    above = False  # whether intrinsics may lie in the folder above
+    assumed = True  # whether a sensor's default is taken where nothing has intrinsics
 
     @abstractmethod
     def matches(self, root: Path, *, posed: bool = True) -> bool:
@@ -128,17 +128,48 @@ class RgbdFolder(ABC):
 
     def calibration(self, root: Path, options: RgbdOptions) -> Recording:
         """A recording that has no frames yet."""
-        options = _under(options, depth_unit=self.unit)
-        if options.color_K is not None:
-            return Recording(root, options)
-        found = intrinsics_beside(root, above=self.above)
-        if found is None:
-            return self.uncalibrated(root, options)
-        line = f"intrinsics: {found[1]}"
-        return Recording(root, _under(options, color_K=found[0]), findings=[Finding("info", line)])
+        maps = (frame.depth for frame in self.frames(root, options) if frame.depth is not None)
+        first = next(filter(Path.is_file, maps), None)
+        unit = self.unit if first is None or not holds_fractions(first) else 1.0
+        cameras = {"color": options.color_K, "depth": options.depth_K}
+        found = [
+            exported_intrinsics(root, camera) if K is None else [] for camera, K in cameras.items()
+        ]
+        color_K, depth_K = (there[0][0] if there else None for there in found)
+        merged = _under(options, depth_unit=unit, color_K=color_K, depth_K=depth_K)
+        if merged.color_K is None:
+            return self.uncalibrated(root, merged)
+        findings = [
+            Finding("warning", f"{other} differs from {name}, which is read; take the wrong away")
+            for (K, name), *others in filter(None, found)
+            for another, other in others
+            if not np.allclose(another, K, rtol=1e-3)
+        ]
+        if merged.depth_K is None:
+            line = [Finding("info", f"intrinsics: {found[0][0][1]}")] if found[0] else []
+            return Recording(root, merged, findings=[*line, *findings])
+        # Camera from rig each; an export without such files has one place for both.
+        color, depth = (
+            rigid_transform(load_matrix(path, (4, 4)), what=str(path))[0]
+            if path.is_file()
+            else np.eye(4)
+            for path in (exported_file(root, f"extrinsic_{camera}.txt") for camera in cameras)
+        )
+        moved = color @ np.linalg.inv(depth)
+        if options.color_from_depth is None and not np.allclose(moved, np.eye(4)):
+            # Exports with other than identity are rare, and tools read them both ways.
+            message = "extrinsics are taken as camera-from-rig; if not, give color_from_depth"
+            findings.append(Finding("warning", message))
+        return Recording(root, _under(merged, color_from_depth=moved), findings=findings)
 
     def uncalibrated(self, root: Path, options: RgbdOptions) -> Recording:
         """A recording where neither an option nor a file has intrinsics."""
+        if not self.assumed:
+            raise ProjectError(
+                f"{root}: no {INTRINSICS} there or in the parent folder, no intrinsic_color.txt; "
+                "expected three lines 'fx 0 cx', '0 fy cy', '0 0 1'; write one, or give color_K "
+                "(--color-intrinsics)"
+            )
         pictures = (frame.image for frame in self.frames(root, options))
         K, finding = sensor_default(first_size(pictures))
         return Recording(root, _under(options, color_K=K), findings=[finding])
@@ -161,10 +192,6 @@ class RgbdFolder(ABC):
         recording = self.record(root, resolved)
         return rgbd_scene(replace(recording, findings=[*findings, *recording.findings]))
 
-    def layout(self) -> Layout:
-        """For folders with poses."""
-        return Layout.of_folder(self.name, self.holds[0], matches=self.matches, read=self.read)
-
 
 def _with_pose(frame: PosedFrame, *, strict: bool) -> PosedFrame:
     """The frame with the pose in its own file."""
@@ -181,10 +208,10 @@ def _with_pose(frame: PosedFrame, *, strict: bool) -> PosedFrame:
 class _SevenScenes(RgbdFolder):
     name = "7-Scenes"
     holds = "*.color.*, *.depth.png, *.pose.txt", "*.color.*, *.depth.png"
-    above = True
+    assumed = False
 
     def matches(self, root: Path, *, posed: bool = True) -> bool:
-        beside = "*.pose.txt" if posed else "*.depth.png"
+        beside = "*.pose.txt" if posed else "*.depth.*"
         return any(root.glob(beside)) and any(root.glob("*.color.*"))
 
     def frames(self, root: Path, options: RgbdOptions) -> list[PosedFrame]:
@@ -197,14 +224,10 @@ class _SevenScenes(RgbdFolder):
         return [self._frame(root, stem, f"{stem}.color.png") for stem in stems]
 
     def _frame(self, root: Path, stem: str, name: str) -> PosedFrame:
-        pose, depth = str(root / f"{stem}.pose.txt"), root / f"{stem}.depth.png"
+        maps = [root / f"{stem}.depth{suffix}" for suffix in DEPTH_SUFFIXES]
+        depth = next(filter(Path.is_file, maps), maps[0])
+        pose = str(root / f"{stem}.pose.txt")
         return PosedFrame(name, root / name, None, None, depth, where=pose)
-
-    def uncalibrated(self, root: Path, options: RgbdOptions) -> Recording:
-        raise ProjectError(
-            f"{root}: no {INTRINSICS} there or in the parent folder; expected three lines "
-            "'fx 0 cx', '0 fy cy', '0 0 1'; write it, or give color_K (--color-intrinsics)"
-        )
 
 
 TRUTH = "groundtruth.txt"
@@ -344,13 +367,13 @@ def _stamped_files(path: Path) -> list[tuple[float, str]]:
 class _ScanNet(RgbdFolder):
     name = "ScanNet"
     holds = "color, depth, pose, intrinsic", "color, depth, intrinsic"
+    assumed = False
 
     def matches(self, root: Path, *, posed: bool = True) -> bool:
         # Exporters put the cameras in several places; Redwood's have a trajectory instead of poses.
         folders = [self._folder(root, "color"), self._folder(root, "depth")]
         if posed and not any(root.glob("*.log")):
-            posed_by_files = any(self._folder(root, "pose").glob("*.txt"))
-            return posed_by_files and all(folder.is_dir() for folder in folders)
+            return bool(self._poses(root)) and all(folder.is_dir() for folder in folders)
         folders += [root / "intrinsic", *([self._folder(root, "pose")] if posed else [])]
         return all(folder.is_dir() for folder in folders)
 
@@ -362,11 +385,13 @@ class _ScanNet(RgbdFolder):
         }
         return next((root / n for n in kinds[kind] if (root / n).is_dir()), root / kind)
 
+    def _poses(self, root: Path) -> list[Path]:
+        return pictures_in(self._folder(root, "pose"), (".txt", ".npy"))
+
     def frames(self, root: Path, options: RgbdOptions) -> list[PosedFrame]:
         colors = pictures_in(self._folder(root, "color"))
-        depths = pictures_in(self._folder(root, "depth"))
-        poses = sorted(self._folder(root, "pose").glob("*.txt"))
-        depth_of, pose_of = pair_by_name(colors, depths), pair_by_name(colors, poses)
+        depths = pictures_in(self._folder(root, "depth"), DEPTH_SUFFIXES)
+        depth_of, pose_of = pair_by_name(colors, depths), pair_by_name(colors, self._poses(root))
         return [
             self._frame(root, color, depth=depth_of.get(color), pose=pose_of.get(color))
             for color in colors
@@ -374,79 +399,52 @@ class _ScanNet(RgbdFolder):
 
     def frames_of_poses(self, root: Path) -> list[PosedFrame]:
         colors = self._folder(root, "color")
-        poses = self._folder(root, "pose").glob("*.txt")
-        return [self._frame(root, colors / f"{path.stem}.jpg", pose=path) for path in poses]
+        return [
+            self._frame(root, colors / f"{path.stem}.jpg", pose=path) for path in self._poses(root)
+        ]
 
     def _frame(
         self, root: Path, color: Path, *, depth: Path | None = None, pose: Path | None = None
     ) -> PosedFrame:
-        depth = depth or self._folder(root, "depth") / f"{color.stem}.png"
         pose = pose or self._folder(root, "pose") / f"{color.stem}.txt"
         return PosedFrame(color.name, color, None, None, depth, where=str(pose))
 
-    def calibration(self, root: Path, options: RgbdOptions) -> Recording:
-        folder, cameras = root / "intrinsic", ("color", "depth")
-        found = [exported_intrinsics(root, camera) for camera in cameras]
-        color_K, depth_K = (there[0][0] if there else None for there in found)
-        merged = _under(options, depth_unit=self.unit, color_K=color_K, depth_K=depth_K)
-        if merged.color_K is None:
-            raise ProjectError(
-                f"{folder}: no intrinsic_color.txt there or in {root}; export it, or give color_K "
-                "(--color-intrinsics)"
-            )
-        findings = [
-            Finding("warning", f"{other} differs from {name}, which is read; take the wrong away")
-            for (K, name), *others in filter(None, found)
-            for another, other in others
-            if not np.allclose(another, K, rtol=1e-3)
-        ]
-        if depth_K is None:
-            line = [Finding("info", f"intrinsics: {found[0][0][1]}")] if found[0] else []
-            return Recording(root, merged, findings=[*line, *findings])
-        # Camera from rig each; an export without such files has one place for both.
-        color, depth = (
-            rigid_transform(load_matrix(path, (4, 4)), what=str(path))[0]
-            if path.is_file()
-            else np.eye(4)
-            for path in (exported_file(root, f"extrinsic_{camera}.txt") for camera in cameras)
-        )
-        moved = color @ np.linalg.inv(depth)
-        if options.color_from_depth is None and not np.allclose(moved, np.eye(4)):
-            # Exports with other than identity are rare, and tools read them both ways.
-            message = "extrinsics are taken as camera-from-rig; if not, give color_from_depth"
-            findings.append(Finding("warning", message))
-        return Recording(root, _under(merged, color_from_depth=moved), findings=findings)
 
+class _Redwood(_ScanNet):
+    """As ScanNet's, with the poses in one file."""
 
-class _Redwood(RgbdFolder):
     name = "Redwood"
     holds = "color, depth, a .log trajectory", "color, depth"
+    assumed = True
 
     def matches(self, root: Path, *, posed: bool = True) -> bool:
-        folders = (root / "depth").is_dir() and self._pictures(root) is not None
-        return folders and (not posed or any(root.glob("*.log")))
+        folders = all(self._folder(root, kind).is_dir() for kind in ("color", "depth"))
+        return folders and (not posed or bool(self._trajectories(root)))
 
-    def _pictures(self, root: Path) -> Path | None:
-        folders = (root / name for name in ("color", "image", "rgb"))
-        return next((folder for folder in folders if folder.is_dir()), None)
-
-    def frames(self, root: Path, options: RgbdOptions) -> list[PosedFrame]:
-        folder = self._pictures(root)
-        colors = [] if folder is None else pictures_in(folder)
-        depth_of = pair_by_name(colors, pictures_in(root / "depth"))
-        return [PosedFrame(path.name, path, None, None, depth_of.get(path)) for path in colors]
+    def _trajectories(self, root: Path) -> list[Path]:
+        """The ``.log`` files, else those of other programs with a pose for each picture."""
+        logs = sorted(root.glob("*.log"), key=lambda path: (path.name != "trajectory.log", path))
+        forms = ("trajectory", "traj", "poses", "groundtruth")
+        others = (root / f"{name}{suffix}" for name in forms for suffix in (".txt", ".npy"))
+        return logs or list(filter(Path.is_file, others))
 
     def posed(self, recording: Recording, *, strict: bool) -> Recording:
         root, findings = recording.root, list(recording.findings)
-        logs = sorted(root.glob("*.log"), key=lambda path: (path.name != "trajectory.log", path))
+        logs = self._trajectories(root)
         if len(logs) > 1:
             others = named([path.name for path in logs[1:]])
             findings.append(Finding("warning", f"poses are read from {logs[0].name}, not {others}"))
         frames = self.frames(root, recording.options)
-        unpaired = len(pictures_in(root / "depth")) - sum(item.depth is not None for item in frames)
+        depths = pictures_in(self._folder(root, "depth"), DEPTH_SUFFIXES)
+        unpaired = len(depths) - sum(item.depth is not None for item in frames)
         if unpaired:
             findings.append(Finding("warning", f"{unpaired} depth maps belong to no picture"))
-        numbers, poses = read_log(logs[0])
+        if logs[0].suffix == ".log":
+            numbers, poses = read_log(logs[0])
+        else:
+            poses = list(read_poses(logs[0]).poses)
+            numbers = list(range(len(poses)))
+            findings.append(Finding("info", f"poses: {logs[0].name}, one a picture in order"))
         fits = len(set(numbers)) == len(numbers) and all(0 <= i < len(frames) for i in numbers)
         if not fits and len(numbers) != len(frames):
             raise ProjectError(
@@ -462,22 +460,20 @@ class _Redwood(RgbdFolder):
 def read_log(path: Path) -> tuple[list[int], list[Float64]]:
     """The first integers and (4, 4) matrices of a ``.log`` trajectory's blocks, as read."""
     with reading(path, "expected blocks of three integers and four lines of four numbers"):
-        rows = [line.split() for line in read_text(path).splitlines()]
-        rows = [row for row in rows if row]
-        for at, row in enumerate(rows):
-            if len(row) != (3 if at % 5 == 0 else 4):
-                raise ValueError(f"line {at + 1} that is not empty has {len(row)} numbers")
-        if len(rows) % 5:
-            raise ValueError("the last block is not whole")
-        numbers = [int(row[0]) for row in rows[::5]]
-        matrices = np.array([row for at, row in enumerate(rows) if at % 5], np.float64)
-    return numbers, list(matrices.reshape(-1, 4, 4))
+        words = read_text(path).split()
+        if len(words) % 19:
+            raise ValueError(f"{len(words)} numbers, not 19 a block")
+        blocks = np.array(words, np.float64).reshape(-1, 19)
+        return [int(word) for word in words[::19]], list(blocks[:, 3:].reshape(-1, 4, 4))
 
 
 SCANNET_FOLDER = _ScanNet()
 # ScanNet before Redwood: both have colour and depth folders.
 _FOLDERS = (_SevenScenes(), _Tum(), SCANNET_FOLDER, _Redwood())
-SEVENSCENES, TUM, SCANNET, REDWOOD = LAYOUTS = tuple(folder.layout() for folder in _FOLDERS)
+SEVENSCENES, TUM, SCANNET, REDWOOD = LAYOUTS = tuple(
+    Layout.of_folder(folder.name, folder.holds[0], matches=folder.matches, read=folder.read)
+    for folder in _FOLDERS
+)
 UNPOSED = tuple(f"{folder.name} ({folder.holds[1]})" for folder in _FOLDERS)
 
 
@@ -525,9 +521,14 @@ def resolve_options(root: Path, options: RgbdOptions | None) -> tuple[RgbdOption
 def rgbd_scene(recording: Recording, *, kind: str = "rgbd", strict: bool = True) -> Scene:
     """The scene of a recording, in metres, in the poses' own world frame."""
     root, frames, options = recording.root, recording.frames, recording.options
-    K = corner_origin(np.array(options.color_K), what=f"{root}, colour intrinsics")
-    registration = _registration(root, options)
     size = first_size(frame.image for frame in frames)
+    K = corner_origin(np.array(options.color_K), what=f"{root}, colour intrinsics")
+    K, lines = _of_size(K, size, what="the colour camera")
+    registration = _registration(root, options)
+    if registration is not None:
+        of_depth = first_size(frame.depth for frame in frames if frame.depth is not None)
+        depth_K, others = _of_size(registration.depth_K, of_depth, what="the depth camera")
+        registration, lines = replace(registration, depth_K=depth_K), [*lines, *others]
     if size is None and frames and strict:
         what = "unreadable" if frames[0].image.exists() else "no such picture"
         raise ProjectError(f"{frames[0].image}: {what}, like all {len(frames)} pictures beside it")
@@ -544,7 +545,7 @@ def rgbd_scene(recording: Recording, *, kind: str = "rgbd", strict: bool = True)
         metric=True,
         kind=kind,
         strict=strict,
-        findings=recording.findings,
+        findings=[*recording.findings, *lines],
         unposed=recording.unposed,
         advice="give its pictures and poses",
     )
@@ -559,6 +560,20 @@ def rgbd_scene(recording: Recording, *, kind: str = "rgbd", strict: bool = True)
             line = "depth is taken as seen by the colour camera (no depth_K)"
             findings.append(Finding("info", line))
     return replace(scene, findings=tuple(findings))
+
+
+def _of_size(
+    K: Float64, size: tuple[int, int] | None, *, what: str
+) -> tuple[Float64, list[Finding]]:
+    """(3, 3) scaled to pictures of a size, where their principal point is the middle of others."""
+    times = 1.0 if size is None else times_as_large(K[:2, 2], size)
+    if size is None or times == 1:
+        return K, []
+    line = (
+        f"{what}'s principal point ({K[0, 2]:g}, {K[1, 2]:g}) is the middle of pictures "
+        f"{times:.4g} times as large as its own ({size[0]}x{size[1]}): intrinsics scaled"
+    )
+    return np.diag([1 / times, 1 / times, 1]) @ K, [Finding("warning", line)]
 
 
 def _registration(root: Path, options: RgbdOptions) -> Registration | None:

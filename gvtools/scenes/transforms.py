@@ -31,6 +31,7 @@ from gvtools.scenes.calibration import (
     finite_array,
     opencv_pose,
     scaled_lens,
+    times_as_large,
 )
 from gvtools.scenes.faces import PANORAMA, perspective_views
 from gvtools.scenes.images import read_depth, read_header
@@ -63,8 +64,6 @@ DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 FURTHER = ("k5", "k6", "p3", "p4", "b1", "b2")
 # What tells one axis may differ so much from what else tells it.
 SAME_FOCAL = 0.02
-# Twice a principal point may differ so much from the picture that it is of.
-OFF_CENTER = 0.15
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Positive = Annotated[Number, Field(gt=0)]
@@ -387,6 +386,7 @@ def _pose(keys: FrameKeys, what: str) -> Float64:
         pose = np.array(keys.transform_matrix, np.float64)
     except (OverflowError, TypeError, ValueError):
         raise ProjectError(f"{what}: transform_matrix is no matrix; expected 4x4 numbers") from None
+    pose = pose.reshape(4, 4) if pose.shape == (16,) else pose
     return pose * np.diag(OPENCV_FROM_OPENGL) if pose.shape[-1:] == (4,) else pose
 
 
@@ -506,7 +506,7 @@ class FrameKeys(BaseModel):
         if (times := self._times(size)) != 1:
             lines.append(
                 f"no w and h, and the principal point ({self.cx:g}, {self.cy:g}) is the middle of "
-                f"pictures {times:g} times as large as these ({size[0]}x{size[1]}): intrinsics "
+                f"pictures {times:.4g} times as large as these ({size[0]}x{size[1]}): intrinsics "
                 "scaled; if they are of these pictures, write w and h"
             )
         for level in (self, self._of_file) if not self.is_fisheye else ():
@@ -530,12 +530,9 @@ class FrameKeys(BaseModel):
     def _times(self, size: tuple[int, int]) -> float:
         """How many times as large the pictures are that the principal point is the middle of."""
         sized = self.w is not None and self.h is not None
-        if sized or self.cx is None or self.cy is None or min(self.cx, self.cy) <= 0:
+        if sized or self.cx is None or self.cy is None:
             return 1
-        x, y = 2 * self.cx / size[0], 2 * self.cy / size[1]
-        mean = (x + y) / 2
-        times = float(round(mean)) if mean > 1 else 1 / round(1 / mean)
-        return times if max(abs(x / times - 1), abs(y / times - 1)) < OFF_CENTER else 1
+        return times_as_large((self.cx, self.cy), size)
 
     def _told(self, axis: str, length: int) -> dict[str, float]:
         """Focal length along an axis by each key that tells it, the one that counts first."""

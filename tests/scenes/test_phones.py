@@ -225,7 +225,7 @@ def test_record3d_archive_and_folder_are_the_same(tmp_path: Path) -> None:
     scene = open_project(tmp_path / "scan")
     assert scene.names == ("0.jpg", "2.jpg", "3.jpg")
     assert [view.has_depth for view in scene] == [True, True, False]
-    assert "1 depth maps have no confidence map" in told(scene)
+    assert "1 of 3 depth maps have no confidence map" in told(scene)
 
 
 def rewritten(path: Path, *, without: str = "", **metadata: Any) -> Path:

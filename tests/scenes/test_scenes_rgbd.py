@@ -213,10 +213,22 @@ def test_wrong_options(tmp_path):
         SEVENSCENES.read(root)
 
 
-def test_intrinsics_of_another_size_are_pointed_out(tmp_path):
-    root = sevenscenes(tmp_path)
-    np.savetxt(root / "camera-intrinsics.txt", [[525, 0, 319.5], [0, 525, 239.5], [0, 0, 1]])
-    assert "far from the middle" in messages(SEVENSCENES.read(root))
+@pytest.mark.parametrize(("layout", "write"), [(SEVENSCENES, sevenscenes), (SCANNET, scannet)])
+@pytest.mark.parametrize("times", [0.5, 2, 2.02])  # ScanNet's pictures are 1296x968, maps 640x480
+def test_intrinsics_of_another_size_are_scaled_and_said(tmp_path, layout, write, times):
+    root = write(tmp_path / "recording")
+    before = layout.read(root)
+    for path in [*root.glob("camera-intrinsics.txt"), *root.glob("intrinsic/intrinsic_*.txt")]:
+        K = np.loadtxt(path)
+        K[:2, 2] += 0.5
+        K[:2] *= times
+        K[:2, 2] -= 0.5
+        np.savetxt(path, K)
+    scene = layout.read(root)
+    np.testing.assert_allclose(scene.cameras.K, before.cameras.K, rtol=5e-3)
+    assert f"the middle of pictures {times:g}"[:-1] in messages(scene)
+    depths = [x.views[0].load().depth for x in (scene, before)]
+    np.testing.assert_allclose(*depths, atol=0.01)
 
 
 # --- TUM --------------------------------------------------------------------------------------
@@ -264,7 +276,7 @@ def test_a_damaged_camera_file_is_refused_and_two_that_differ_are(tmp_path, text
     (root / "camera.json").write_text(text)
     with pytest.raises(ProjectError, match=r"camera.json: .* expected Open3D's form"):
         TUM.read(root)
-    K = [500.0, 0, 0, 0, 500, 0, WIDTH / 2, HEIGHT / 2, 1]
+    K = [500.0, 0, 0, 0, 500, 0, 320, 240, 1]
     (root / "camera.json").write_text(json.dumps({"intrinsic_matrix": K}), encoding="utf-16")
     given = np.array(K).reshape(3, 3).T
     np.testing.assert_allclose(TUM.read(root).cameras.K[0, :2, :2], given[:2, :2])
@@ -344,7 +356,8 @@ def test_a_default_camera_is_a_warning_at_every_door(tmp_path, layout, write):
     focal = 525 * width / 640
     middle = [[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]
     np.testing.assert_allclose(scene.cameras.K[0], middle)
-    np.savetxt(root / "camera-intrinsics.txt", [[90, 0, 47.5], [0, 91, 35.5], [0, 0, 1]])
+    middle[0][2], middle[1][1], middle[1][2] = (width - 1) / 2, 91, (height - 1) / 2
+    np.savetxt(root / "camera-intrinsics.txt", middle)
     scene = layout.read(root)
     assert scene.cameras.K[0, 1, 1] == 91
     assert "intrinsics: camera-intrinsics.txt" in messages(scene)

@@ -334,7 +334,8 @@ def test_focal_lengths_in_every_form(tmp_path, shared, own, expected, size):
         ((48, 36), (45, 45.5, 24, 18), "the middle of pictures 2 times as large"),
         ((192, 144), (180, 182, 96, 72), "the middle of pictures 0.5 times as large"),
         ((96, 72), (90, 91, 48, 36), ""),
-        ((60, 45), (90, 91, 48, 36), "far from the middle"),
+        ((60, 45), (56.25, 56.875, 30, 22.5), "the middle of pictures 1.6 times as large"),
+        ((60, 60), (90, 91, 48, 36), "far from the middle"),
     ],
 )
 def test_intrinsics_without_a_size_are_of_the_size_of_their_middle(tmp_path, shape, expected, line):
