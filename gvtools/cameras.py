@@ -233,7 +233,9 @@ def rigid_transform(matrix: ArrayLike, *, what: str) -> tuple[Float64, float]:
     if not np.isfinite(matrix).all():
         raise ShapeError(f"{what}: the pose holds NaN or infinity; mend it or drop the view")
     if matrix.shape == (4, 4) and not np.allclose(matrix[3], (0, 0, 0, 1), atol=1e-6):
-        raise ShapeError(f"{what}: the pose's last row is {matrix[3].tolist()}; expected 0 0 0 1")
+        advice = "" if matrix[:3, 3].any() else "; transpose it, it is written column by column"
+        last = f"{matrix[3].tolist()}; expected 0 0 0 1{advice}"
+        raise ShapeError(f"{what}: the pose's last row is {last}")
     rotation = matrix[:3, :3]
     defect = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
     if defect > ROTATION_TOLERANCE or np.linalg.det(rotation) < 0:

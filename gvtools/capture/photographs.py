@@ -18,9 +18,15 @@ from numpy.typing import NDArray
 from PIL import Image, ImageOps
 
 from gvtools.errors import ProjectError
-from gvtools.scenes.images import UNREADABLE, orientation_of, read_mask, resize_nearest, same_aspect
+from gvtools.scenes.images import (
+    IMAGE_SUFFIXES,
+    UNREADABLE,
+    orientation_of,
+    read_mask,
+    resize_nearest,
+    same_aspect,
+)
 from gvtools.scenes.matching import find_renamed, is_hidden, named
-from gvtools.scenes.project import PICTURES
 from gvtools.scenes.scene import Finding, natural_key
 from gvtools.untrusted import is_file, open_picture, read_bytes
 
@@ -71,10 +77,12 @@ def find_photographs(folder: Path) -> tuple[list[CapturedPhotograph], list[Findi
     files = {name: path for name, path in every.items() if not is_hidden(name)}
     hidden = [
         name for name, path in every.items()
-        if name not in files and path.suffix.lower() in PICTURES and path.is_file()
+        if name not in files and path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()
     ]  # fmt: skip
     foreign = [name for name, path in files.items() if path.suffix.lower() in (*HEIF, *RAW)]
-    names = [n for n, path in files.items() if path.suffix.lower() in PICTURES and path.is_file()]
+    names = [
+        n for n, path in files.items() if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()
+    ]
     found: list[CapturedPhotograph] = []
     damaged: list[str] = []
     copies: list[str] = []

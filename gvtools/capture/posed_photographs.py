@@ -35,10 +35,9 @@ from gvtools.files import write_json
 from gvtools.poses.bundle_adjustment import MOST_VIEWS, Tracks, adjusted_poses, refine_focals
 from gvtools.scenes.colmap import read_colmap
 from gvtools.scenes.colmap_writer import build_reconstruction, write_colmap
-from gvtools.scenes.images import read_image
+from gvtools.scenes.images import IMAGE_SUFFIXES, read_image
 from gvtools.scenes.matching import is_hidden, named
 from gvtools.scenes.pose_forms import pose_contradiction, pose_findings
-from gvtools.scenes.project import PICTURES
 from gvtools.scenes.resized import reduced
 from gvtools.scenes.scene import Finding, Scene
 
@@ -161,7 +160,7 @@ def _rows(
         # As networks list folders: by names as text.
         order = sorted(
             name for name in names
-            if PurePosixPath(name).suffix.lower() in PICTURES and not is_hidden(name)
+            if PurePosixPath(name).suffix.lower() in IMAGE_SUFFIXES and not is_hidden(name)
         )  # fmt: skip
         if len(order) != count:
             raise ProjectError(

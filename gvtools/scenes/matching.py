@@ -22,7 +22,6 @@ from gvtools.untrusted import is_file, named_file
 
 Float64 = NDArray[np.float64]
 
-PICTURES = (".jpg", ".jpeg", ".png")
 # Stamps of the other list within the limit of one, on average, at most.
 MOST_CANDIDATES = 100
 # Files of a folder that absent ones are looked for among.
@@ -63,7 +62,7 @@ def given_folder(folder: Path, held: str) -> Path:
     return folder
 
 
-def pictures_in(folder: Path, suffixes: Collection[str] = PICTURES) -> list[Path]:
+def pictures_in(folder: Path, suffixes: Collection[str] = IMAGE_SUFFIXES) -> list[Path]:
     """The folder's files of the suffixes in natural order of names; none where it is absent."""
     if not folder.is_dir():
         return []

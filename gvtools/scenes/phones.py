@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -67,7 +67,13 @@ def phone_scene(
     """The scene of an app's export, metric, in the poses' own world.
 
     Poses are world_from_cam for OpenCV's axes; ``upright`` says that y of the world points up.
+    Readers of depth are partial functions; those with confidence have it as a keyword.
     """
+    readers = [item.read_depth for item in frames if item.depth and item.depth.is_file()]
+    bare = sum(getattr(reader, "keywords", {}).get("confidence") is None for reader in readers)
+    if bare:
+        line = f"{bare} of {len(readers)} depth maps have no confidence map: all of them is used"
+        findings = [*findings, Finding("info", line)]
     scene = posed_scene(
         root, frames, poses="world_from_cam", metric=True, kind=name, findings=tuple(findings)
     )
@@ -87,27 +93,9 @@ def read_lidar(path: Path, *, confidence: Path | None) -> Depth:
     return depth if confidence is None else confident(depth, read_mask(confidence))
 
 
-@dataclass
-class LidarMaps:
-    """Counts of depth maps that are there, and of those of them without a confidence map."""
-
-    maps: int = 0
-    bare: int = 0
-
-    def reader(self, depth: Path, confidence: Path) -> Callable[[Path], Depth]:
-        """How a depth map is read: with its confidence where that is there."""
-        there = confidence.is_file()
-        if depth.is_file():
-            self.maps += 1
-            self.bare += not there
-        return partial(read_lidar, confidence=confidence if there else None)
-
-    def findings(self) -> list[Finding]:
-        """One line when depth maps lack their confidence."""
-        if not self.bare:
-            return []
-        line = f"{self.bare} of {self.maps} depth maps have no confidence map: all of them is used"
-        return [Finding("info", line)]
+def lidar_reader(confidence: Path) -> Callable[[Path], Depth]:
+    """How a depth map is read: with its confidence where that is there."""
+    return partial(read_lidar, confidence=confidence if confidence.is_file() else None)
 
 
 # --- Polycam, raw data ------------------------------------------------------------------------
@@ -131,7 +119,7 @@ def _keyframes(root: Path) -> Path:
 
 
 def _read_polycam(root: Path) -> Scene:
-    home, lidar = _keyframes(root), LidarMaps()
+    home = _keyframes(root)
     corrected = all((home / folder).is_dir() for folder in _CORRECTED)
     cameras, images = _CORRECTED if corrected else _RECORDED
     names = natural(
@@ -159,12 +147,12 @@ def _read_polycam(root: Path) -> Scene:
                 lens,
                 None if pose is None else opencv_pose(pose),
                 depth,
-                lidar.reader(depth, home / "confidence" / f"{name}.png"),
+                lidar_reader(home / "confidence" / f"{name}.png"),
                 read=_read_undistorted if corrected and whole else None,
             )
         )
     said = "optimised, pictures undistorted" if corrected else "as ARKit tracked them"
-    findings = [Finding("info", f"poses: {said}"), *lidar.findings()]
+    findings = [Finding("info", f"poses: {said}")]
     return phone_scene(root, "Polycam", frames, findings=findings)
 
 
@@ -211,7 +199,7 @@ def _read_scanner_app(root: Path) -> Scene:
     shown = natural(path.stem for path in root.glob("frame_*.jpg"))
     # All pictures are of one camera, and no file says their size.
     size = first_size(root / f"{name}.jpg" for name in shown) or (2, 2)
-    lidar, frames = LidarMaps(), []
+    frames = []
     for name in shown:
         number = name.removeprefix("frame_")
         said = json_object(root / f"{name}.json")
@@ -224,10 +212,10 @@ def _read_scanner_app(root: Path) -> Scene:
                 None if K is None else pinhole_lens(K, size),
                 None if pose is None else opencv_pose(pose),
                 depth,
-                lidar.reader(depth, root / f"conf_{number}.png"),
+                lidar_reader(root / f"conf_{number}.png"),
             )
         )
-    unseen, findings = len(poses - set(shown)), lidar.findings()
+    unseen, findings = len(poses - set(shown)), list[Finding]()
     if unseen:
         line = f"{unseen} of {len(poses)} frames were recorded without a picture: not used"
         findings.append(Finding("info", line))
@@ -260,7 +248,7 @@ _MOST_FRAMES = 3e10  # of a recording: a year at a thousand a second
 
 def _read_stray_scanner(root: Path) -> Scene:
     rows = _odometry(root / _ODOMETRY)
-    video, lidar = root / _VIDEO, LidarMaps()
+    video = root / _VIDEO
     seconds, size = frame_seconds(video, edits=False), video_header(video).size
     shared = None
     if (root / _MATRIX).is_file():
@@ -283,17 +271,17 @@ def _read_stray_scanner(root: Path) -> Scene:
                 None if K is None else pinhole_lens(K, size),
                 None if turn is None or centre is None else quaternion_pose(turn, centre),
                 depth,
-                lidar.reader(depth, root / "confidence" / f"{number}.png"),
+                lidar_reader(root / "confidence" / f"{number}.png"),
                 read=partial(read_frame, seconds=seconds[place], edits=False) if inside else None,
             )
         )
-    findings = lidar.findings()
+    findings = []
     if len(seconds) != len(rows):
         line = (
             f"{_VIDEO} has {len(seconds)} frames for {len(rows)} poses: pictures may belong to "
             "poses beside theirs; give the video as the app wrote it"
         )
-        findings.insert(0, Finding("warning", line))
+        findings.append(Finding("warning", line))
     return phone_scene(root, "Stray Scanner", frames, findings=findings)
 
 
@@ -378,11 +366,6 @@ class Record3dMetadata(BaseModel):
         return sorted({*range(len(self.poses)), *(int(stem) for stem in stems if stem.isdecimal())})
 
 
-def _is_record3d(path: Path) -> bool:
-    recording = (path / "metadata").is_file() and (path / "rgbd").is_dir()
-    return recording or _export(path) is not None
-
-
 def _export(path: Path) -> Path | None:
     """The folder of an export of EXR and JPG, which may lie inside the one that is given."""
     for home in (path, path / _EXPORT):
@@ -395,10 +378,8 @@ def _read_record3d(path: Path) -> Scene:
     export = _export(path)
     metadata = _metadata(path / "metadata" if export is None else export / "metadata.json")
     frames = _frames(export or path, metadata, exported=export is not None)
-    maps = [item.depth for item in frames if item.depth is not None and item.depth.is_file()]
-    bare = sum(not depth.with_suffix(".conf").is_file() for depth in maps)
     line = "the world is where the recording began: which way is up is not said"
-    findings = [Finding("info", line), *LidarMaps(len(maps), bare).findings()]
+    findings = [Finding("info", line)]
     return phone_scene(path, "Record3D", frames, upright=False, findings=findings)
 
 
@@ -480,6 +461,8 @@ def _decompressed(data: bytes, size: int) -> bytes:
 RECORD3D = Layout.of_folder(
     "Record3D",
     f"an .r3d file, metadata with rgbd/, or {_EXPORT}/metadata.json",
-    matches=_is_record3d,
+    matches=lambda path: (
+        ((path / "metadata").is_file() and (path / "rgbd").is_dir()) or _export(path) is not None
+    ),
     read=_read_record3d,
 )

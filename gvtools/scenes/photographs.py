@@ -61,8 +61,9 @@ BAD_POSE = "have an impossible pose"
 BAD_CAMERA = "have an impossible camera"
 # Pictures that may have 16 bits a channel, and what is done with them.
 DEEP, UPPER = (".png", ".tif", ".tiff", ".ppm"), "the upper eight bits are used"
-# A principal point is expected within so much of the middle, in sides of the picture.
-CENTER = 0.25
+# A principal point is expected within so much of the middle, in sides of the picture; if it is so
+# near to that of the picture on its side, within less.
+CENTER, TURNED = 0.25, 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -476,13 +477,15 @@ def center_findings(lenses: Sequence[Undistortion]) -> list[Finding]:
     found = Counter[str]()
     for lens in lenses:
         (x, y), (w, h) = lens.K[:2, 2], lens.size
-        if max(abs(x / w - 0.5), abs(y / h - 0.5)) >= CENTER:
-            found[f"({x:.1f}, {y:.1f}) is far from the middle of {w}x{h} pixels"] += 1
+        off, turned = (max(abs(x / a - 0.5), abs(y / b - 0.5)) for a, b in ((w, h), (h, w)))
+        if off >= CENTER or 2 * turned < TURNED < off:
+            of = "turned pictures" if turned < TURNED else "another size"
+            place = f"({x:.1f}, {y:.1f}) is far from the middle of {w}x{h} pixels"
+            found[f"{place}: are the intrinsics of {of}?"] += 1
     return [
-        Finding("warning", f"{count} views: the principal point {line}: are the intrinsics of "
-                "another size?")
+        Finding("warning", f"{count} views: the principal point {line}")
         for line, count in found.items()
-    ]  # fmt: skip
+    ]
 
 
 def rotation_findings(defects: Sequence[float]) -> list[Finding]:

@@ -15,7 +15,7 @@ from gvtools.errors import OptionError, ProjectError, UnposedError
 from gvtools.scenes.calibration import load_matrix
 from gvtools.scenes.collection import SceneCollection, of_scenes
 from gvtools.scenes.colmap_model import find_model
-from gvtools.scenes.images import ALPHA
+from gvtools.scenes.images import ALPHA, IMAGE_SUFFIXES
 from gvtools.scenes.layout import ARCHIVES, FORM, SPEC, is_address
 from gvtools.scenes.matching import named
 from gvtools.scenes.phones import POLYCAM, RECORD3D, SCANNER_APP, STRAY_SCANNER
@@ -26,7 +26,6 @@ from gvtools.scenes.transforms import FILE as TRANSFORMS
 from gvtools.scenes.transforms import SPLITS, is_transforms, read_transforms
 from gvtools.untrusted import unpacked
 
-PICTURES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg")
 # A recording of a RealSense camera.
 BAG = ".bag"
@@ -191,9 +190,9 @@ def _unknown(path: Path) -> ProjectError:
     entries = sorted(entry.name + "/" * entry.is_dir() for entry in path.iterdir())
     there = (place for form in ("*/", "dense/*/", "*.r3d", "*.zip") for place in path.glob(form))
     inside = [str(place) for place in sorted(there) if is_project(place)]
-    pictures = [name for name in entries if Path(name).suffix.lower() in PICTURES]
+    pictures = [name for name in entries if Path(name).suffix.lower() in IMAGE_SUFFIXES]
     if not inside and all(entry.is_dir() for entry in path.iterdir() if _is_other(entry)):
-        pictures += [p.name for p in path.glob("*/*") if p.suffix.lower() in PICTURES]
+        pictures += [p.name for p in path.glob("*/*") if p.suffix.lower() in IMAGE_SUFFIXES]
     if len(pictures) > 1:
         return UnposedError(path, f"{len(pictures)} pictures without cameras", _capture(path))
     held = f"holds {named(entries)}" if entries else "is empty"
@@ -202,7 +201,7 @@ def _unknown(path: Path) -> ProjectError:
 
 
 def _is_other(entry: Path) -> bool:
-    return entry.suffix.lower() not in PICTURES and not entry.name.startswith(".")
+    return entry.suffix.lower() not in IMAGE_SUFFIXES and not entry.name.startswith(".")
 
 
 # --- options and addresses as users and runs have them -----------------------------------------

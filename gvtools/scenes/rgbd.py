@@ -57,7 +57,7 @@ from gvtools.scenes.photographs import NO_POSE, PosedFrame, Registration, first_
 from gvtools.scenes.scene import Finding, Scene
 from gvtools.scenes.undistort import LensParameters
 from gvtools.settings import Settings, changes, with_file
-from gvtools.trajectory_files import read_poses
+from gvtools.trajectory_files import in_seconds, read_poses
 from gvtools.untrusted import read_text, reading
 
 SIDECAR = "rgbd.json"
@@ -361,7 +361,8 @@ def _stamped_files(path: Path) -> list[tuple[float, str]]:
             if stamp is None or len(words) < 2:
                 raise ValueError(f"line {number}: {line!r}")
             entries.append((float(stamp[0]), words[1].strip()))
-    return entries
+    seconds = in_seconds(np.array([stamp for stamp, _ in entries]))
+    return [(time, name) for time, (_, name) in zip(seconds.tolist(), entries, strict=True)]
 
 
 class _ScanNet(RgbdFolder):

@@ -25,9 +25,9 @@ from gvtools.scenes.colmap_model import (
     has_model,
     load_model,
 )
-from gvtools.scenes.images import read_depth, readings
+from gvtools.scenes.images import IMAGE_SUFFIXES, read_depth, readings
 from gvtools.scenes.layout import Layout
-from gvtools.scenes.matching import PICTURES, natural, pictures_by_stem, scenes_holding
+from gvtools.scenes.matching import natural, pictures_by_stem, scenes_holding
 from gvtools.scenes.photographs import Depth, PosedFrame, first_size, posed_scene
 from gvtools.scenes.scene import Finding, Scene
 from gvtools.scenes.transforms import FILE as TRANSFORMS
@@ -44,7 +44,7 @@ FULL = "images"
 def picture_folders(scene: Path) -> list[Path]:
     """The folders of pictures that a scene has, the largest pictures first."""
     found = [path for path in scene.glob(f"{FULL}*") if path.is_dir() and _factor(path.name)]
-    held = [p for p in found if any(item.suffix.lower() in PICTURES for item in p.iterdir())]
+    held = [p for p in found if any(item.suffix.lower() in IMAGE_SUFFIXES for item in p.iterdir())]
     return sorted(held, key=lambda path: _factor(path.name))
 
 
