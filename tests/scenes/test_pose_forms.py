@@ -14,7 +14,7 @@ from gvtools.scenes.inspection import inspect
 from gvtools.scenes.pose_forms import pose_findings
 from gvtools.scenes.project import open_project
 
-FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+FLIP, MIRROR = np.diag([1.0, -1.0, -1.0, 1.0]), np.diag([1.0, 1.0, -1.0, 1.0])
 
 
 def rolled(pose):
@@ -39,6 +39,7 @@ def room(wall_walk, tmp_path_factory):
         (np.linalg.inv, "invert them"),
         (lambda pose: np.linalg.inv(pose @ FLIP), "invert them"),
         (lambda pose: rolled(pose @ FLIP) @ FLIP, "have the scalar first"),
+        (lambda pose: MIRROR @ pose @ MIRROR, "left-handed"),
     ],
 )
 def test_the_form_of_poses_is_told_by_the_photographs(room, change, reason):
@@ -50,6 +51,21 @@ def test_the_form_of_poses_is_told_by_the_photographs(room, change, reason):
     found = [item.message for item in pose_findings(open_project(file))]
     assert len(found) == (reason is not None)
     assert all("do not fit the photographs" in line and reason in line for line in found)
+
+
+def test_axes_of_cameras_that_go_sideways(tmp_path):
+    # Epipolar lines are nearly those of the other axes; what is seen lies behind these cameras.
+    textures = [blotches(np.random.default_rng(3 + wall)) for wall in range(3)]
+    places = [((0.5 * i - 0.5, 0, 0), (0, 6 - 6 * i, 0)) for i in range(3)]
+    cameras = [camera_at(at, turn=turn, name=f"{at[0]:.1f}.png") for at, turn in places]
+    file = write_project(tmp_path / "room", [photograph(each, textures) for each in cameras])
+    assert pose_findings(open_project(file)) == []
+    data = json.loads(file.read_text())
+    for frame in data["frames"]:
+        frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ FLIP).tolist()
+    file.write_text(json.dumps(data))
+    (found,) = pose_findings(open_project(file))
+    assert "taken for each other" in found.message
 
 
 def test_focal_lengths_of_pictures_that_were_cropped(tmp_path):

@@ -6,10 +6,12 @@ import shutil
 
 import numpy as np
 import pytest
+from PIL import Image
 from rgbd_folders import redwood, scannet, tum
 from scenes_workspace import HEIGHT, WIDTH, pose_matrix, ramp, save, sevenscenes
 
 from gvtools.errors import GvError, OptionError, ProjectError, ShapeError
+from gvtools.scenes.images import read_depth
 from gvtools.scenes.matching import associate
 from gvtools.scenes.project import open_project
 from gvtools.scenes.rgbd import PUBLISHED, REDWOOD, SCANNET, SEVENSCENES, TUM, RgbdOptions
@@ -336,6 +338,16 @@ def test_association_is_the_greedy_one_over_all_pairs():
     assert len(expected) > 20
 
 
+def test_tum_stamps_in_nanoseconds(tmp_path):
+    root = tum(tmp_path / "sequence")
+    before = TUM.read(root)
+    for name in ("rgb.txt", "depth.txt", "groundtruth.txt"):
+        lines = [line.split(maxsplit=1) for line in (root / name).read_text().splitlines()[1:]]
+        rows = (f"{int((1.3e9 + float(stamp)) * 1e9)} {rest}\n" for stamp, rest in lines)
+        (root / name).write_text("".join(rows))
+    assert TUM.read(root).names == before.names
+
+
 @pytest.mark.parametrize("name", ["rgb.txt", "depth.txt", "groundtruth.txt"])
 def test_tum_lists_of_windows_programs(tmp_path, name):
     root = tum(tmp_path / "sequence")
@@ -380,6 +392,57 @@ def test_redwood_pose_numbers_choose_the_picture(tmp_path):
     assert scene.names == ("00001-000077.jpg", "00003-000277.jpg")
     np.testing.assert_allclose(scene.cameras.world_from_cam[1], pose_matrix(0.2), atol=1e-8)
     assert "1 of 3 frames have no pose: dropped (00002-000177.jpg)" in messages(scene)
+
+
+@pytest.mark.parametrize(
+    ("file", "form"), [("poses.npy", (4, 4)), ("poses.npy", (3, 4)), ("traj.txt", (16,))]
+)
+def test_poses_of_all_pictures_in_one_file(tmp_path, file, form):
+    root = redwood(tmp_path / "recording")
+    before = REDWOOD.read(root)
+    for path in root.glob("*.log"):
+        path.unlink()
+    poses = np.array([np.delete(pose, 3, 0) for pose in before.cameras.world_from_cam])
+    whole = before.cameras.world_from_cam
+    rows = {(4, 4): whole, (3, 4): poses, (16,): whole.reshape(3, 16)}[form]
+    (np.save if file.endswith(".npy") else np.savetxt)(root / file, rows)
+    scene = open_project(root)
+    np.testing.assert_allclose(scene.cameras.cam_from_world, before.cameras.cam_from_world)
+    assert f"poses: {file}" in messages(scene)
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".npz", ".tiff", ".pfm"])
+def test_depth_of_other_files_is_in_metres_where_it_holds_fractions(tmp_path, suffix):
+    root = scannet(tmp_path / "scan")
+    before = SCANNET.read(root).views[0].load()
+    for path in sorted(root.glob("depth/*.png")):
+        metres = read_depth(path, unit=0.001)
+        path.unlink()
+        other = path.with_suffix(suffix)
+        if suffix == ".pfm":
+            head = b"Pf\n%d %d\n-1\n" % metres.shape[::-1]
+            other.write_bytes(head + metres[::-1].astype("<f4").tobytes())
+        elif suffix == ".tiff":
+            Image.fromarray(metres).save(other)
+        else:
+            np.save(other, metres) if suffix == ".npy" else np.savez(other, depth=metres)
+    for path in sorted(root.glob("pose/*.txt")):  # a matrix each
+        np.save(path.with_suffix(".npy"), np.loadtxt(path))
+        path.unlink()
+    for path in sorted(root.glob("color/*.jpg")):
+        with Image.open(path) as picture:
+            picture.save(path.with_suffix(".webp"), lossless=True)
+        path.unlink()
+    frame = SCANNET.read(root).views[0].load()
+    np.testing.assert_array_equal(frame.rgb, before.rgb)
+    np.testing.assert_allclose(frame.depth, before.depth)
+
+
+def test_intrinsics_of_turned_pictures_are_told(tmp_path):
+    root = redwood(tmp_path / "recording")
+    np.savetxt(root / "camera-intrinsics.txt", [[91, 0, 35.5], [0, 92, 47.5], [0, 0, 1]])
+    (root / "camera.json").unlink()
+    assert "are the intrinsics of turned pictures?" in messages(REDWOOD.read(root))
 
 
 def test_redwood_trajectory_that_does_not_fit(tmp_path):
