@@ -75,14 +75,13 @@ def find_photographs(folder: Path) -> tuple[list[CapturedPhotograph], list[Findi
     """The readable, different pictures below a folder in natural order, and what was met."""
     every = {path.relative_to(folder).as_posix(): path for path in sorted(folder.rglob("*"))}
     files = {name: path for name, path in every.items() if not is_hidden(name)}
-    hidden = [
+    pictures = [
         name for name, path in every.items()
-        if name not in files and path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()
+        if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()
     ]  # fmt: skip
+    hidden = [name for name in pictures if name not in files]
+    names = [name for name in pictures if name in files]
     foreign = [name for name, path in files.items() if path.suffix.lower() in (*HEIF, *RAW)]
-    names = [
-        n for n, path in files.items() if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()
-    ]
     found: list[CapturedPhotograph] = []
     damaged: list[str] = []
     copies: list[str] = []

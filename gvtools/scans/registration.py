@@ -11,7 +11,7 @@ A cell is a cube such that about 6,000 of them hold the photographs' points.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -89,7 +89,7 @@ class Placement:
     world_from_scan: NDArray[np.float64]
     how: str  # "given", "as it is" (an estimate that left the scan where it was) or "estimated"
     # share of the photographs' points that have a point of the scan within ``tolerance``;
-    # None for a given placement, like the next ones
+    # None where nothing judged it, like the next ones
     fitness: float | None = None
     # share of the scan's points that have one of the photographs'
     scan_fitness: float | None = None
@@ -157,12 +157,18 @@ def given_placement(text: str) -> Placement | None:
 
 
 def register(
-    scan: Surface, photographed: Surface, *, least: float, metric: bool, seed: int = 0
+    scan: Surface,
+    photographed: Surface,
+    *,
+    least: float,
+    metric: bool,
+    seed: int = 0,
+    given: Placement | None = None,
 ) -> Placement:
     """The similarity from a scan's frame to the photographs' world.
 
     ``least`` is the smallest fitness that is accepted, 0 to 1; in a ``metric`` world, whose unit is
-    the metre, METRIC scales are tried first.
+    the metre, METRIC scales are tried first. A ``given`` one is judged alone.
     """
     for name, surface in (("scan", scan), ("photographs", photographed)):
         if len(surface.positions) < FEWEST:
@@ -171,6 +177,9 @@ def register(
                 f"{FEWEST}; give its placement"
             )
     task = _Task(scan, photographed, seed=seed)
+    if given is not None:
+        judged = task.judged(task.of_world(given.world_from_scan), given.how)
+        return replace(judged, world_from_scan=given.world_from_scan)
     there = task.judged(task.of_world(np.eye(4)), "as it is")
     if _support(there) >= least:
         return there
@@ -366,7 +375,7 @@ class _Task:
         back = self.target_sample @ inverse[:3, :3].T + inverse[:3, 3]
         near = scale * self._scan_tree.query(back, workers=-1)[0]
         inside = near <= tolerance
-        rmse = float(np.sqrt((near[inside] ** 2).mean())) if inside.any() else float("nan")
+        rmse = float(np.sqrt((near[inside] ** 2).mean())) if inside.any() else 0.0
         moved = self.source_sample @ placed[:3, :3].T + placed[:3, 3]
         share = float((self._target_tree.query(moved, workers=-1)[0] <= tolerance).mean())
         return float(inside.mean()), share, rmse

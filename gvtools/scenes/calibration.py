@@ -54,17 +54,15 @@ def load_matrix(path: Path, *shapes: tuple[int, int]) -> Float64:
     """A matrix of one of the shapes, in rows or in one line, in a text file or an ``.npy``."""
     expected = " or ".join(f"{rows}x{columns}" for rows, columns in shapes)
     with reading(path, f"expected {expected} numbers"):
-        if path.suffix == ".npy":
-            matrix = np.atleast_2d(load_array(path).astype(np.float64))
-        else:
-            lines = read_text(path).replace(",", " ").splitlines()
-            matrix = np.loadtxt(lines, np.float64, ndmin=2)
+        npy = path.suffix == ".npy"
+        lines = [] if npy else read_text(path).replace(",", " ").splitlines()
+        matrix = load_array(path) if npy else np.loadtxt(lines, np.float64, ndmin=2)
         by_size = {rows * columns: (rows, columns) for rows, columns in shapes}
-        if 1 in matrix.shape and matrix.size in by_size:
+        if max(matrix.shape, default=0) == matrix.size in by_size:
             matrix = matrix.reshape(by_size[matrix.size])
         if matrix.shape not in shapes:
             raise ValueError(f"{'x'.join(str(length) for length in matrix.shape)} numbers")
-        return matrix
+        return matrix.astype(np.float64)
 
 
 def csv_rows(path: Path, *, again: str = "copy it again") -> list[dict[str, str]]:
@@ -172,7 +170,7 @@ def _text(path: Path) -> str:
 def times_as_large(center: ArrayLike, size: tuple[int, int]) -> float:
     """How many times as large the picture is that a point is the middle of; 1 of this ``size``.
 
-    >>> times_as_large((648, 484), (324, 242)), times_as_large((160, 130), (324, 242))
+    >>> times_as_large((648, 484), (648, 484)), times_as_large((330, 230), (648, 484))
     (2.0, 1.0)
     """
     x, y = 2 * np.asarray(center, np.float64) / size

@@ -155,14 +155,10 @@ def _homes(root: Path, folder: Path) -> list[Path]:
     homes = [root, folder, folder.parent]
     if folder.parent.name in ("sparse", "sparse_txt"):
         homes.append(folder.parent.parent)
-    # A chunk of Hierarchical-3DGS: all chunks share the pictures.
-    homes += [home.resolve().parents[1] / "rectified" for home in homes if is_chunk(home)]
+    # A chunk of Hierarchical-3DGS, a part of a model with its box: all share the pictures.
+    chunks = [home for home in homes if all((home / name).is_file() for name in CHUNK_BOX)]
+    homes += [home.resolve().parents[1] / "rectified" for home in chunks]
     return list(dict.fromkeys(path.resolve() for path in homes))
-
-
-def is_chunk(folder: Path) -> bool:
-    """Whether a folder is a chunk of Hierarchical-3DGS: a part of a model, with its box."""
-    return all((folder / name).is_file() for name in CHUNK_BOX)
 
 
 def _first(homes: list[Path], name: str) -> Path | None:

@@ -196,8 +196,7 @@ def posed_scene(
         photographs = [replace(item, white=white) for item in photographs]
     if strict:
         report += center_findings([item.lens for item in photographs])
-        files = [item for item in photographs if item.frame.read is None]
-        report += header_findings([(item.frame.image, item.lens.source_size) for item in files])
+        report += header_findings([item for item in photographs if item.frame.read is None])
         report += map_findings(photographs)
     if white != WHOLE[-1]:
         report = [item for item in report if not item.message.endswith(UPPER)]
@@ -390,14 +389,11 @@ class Photograph:
         )
 
 
-def header_findings(pictures: Sequence[tuple[Path, tuple[int, int]]]) -> list[Finding]:
-    """An error for each unreadable picture or wrong size, and a line a kind of conversion.
-
-    Each file comes with the width and height that its camera expects; none is decoded.
-    """
+def header_findings(photographs: Sequence[Photograph]) -> list[Finding]:
+    """An error for each unreadable picture or wrong size, and a line a kind of conversion."""
     findings: list[Finding] = []
     headers: list[ImageHeader] = []
-    for path, expected in dict.fromkeys(pictures):
+    for path, expected in {item.frame.image: item.lens.source_size for item in photographs}.items():
         try:
             header = read_header(path)
             check_size(
@@ -448,9 +444,8 @@ def map_findings(photographs: Sequence[Photograph]) -> list[Finding]:
         if found != expected and same_aspect(found, expected):
             resized[f"{noun} of {line}: nearest pixel taken"] += 1
         elif found != expected:
-            other = ", or the depth camera's intrinsics (depth_K of RGB-D)" * (noun != "masks")
-            message = f"{path}: {noun} of {line}; expected the same aspect{other}"
-            findings.append(Finding("error", message))
+            advice = "expected the same aspect, or of depth its camera's intrinsics (depth_K)"
+            findings.append(Finding("error", f"{path}: {noun} of {line}; {advice}"))
     return findings + [Finding("info", f"{count} {line}") for line, count in resized.items()]
 
 
@@ -482,10 +477,7 @@ def center_findings(lenses: Sequence[Undistortion]) -> list[Finding]:
             of = "turned pictures" if turned < TURNED else "another size"
             place = f"({x:.1f}, {y:.1f}) is far from the middle of {w}x{h} pixels"
             found[f"{place}: are the intrinsics of {of}?"] += 1
-    return [
-        Finding("warning", f"{count} views: the principal point {line}")
-        for line, count in found.items()
-    ]
+    return [Finding("warning", f"{n} views: the principal point {at}") for at, n in found.items()]
 
 
 def rotation_findings(defects: Sequence[float]) -> list[Finding]:

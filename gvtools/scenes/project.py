@@ -191,17 +191,14 @@ def _unknown(path: Path) -> ProjectError:
     there = (place for form in ("*/", "dense/*/", "*.r3d", "*.zip") for place in path.glob(form))
     inside = [str(place) for place in sorted(there) if is_project(place)]
     pictures = [name for name in entries if Path(name).suffix.lower() in IMAGE_SUFFIXES]
-    if not inside and all(entry.is_dir() for entry in path.iterdir() if _is_other(entry)):
+    others = [p for p in path.iterdir() if p.suffix.lower() not in IMAGE_SUFFIXES]
+    if not inside and all(entry.is_dir() for entry in others if entry.name[0] != "."):
         pictures += [p.name for p in path.glob("*/*") if p.suffix.lower() in IMAGE_SUFFIXES]
     if len(pictures) > 1:
         return UnposedError(path, f"{len(pictures)} pictures without cameras", _capture(path))
     held = f"holds {named(entries)}" if entries else "is empty"
     advice = f"did you mean {named(inside)}?" if inside else "give the project's folder"
     return ProjectError(f"{path}: {held}; expected one of: {'; '.join(LOOKED_FOR)}; {advice}")
-
-
-def _is_other(entry: Path) -> bool:
-    return entry.suffix.lower() not in IMAGE_SUFFIXES and not entry.name.startswith(".")
 
 
 # --- options and addresses as users and runs have them -----------------------------------------

@@ -267,7 +267,8 @@ class _Tum(RgbdFolder):
         self, root: Path, options: RgbdOptions
     ) -> tuple[list[tuple[float, PosedFrame]], list[Finding]]:
         lists, pairs = [root / f"{kind}.txt" for kind in ("rgb", "depth")], self._associated(root)
-        if pairs is not None and not all(path.is_file() for path in lists):
+        listed = all(path.is_file() for path in lists)
+        if pairs is not None and not listed:
             colors, depths = _associated_files(pairs)
             depth_of = {i: i for i in range(len(colors))}
             lists = [pairs, pairs]
@@ -290,7 +291,7 @@ class _Tum(RgbdFolder):
             depth = maps[depth_of[i]] if i in depth_of else None
             where = f"{self._truth(root)}, time {time:.6f}"
             frames.append((time, PosedFrame(color.name, color, None, None, depth, where=where)))
-        if not all((root / f"{kind}.txt").is_file() for kind in ("rgb", "depth")):
+        if not listed:
             source = pairs.name if pairs is not None else "the names of the files in rgb and depth"
             met.append(Finding("info", f"rgb.txt or depth.txt is absent: times are of {source}"))
         return sorted(frames, key=lambda item: (item[0], item[1].image)), [*met, *others]

@@ -326,20 +326,27 @@ def placed_scan(plan: Plan, console: Console) -> PlacedScan | None:
     console.line(_scan_summary(scan))
     for note in scan.notes:
         console.warn(f"{scan.name}: {note}")
-    placement = given_placement(options.placement)
-    if placement is None:
-        centers = [station.center for station in scan.stations]
-        known = None if any(center is None for center in centers) else np.array(centers)
-        seen_from = None if known is None else known[scan.station]
-        surface = Surface(scan.positions + scan.origin, seen_from)
-        try:
-            placement = register(
-                surface, photographed(plan), least=options.min_fitness,
-                metric=plan.scene.metric, seed=plan.config.seed,
-            )  # fmt: skip
-        except DegenerateError as error:
+    given = given_placement(options.placement)
+    centers = [station.center for station in scan.stations]
+    known = None if any(center is None for center in centers) else np.array(centers)
+    seen_from = None if known is None else known[scan.station]
+    surface = Surface(scan.positions + scan.origin, seen_from)
+    try:
+        placement = register(
+            surface, photographed(plan), least=options.min_fitness,
+            metric=plan.scene.metric, seed=plan.config.seed, given=given,
+        )  # fmt: skip
+    except DegenerateError as error:
+        if given is None:
             raise DegenerateError(f"{options.file}: {error} (--cloud-placement)") from None
+        placement = given
     console.line(f"{scan.name}: placement {placement.summary()}")
+    fit = max(placement.fitness or 0, placement.scan_fitness or 0)
+    if placement.fitness is not None and fit < options.min_fitness:
+        console.warn(
+            f"{scan.name}: {fit:.0%} of the points fit what the photographs show, expected "
+            f"{options.min_fitness:.0%}: is it in another unit, or the matrix of another frame?"
+        )
     _check_reach(scan, placement, plan)
     return PlacedScan(scan, placement)
 
