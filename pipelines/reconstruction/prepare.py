@@ -345,7 +345,7 @@ def placed_scan(plan: Plan, console: Console) -> PlacedScan | None:
     if placement.fitness is not None and fit < options.min_fitness:
         console.warn(
             f"{scan.name}: {fit:.0%} of the points fit what the photographs show, expected "
-            f"{options.min_fitness:.0%}: is it in another unit, or the matrix of another frame?"
+            f"{options.min_fitness:.0%} of the same places: is the matrix of another unit or frame?"
         )
     _check_reach(scan, placement, plan)
     return PlacedScan(scan, placement)

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 from memory_scenes import camera, points
@@ -163,6 +165,19 @@ def test_a_scan_that_fits_as_it_is_stays_where_it_is():
     found = register(Surface(one), Surface(two, two * 0 + FAR + SEEN_FROM), least=0.5, metric=True)
     assert found.how == "as it is"
     np.testing.assert_array_equal(found.world_from_scan, np.eye(4))
+
+
+@pytest.mark.parametrize(("moved", "fits"), [(0.0, True), (0.3, False), (1e6, False)])
+def test_a_given_placement_is_judged_and_kept(moved, fits):
+    one, two = surface(20_000, seed=1)[0], surface(20_000, seed=2)[0]
+    matrix = np.eye(4)
+    matrix[:3, 3] = moved
+    found = register(
+        Surface(one), seen(two), least=0.5, metric=True, given=Placement(matrix, "given")
+    )
+    assert found.how == "given" and np.array_equal(found.world_from_scan, matrix)
+    assert (found.fitness > 0.5) if fits else (found.fitness < 0.1)
+    json.dumps(found.to_json(), allow_nan=False)
 
 
 @pytest.mark.slow

@@ -66,6 +66,13 @@ def test_a_run_begins_with_the_scan_and_counts_it_apart(runs):
     assert figures["depth_rel_valid"] < 0.01
 
 
+def test_a_given_placement_that_the_photographs_contradict_is_said(runs, tmp_path, capsys):
+    options = ["--context", "first:1", "--targets", "range:4-5", "--refine", "0", "--rounds", "0"]
+    words = ["--cloud", str(runs / "scan.laz"), "--cloud-placement", "identity"]
+    main(["reconstruct", str(runs / "project"), *options, *words, "--out", str(tmp_path / "run")])
+    assert "of the same places: is the matrix of another unit" in capsys.readouterr().err
+
+
 def test_pages_and_pictures_name_what_is_scanned(runs):
     page = (runs / "with" / "report.html").read_text()
     assert "of them scanned" in page and "scan.laz" in page
