@@ -97,6 +97,7 @@ class Recording:
     options: RgbdOptions  # ``color_K`` and ``depth_unit`` are known
     frames: Sequence[PosedFrame] = ()
     unposed: str = NO_POSE  # why frames without a pose are left out
+    given: frozenset[str] = frozenset()  # the intrinsics that are the user's word
     findings: Sequence[Finding] = ()
 
 
@@ -104,6 +105,10 @@ def _under(options: RgbdOptions, **values: object) -> RgbdOptions:
     """The options with what a layout says, where they say nothing."""
     absent = {name: value for name, value in values.items() if getattr(options, name) is None}
     return options.replaced(**absent)
+
+
+def _given(options: RgbdOptions) -> frozenset[str]:
+    return frozenset(name for name in ("color_K", "depth_K") if getattr(options, name) is not None)
 
 
 class RgbdFolder(ABC):
@@ -184,7 +189,8 @@ class RgbdFolder(ABC):
 
     def record(self, root: Path, options: RgbdOptions, *, strict: bool = True) -> Recording:
         """The frames, poses and calibration of a folder."""
-        return self.posed(self.calibration(root, options), strict=strict)
+        calibrated = replace(self.calibration(root, options), given=_given(options))
+        return self.posed(calibrated, strict=strict)
 
     def read(self, root: Path, *, options: RgbdOptions | None = None) -> Scene:
         """A folder with poses as a scene, metric, in the poses' own world frame."""
@@ -505,7 +511,7 @@ def read_unposed(root: Path, options: RgbdOptions) -> Recording | None:
     if len(frames) < len(found):
         message = f"{len(found) - len(frames)} of {len(found)} pictures have no depth map: left out"
         findings.append(Finding("warning", message))
-    return replace(recording, frames=frames, findings=findings)
+    return replace(recording, frames=frames, given=_given(options), findings=findings)
 
 
 def resolve_options(root: Path, options: RgbdOptions | None) -> tuple[RgbdOptions, list[Finding]]:
@@ -525,11 +531,14 @@ def rgbd_scene(recording: Recording, *, kind: str = "rgbd", strict: bool = True)
     root, frames, options = recording.root, recording.frames, recording.options
     size = first_size(frame.image for frame in frames)
     K = corner_origin(np.array(options.color_K), what=f"{root}, colour intrinsics")
-    K, lines = _of_size(K, size, what="the colour camera")
+    K, lines = _of_size(K, size, what="the colour camera", given="color_K" in recording.given)
     registration = _registration(root, options)
     if registration is not None:
         of_depth = first_size(frame.depth for frame in frames if frame.depth is not None)
-        depth_K, others = _of_size(registration.depth_K, of_depth, what="the depth camera")
+        given = "depth_K" in recording.given
+        depth_K, others = _of_size(
+            registration.depth_K, of_depth, what="the depth camera", given=given
+        )
         registration, lines = replace(registration, depth_K=depth_K), [*lines, *others]
     if size is None and frames and strict:
         what = "unreadable" if frames[0].image.exists() else "no such picture"
@@ -565,16 +574,19 @@ def rgbd_scene(recording: Recording, *, kind: str = "rgbd", strict: bool = True)
 
 
 def _of_size(
-    K: Float64, size: tuple[int, int] | None, *, what: str
+    K: Float64, size: tuple[int, int] | None, *, what: str, given: bool
 ) -> tuple[Float64, list[Finding]]:
-    """(3, 3) scaled to pictures of a size, where their principal point is the middle of others."""
+    """(3, 3) scaled to a picture's size unless ``given``, told where they are of another size."""
     times = 1.0 if size is None else times_as_large(K[:2, 2], size)
     if size is None or times == 1:
         return K, []
     line = (
         f"{what}'s principal point ({K[0, 2]:g}, {K[1, 2]:g}) is the middle of pictures "
-        f"{times:.4g} times as large as its own ({size[0]}x{size[1]}): intrinsics scaled"
+        f"{times:.4g} times as large as its own ({size[0]}x{size[1]}): intrinsics "
     )
+    if given:
+        return K, [Finding("warning", f"{line}used as given; give those of its own size")]
+    line += "scaled"
     return np.diag([1 / times, 1 / times, 1]) @ K, [Finding("warning", line)]
 
 

@@ -57,6 +57,7 @@ def test_depth_unit_and_intrinsics_change_what_is_read(tmp_path):
     # Published with the first pixel's centre at (0, 0), here at (0.5, 0.5).
     expected = np.array([[100, 0, 40.5], [0, 101, 30.5], [0, 0, 1]])
     np.testing.assert_allclose(other.views[0].camera.K[0], expected)
+    assert any("used as given" in finding.message for finding in other.findings)
     near = parsed("--depth-max", 1.0).open_scene(tmp_path)
     assert not depth_of(near).any()
 
