@@ -475,9 +475,9 @@ def read_log(path: Path) -> tuple[list[int], list[Float64]]:
         return [int(word) for word in words[::19]], list(blocks[:, 3:].reshape(-1, 4, 4))
 
 
-SCANNET_FOLDER = _ScanNet()
+SEVENSCENES_FOLDER, SCANNET_FOLDER = _SevenScenes(), _ScanNet()
 # ScanNet before Redwood: both have colour and depth folders.
-_FOLDERS = (_SevenScenes(), _Tum(), SCANNET_FOLDER, _Redwood())
+_FOLDERS = (SEVENSCENES_FOLDER, _Tum(), SCANNET_FOLDER, _Redwood())
 SEVENSCENES, TUM, SCANNET, REDWOOD = LAYOUTS = tuple(
     Layout.of_folder(folder.name, folder.holds[0], matches=folder.matches, read=folder.read)
     for folder in _FOLDERS

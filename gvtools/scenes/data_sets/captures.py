@@ -9,7 +9,7 @@ import io
 import struct
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import BinaryIO
@@ -33,7 +33,14 @@ from gvtools.scenes.images import decode_picture, read_depth, readings
 from gvtools.scenes.layout import Layout
 from gvtools.scenes.matching import natural, pictures_by_stem, pose_at, scenes_holding
 from gvtools.scenes.photographs import Depth, PosedFrame, Registration, first_size, posed_scene
-from gvtools.scenes.rgbd import SCANNET, SCANNET_FOLDER, SEVENSCENES, RgbdOptions, rgbd_scene
+from gvtools.scenes.rgbd import (
+    SCANNET,
+    SCANNET_FOLDER,
+    SEVENSCENES,
+    SEVENSCENES_FOLDER,
+    RgbdOptions,
+    rgbd_scene,
+)
 from gvtools.scenes.scene import Finding, Frame, Scene
 from gvtools.scenes.undistort import LensParameters
 from gvtools.untrusted import read_text, reading, regular
@@ -46,8 +53,10 @@ KINECT = [[585.0, 0.0, 320.0], [0.0, 585.0, 240.0], [0.0, 0.0, 1.0]]
 
 def _read_sevenscenes(root: Path, scene: str) -> Scene:
     folder = root / scene
-    has_file = any((place / INTRINSICS).is_file() for place in (folder, folder.parent))
-    return SEVENSCENES.read(folder, options=None if has_file else RgbdOptions(color_K=KINECT))
+    if any((place / INTRINSICS).is_file() for place in (folder, folder.parent)):
+        return SEVENSCENES.read(folder)
+    recording = SEVENSCENES_FOLDER.record(folder, RgbdOptions(color_K=KINECT))
+    return rgbd_scene(replace(recording, given=frozenset()))  # scaled where pictures are
 
 
 # --- ScanNet v2 -------------------------------------------------------------------------------
