@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from gvtools.cameras import rigid_poses
 from gvtools.errors import ProjectError
 from gvtools.scenes.scene import Finding
 from gvtools.scenes.undistort import LensParameters, camera_of
-from gvtools.untrusted import load_array, read_json, read_text, reading
+from gvtools.untrusted import load_array, parse_yaml, read_json, read_text, reading
 
 Float64 = NDArray[np.float64]
 
@@ -147,7 +148,7 @@ def exported_intrinsics(root: Path, camera: str) -> list[tuple[Float64, str]]:
     beside = intrinsics_beside(root) if camera == "color" else None
     found += [beside] if beside else []
     # The scan's own are of pictures as they were recorded, before any export.
-    for path in (root / "_info.txt", root / f"{root.resolve().name}.txt"):
+    for path in (root / "_info.txt", root / "info.txt", root / f"{root.resolve().name}.txt"):
         if path.is_file() and not found:
             with reading(path):
                 lines = (line.partition("=") for line in read_text(path).splitlines())
@@ -203,6 +204,21 @@ def sensor_default(size: tuple[int, int] | None = None) -> tuple[Float64, Findin
         f"recording: 21.7 instead of 26.1 dB); write {INTRINSICS}, or give --color-intrinsics"
     )
     return pinhole(taken), Finding("warning", line)
+
+
+def opencv_lens(path: Path) -> LensParameters:
+    """A camera of a calibration in OpenCV's YAML, as ROS and RTAB-Map write it."""
+    with reading(path, "expected image_width, image_height and camera_matrix"):
+        told = parse_yaml(re.sub(r"^%YAML.*|!!opencv-matrix", "", read_text(path)))
+        size = int(told["image_width"]), int(told["image_height"])
+        numbers = np.array(told["camera_matrix"]["data"], np.float64)
+        if numbers.size != 9:  # as RTAB-Map wrote it until 2024
+            numbers = np.reshape(told["projection_matrix"]["data"], (3, 4))[:, :3]
+        bent = [float(value) for value in told.get("distortion_coefficients", {}).get("data", [])]
+    lens = pinhole_lens(corner_origin(numbers.reshape(3, 3), what=str(path)), size)
+    if not any(bent):
+        return lens
+    return LensParameters("FULL_OPENCV", (*lens.values, *bent, *[0.0] * (8 - len(bent))), size)
 
 
 def corner_origin(K: ArrayLike, *, what: str) -> Float64:

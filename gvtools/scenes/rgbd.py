@@ -37,12 +37,13 @@ from gvtools.scenes.calibration import (
     exported_intrinsics,
     finite_array,
     load_matrix,
+    opencv_lens,
     pinhole,
     pinhole_lens,
     sensor_default,
     times_as_large,
 )
-from gvtools.scenes.images import DEPTH_SUFFIXES, holds_fractions, read_depth
+from gvtools.scenes.images import DEPTH_SUFFIXES, IMAGE_SUFFIXES, holds_fractions, read_depth
 from gvtools.scenes.layout import Layout
 from gvtools.scenes.matching import (
     associate,
@@ -58,7 +59,7 @@ from gvtools.scenes.scene import Finding, Scene
 from gvtools.scenes.undistort import LensParameters
 from gvtools.settings import Settings, changes, with_file
 from gvtools.trajectory_files import in_seconds, read_poses
-from gvtools.untrusted import read_text, reading
+from gvtools.untrusted import read_json, read_text, reading
 
 SIDECAR = "rgbd.json"
 Matrix = Annotated[list[list[float]], BeforeValidator(lambda value: np.asarray(value).tolist())]
@@ -381,7 +382,7 @@ class _ScanNet(RgbdFolder):
         # Exporters put the cameras in several places; Redwood's have a trajectory instead of poses.
         folders = [self._folder(root, "color"), self._folder(root, "depth")]
         if posed and not any(root.glob("*.log")):
-            return bool(self._poses(root)) and all(folder.is_dir() for folder in folders)
+            return bool(self._files(root, "pose")) and all(folder.is_dir() for folder in folders)
         folders += [root / "intrinsic", *([self._folder(root, "pose")] if posed else [])]
         return all(folder.is_dir() for folder in folders)
 
@@ -393,13 +394,16 @@ class _ScanNet(RgbdFolder):
         }
         return next((root / n for n in kinds[kind] if (root / n).is_dir()), root / kind)
 
-    def _poses(self, root: Path) -> list[Path]:
-        return pictures_in(self._folder(root, "pose"), (".txt", ".npy"))
+    def _files(self, root: Path, kind: str) -> list[Path]:
+        suffixes = {"depth": DEPTH_SUFFIXES, "pose": (".txt", ".npy")}
+        return pictures_in(self._folder(root, kind), suffixes.get(kind, IMAGE_SUFFIXES))
 
     def frames(self, root: Path, options: RgbdOptions) -> list[PosedFrame]:
-        colors = pictures_in(self._folder(root, "color"))
-        depths = pictures_in(self._folder(root, "depth"), DEPTH_SUFFIXES)
-        depth_of, pose_of = pair_by_name(colors, depths), pair_by_name(colors, self._poses(root))
+        colors, depths = self._files(root, "color"), self._files(root, "depth")
+        depth_of, pose_of = (
+            pair_by_name(colors, depths),
+            pair_by_name(colors, self._files(root, "pose")),
+        )
         return [
             self._frame(root, color, depth=depth_of.get(color), pose=pose_of.get(color))
             for color in colors
@@ -408,7 +412,8 @@ class _ScanNet(RgbdFolder):
     def frames_of_poses(self, root: Path) -> list[PosedFrame]:
         colors = self._folder(root, "color")
         return [
-            self._frame(root, colors / f"{path.stem}.jpg", pose=path) for path in self._poses(root)
+            self._frame(root, colors / f"{path.stem}.jpg", pose=path)
+            for path in self._files(root, "pose")
         ]
 
     def _frame(
@@ -443,8 +448,7 @@ class _Redwood(_ScanNet):
             others = named([path.name for path in logs[1:]])
             findings.append(Finding("warning", f"poses are read from {logs[0].name}, not {others}"))
         frames = self.frames(root, recording.options)
-        depths = pictures_in(self._folder(root, "depth"), DEPTH_SUFFIXES)
-        unpaired = len(depths) - sum(item.depth is not None for item in frames)
+        unpaired = len(self._files(root, "depth")) - sum(item.depth is not None for item in frames)
         if unpaired:
             findings.append(Finding("warning", f"{unpaired} depth maps belong to no picture"))
         if logs[0].suffix == ".log":
@@ -465,6 +469,82 @@ class _Redwood(_ScanNet):
         return replace(recording, frames=frames, findings=findings)
 
 
+class _Replica(_Redwood):
+    """Replica as NICE-SLAM publishes it: pictures and depth maps share a folder."""
+
+    name = "Replica"
+    holds = "results/frame*, results/depth*, traj.txt", "results/frame*, results/depth*"
+
+    def matches(self, root: Path, *, posed: bool = True) -> bool:
+        pictures = any(root.glob("results/frame*")) and any(root.glob("results/depth*"))
+        return pictures and (not posed or bool(self._trajectories(root)))
+
+    def _files(self, root: Path, kind: str) -> list[Path]:
+        suffixes, start = (
+            (DEPTH_SUFFIXES, "depth") if kind == "depth" else (IMAGE_SUFFIXES, "frame")
+        )
+        found = pictures_in(root / "results", suffixes)
+        return [path for path in found if path.name.startswith(start)]
+
+    def calibration(self, root: Path, options: RgbdOptions) -> Recording:
+        places = (root / "cam_params.json", root.resolve().parent / "cam_params.json")
+        path = next(filter(Path.is_file, places), None)
+        if path is None:
+            return super().calibration(root, options)
+        with reading(path, "expected fx, fy, cx, cy and scale of 'camera'"):
+            told = read_json(path)["camera"]
+            K = pinhole([float(told[name]) for name in ("fx", "fy", "cx", "cy")])
+            unit = 1 / float(told["scale"])
+        recording = super().calibration(root, _under(options, color_K=K, depth_unit=unit))
+        line = Finding("info", f"intrinsics and depth unit: {path.name}")
+        return replace(recording, findings=[line, *recording.findings])
+
+
+class _RtabMap(_ScanNet):
+    """What ``rtabmap-export --images_id --poses_camera --poses_format 11`` writes.
+
+    NAME_rgb/ID.jpg, NAME_depth/ID.png, NAME_calib/ID.yaml and poses with the ID at the line's end.
+    """
+
+    name = "RTAB-Map"
+    holds = "*_rgb, *_depth, *_calib, *_poses.txt", "*_rgb, *_depth, *_calib"
+
+    def matches(self, root: Path, *, posed: bool = True) -> bool:
+        folders = all(self._folder(root, kind).is_dir() for kind in ("rgb", "depth", "calib"))
+        return folders and (not posed or any(root.glob("*_poses.txt")))
+
+    def _folder(self, root: Path, kind: str) -> Path:
+        kind = "rgb" if kind == "color" else kind
+        return min(root.glob(f"*_{kind}"), default=root / kind)
+
+    def _frame(
+        self, root: Path, color: Path, *, depth: Path | None = None, pose: Path | None = None
+    ) -> PosedFrame:
+        path = self._folder(root, "calib") / f"{color.stem}.yaml"
+        lens = opencv_lens(path) if path.is_file() else None
+        return PosedFrame(color.name, color, lens, None, depth, where=str(path))
+
+    def calibration(self, root: Path, options: RgbdOptions) -> Recording:
+        lens = next((f.lens for f in self.frames(root, options) if f.lens is not None), None)
+        K = pinhole(lens.values[:4]) if isinstance(lens, LensParameters) else None
+        if K is not None:
+            K[:2, 2] -= 0.5
+        recording = super().calibration(root, _under(options, color_K=K))
+        return replace(recording, findings=[Finding("info", "intrinsics: each picture's own")])
+
+    def posed(self, recording: Recording, *, strict: bool) -> Recording:
+        path = min(recording.root.glob("*_poses.txt"))
+        with reading(path, "expected 'timestamp x y z qx qy qz qw id' in each line"):
+            poses, ids = read_poses(path).poses, np.loadtxt(path, ndmin=2)[:, 8].astype(int)
+        by_id = {str(number): pose for number, pose in zip(ids, poses, strict=True)}
+        frames = self.frames(recording.root, recording.options)
+        frames = [
+            replace(frame, pose=by_id.get(frame.image.stem), where=f"{path}, id {frame.image.stem}")
+            for frame in frames
+        ]
+        return replace(recording, frames=frames)
+
+
 def read_log(path: Path) -> tuple[list[int], list[Float64]]:
     """The first integers and (4, 4) matrices of a ``.log`` trajectory's blocks, as read."""
     with reading(path, "expected blocks of three integers and four lines of four numbers"):
@@ -477,8 +557,8 @@ def read_log(path: Path) -> tuple[list[int], list[Float64]]:
 
 SEVENSCENES_FOLDER, SCANNET_FOLDER = _SevenScenes(), _ScanNet()
 # ScanNet before Redwood: both have colour and depth folders.
-_FOLDERS = (SEVENSCENES_FOLDER, _Tum(), SCANNET_FOLDER, _Redwood())
-SEVENSCENES, TUM, SCANNET, REDWOOD = LAYOUTS = tuple(
+_FOLDERS = (SEVENSCENES_FOLDER, _Tum(), SCANNET_FOLDER, _Redwood(), _Replica(), _RtabMap())
+SEVENSCENES, TUM, SCANNET, REDWOOD, REPLICA, RTABMAP = LAYOUTS = tuple(
     Layout.of_folder(folder.name, folder.holds[0], matches=folder.matches, read=folder.read)
     for folder in _FOLDERS
 )
@@ -549,7 +629,7 @@ def rgbd_scene(recording: Recording, *, kind: str = "rgbd", strict: bool = True)
     scene = posed_scene(
         root,
         [
-            replace(frame, lens=lens, read_depth=reader, registration=registration)
+            replace(frame, lens=frame.lens or lens, read_depth=reader, registration=registration)
             for frame in frames
         ],
         poses="world_from_cam",

@@ -9,6 +9,7 @@ import pytest
 from PIL import Image
 from rgbd_folders import redwood, scannet, tum
 from scenes_workspace import HEIGHT, WIDTH, pose_matrix, ramp, save, sevenscenes
+from scipy.spatial.transform import Rotation
 
 from gvtools.errors import GvError, OptionError, ProjectError, ShapeError
 from gvtools.scenes.images import read_depth
@@ -443,6 +444,63 @@ def test_intrinsics_of_turned_pictures_are_told(tmp_path):
     np.savetxt(root / "camera-intrinsics.txt", [[91, 0, 35.5], [0, 92, 47.5], [0, 0, 1]])
     (root / "camera.json").unlink()
     assert "are the intrinsics of turned pictures?" in messages(REDWOOD.read(root))
+
+
+def replica(root):
+    """As NICE-SLAM publishes it, its cameras in the folder above."""
+    for i in range(3):
+        save(root / f"results/frame{i:06d}.jpg", ramp())
+        save(root / f"results/depth{i:06d}.png", np.full((HEIGHT, WIDTH), 13107, np.uint16))
+    np.savetxt(root / "traj.txt", [pose_matrix(i / 10).ravel() for i in range(3)])
+    camera = {"w": WIDTH, "h": HEIGHT, "fx": 91, "fy": 92, "cx": 47.5, "cy": 35.5, "scale": 6553.5}
+    (root.parent / "cam_params.json").write_text(json.dumps({"camera": camera}))
+
+
+def rtabmap(root):
+    """Pictures by ID, of which the second has no pose, and the fourth pose no picture."""
+    rows = ["#timestamp x y z qx qy qz qw id"]
+    for i in range(4):
+        x, y, z = pose_matrix(i / 10)[:3, 3]
+        turn = Rotation.from_matrix(pose_matrix(i / 10)[:3, :3]).as_quat()
+        rows += [" ".join(map(str, [100 + i, x, y, z, *turn, i + 8]))] if i != 1 else []
+        if i < 3:
+            save(root / f"flat_rgb/{i + 8}.jpg", ramp())
+            save(root / f"flat_depth/{i + 8}.png", np.full((HEIGHT, WIDTH), 2000, np.uint16))
+            (root / "flat_calib").mkdir(exist_ok=True)
+            (root / f"flat_calib/{i + 8}.yaml").write_text(
+                f"%YAML:1.0\n---\nimage_width: {WIDTH}\nimage_height: {HEIGHT}\ncamera_matrix:\n"
+                f"   data: [ {91 + i}, 0., 47.5, 0., 92, 35.5, 0., 0., 1. ]\n"
+                "distortion_coefficients:\n   data: [ 0., 0., 0., 0., 0. ]\n"
+            )
+    (root / "flat_camera_poses.txt").write_text("\n".join(rows))
+
+
+def bundlefusion(root):
+    """As 7-Scenes, with the sensor's own head."""
+    sevenscenes(root)
+    (root / "camera-intrinsics.txt").unlink()
+    K = np.array([[91, 0, 47.5, 0], [0, 92, 35.5, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    numbers = " ".join(map(str, K.ravel()))
+    (root / "info.txt").write_text(f"m_calibrationColorIntrinsic = {numbers}\n")
+
+
+@pytest.mark.parametrize("write", [replica, rtabmap, bundlefusion])
+def test_layouts_of_other_scanners(tmp_path, write):
+    root = tmp_path / "scan"
+    root.mkdir()
+    write(root)
+    scene = open_project(root)
+    assert "the PrimeSense driver's default" not in messages(scene)
+    np.testing.assert_allclose(scene.cameras.K[0], [[91, 0, 48], [0, 92, 36], [0, 0, 1]])
+    frame = scene.views[-1].load()
+    np.testing.assert_allclose(np.median(frame.depth), 2, rtol=1e-4)
+    if write is rtabmap:
+        assert scene.names == ("8.jpg", "10.jpg")
+        assert scene.cameras.K[1, 0, 0] == 93
+    if write is not bundlefusion:
+        np.testing.assert_allclose(
+            np.linalg.inv(scene.cameras.cam_from_world[-1]), pose_matrix(0.2), atol=1e-6
+        )
 
 
 def test_redwood_trajectory_that_does_not_fit(tmp_path):
