@@ -13,6 +13,9 @@ gsplat: ``RESULT/renders/val_stepSTEP_NNNN.png`` of its example trainers, truth 
 side, colours cut to 8 bits. NNNN counts the validation views in alphabetical order of their names
 (examples/simple_trainer.py, Runner.eval). Of several steps the last one is taken.
 
+3DGS and its descendants: ``RESULT/SPLIT/ours_STEP/renders/NNNNN.png`` and ``gt`` beside. NNNNN
+counts the split's views in alphabetical order of their names (render.py, scene/dataset_readers.py).
+
 NerfBaselines: a folder or ``predictions-STEP.tar.gz`` with ``info.json``, ``color/NAME.png`` and
 ``gt-color/NAME.png``, NAME being the photograph's path below the data set's image folder
 (nerfbaselines/io.py, _save_predictions_iterate). Transparent pixels lie before black, as in its own
@@ -378,6 +381,23 @@ def gsplat_renders(path: Path) -> PictureSet | None:
     return PictureSet(path, "gsplat", pictures, alphabetical=True, notes=tuple(notes))
 
 
+def splatting_renders(path: Path) -> PictureSet | None:
+    """The pictures of 3DGS's ``render.py`` in a run's folder, or in one below; None without any."""
+    if path.name == "renders":
+        path = path.parent
+    found = [path] if (path / "renders").is_dir() and (path / "gt").is_dir() else []
+    for split in ("", *SPLITS):
+        if not found:
+            found = [step for step in (path / split).glob("ours_*") if (step / "gt").is_dir()]
+    if not found:
+        return None
+    last = max(found, key=lambda folder: natural_key(folder.name))
+    notes = [f"{last.relative_to(path)} taken"] if last != path else []
+    files = in_natural_order(image_files(last / "renders"), last)
+    pictures = tuple(_beside_truth(file, last / "renders", last / "gt") for file in files)
+    return PictureSet(path, "3DGS", pictures, alphabetical=True, notes=tuple(notes))
+
+
 def nerfbaselines_predictions(path: Path) -> PictureSet | None:
     """The pictures of a folder or archive of predictions, or a training's last archive; or None."""
     if path.name.endswith(".tar.gz"):
@@ -406,11 +426,17 @@ def _archive(file: Path, path: Path, *, others: int = 0) -> PictureSet:
 
 
 # Recognised in this order, by what no other layout has.
-READERS = (nerfbaselines_predictions, gsplat_renders, nerfstudio_dataset, nerfstudio_evaluation)
+READERS = (
+    nerfbaselines_predictions,
+    splatting_renders,
+    gsplat_renders,
+    nerfstudio_dataset,
+    nerfstudio_evaluation,
+)
 
 
 def open_pictures(path: Path) -> PictureSet:
-    """The pictures at ``path``, in the layout of nerfstudio, gsplat, NerfBaselines, or a plain one.
+    """The pictures at ``path``, in the layout of a known tool or a plain one.
 
     A plain folder holds the pictures, perhaps in folders of its own. Beside ``NAME.rgb.png`` a
     ``NAME.depth.npz`` (z-depth, scene units, key ``depth``) is read, as ``gvtools render`` writes

@@ -162,6 +162,19 @@ def test_nerfbaselines(tmp_path, form):
     assert found.notes == (taken if form == "training" else ())
 
 
+@pytest.mark.parametrize("place", ["", "test", "test/ours_30000", "test/ours_30000/renders"])
+def test_renders_of_3dgs_and_its_descendants(tmp_path, place):
+    for step in (7000, 30000):
+        for number in range(11):
+            for kind, value in (("renders", step // 1000), ("gt", 200)):
+                file = tmp_path / f"test/ours_{step}/{kind}/{number:05d}.png"
+                save(file, np.full((4, 6, 3), value + number, np.uint8))
+    found = open_pictures(tmp_path / place)
+    assert (found.layout, found.alphabetical, len(found.pictures)) == ("3DGS", True, 11)
+    assert found.pictures[10].load().rgb[0, 0, 0] == 40
+    assert truth_of(found.pictures[10])[0, 0, 0] == 210
+
+
 def test_what_holds_no_pictures_is_refused(tmp_path, monkeypatch):
     with pytest.raises(ProjectError, match="no such folder"):
         open_pictures(tmp_path / "absent")
