@@ -40,6 +40,7 @@ _PART = re.compile(r"(?:\w+_)?(n|nano)?sec(?:s|onds)?")
 _TIME = re.compile(r"(?:\w+_)?(?:time|(?:time_?)?stamps?|n?secs?|seconds|t)(?:_(ns|us|ms|s))?")
 _TURN = re.compile(r"(?:q|quat\w*?|rot\w*?|ori\w*?)(?:[._]\w+)??[._]?([xyzw])(?:_world\w*)?")
 _PLACE = re.compile(r"(?:t|p|pos\w*?|trans\w*?)?(?:[._]\w+)??[._]?([xyz])(?:_world\w*)?")
+_METRES = {"mm": 1e-3, "cm": 1e-2}
 # Of a unit of time: seconds, the size of stamps since 1970, and the least median step from one pose
 # to the next by which stamps of another beginning are known.
 _UNITS = {"ns": (1e-9, 1e18, 1e6), "us": (1e-6, 1e15, 1e3), "ms": (1e-3, 1e12, np.inf)}
@@ -110,6 +111,7 @@ def read_poses(path: str | Path, *, layout: str = "auto", lost: bool = False) ->
     if form.columns is None and len(rows[0][1]) % 4 == 0:
         return Trajectory(poses)
     unit = form.unit or unit_of(stamps)
+    poses[:, :3, 3] *= form.metres
     seconds = stamps * _UNITS.get(unit, (1.0,))[0]
     if form.unit and not (np.abs(seconds).max() < 1e11 and 1e-6 < (_step(seconds) or 1) < 1e6):
         raise ProjectError(
@@ -134,6 +136,7 @@ class _Form:
     unit: str = ""  # of the time stamps, as the head names it
     notes: tuple[str, ...] = ()
     guessed: bool = False  # whether the order of eight numbers is told by nothing but these
+    metres: float = 1.0  # a unit of places
 
 
 def _form(path: Path, layout: str) -> tuple[_Form, list[tuple[int, list[str]]]]:
@@ -143,14 +146,15 @@ def _form(path: Path, layout: str) -> tuple[_Form, list[tuple[int, list[str]]]]:
         raise ProjectError(f"{path}: layout {layout!r}; expected auto, tum, kitti or euroc")
     count = len(rows[0][1])
     if head is not None and layout != "kitti":
-        columns, unit = head
+        columns, unit, length = head
         order = "euroc" if columns[7] < columns[4] else "tum"
         if layout not in ("auto", order):
             raise ProjectError(
                 f"{path}: layout {layout!r}, and its head names the columns as {order} has them "
                 f"({_NAMES[order]}); leave --layout out, or mend the head"
             )
-        return _Form(columns, True, unit), rows
+        notes = (f"places in {length}, as its head says: read as m",) if length in _METRES else ()
+        return _Form(columns, True, unit, notes, metres=_METRES.get(length, 1.0)), rows
     matrix = count in MATRICES[:2] and not commas
     if count in MATRICES[2:]:
         matrix = all(map(_ZERO.fullmatch, rows[0][1][-4:-1]))
@@ -301,7 +305,7 @@ def reordered(rotations: Float64, places: int) -> Float64:
 
 def _rows(
     path: Path,
-) -> tuple[tuple[tuple[int, ...], str] | None, list[tuple[int, list[str]]], bool]:
+) -> tuple[tuple[tuple[int, ...], str, str] | None, list[tuple[int, list[str]]], bool]:
     """Columns and unit that a head names, line numbers and words, whether commas part them."""
     if path.suffix == ".npy":
         with reading(path, "expected an array of N poses, 4x4 or 3x4 each; save it again"):
@@ -344,12 +348,12 @@ def _joined(rows: list[tuple[int, list[str]]]) -> list[tuple[int, list[str]]]:
     return rows
 
 
-def _head(line: str) -> tuple[tuple[int, ...], str] | None:
-    """Columns as ``_Form`` has them, and the time's unit."""
+def _head(line: str) -> tuple[tuple[int, ...], str, str] | None:
+    """Columns as ``_Form`` has them, and the units of time and place."""
     line = _UNIT.sub(r"[\1]", line.strip().lstrip("#%").strip().lower())
     found: dict[str, int] = {}
     parts: dict[bool, int] = {}
-    unit = ""
+    unit = length = ""
     for column, word in enumerate(re.split(r"\s*[,;]\s*|\s+", line)):
         name, _, given = word.rstrip("]").partition("[")
         name = "_".join(name.split(".")[-2:])
@@ -362,12 +366,14 @@ def _head(line: str) -> tuple[tuple[int, ...], str] | None:
             given = match[1] or given
             unit = {"n": "ns", "u": "us", "µ": "us", "m": "ms", "s": "s"}.get(given[:1], "")
         elif (match := _PLACE.fullmatch(name)) and match[1] not in found:
-            found[match[1]] = column
+            found[match[1]], length = column, given
     keys = ["time", "x", "y", "z", "qx", "qy", "qz", "qw"]
     if len(parts) == 2:  # of a time's seconds and the nanoseconds that belong to them
         found["time"], found["fraction"], unit = parts[False], parts[True], "s"
         keys.append("fraction")
-    return (tuple(found[key] for key in keys), unit) if set(keys) <= set(found) else None
+    if set(keys) <= set(found):
+        return tuple(found[key] for key in keys), unit, length
+    return None
 
 
 def _read(

@@ -7,7 +7,7 @@ from trajectory_writers import write_kitti, write_tum
 
 from gvtools.cameras import Cameras, invert_rigid
 from gvtools.errors import ProjectError
-from gvtools.trajectory_files import read_trajectory
+from gvtools.trajectory_files import read_poses, read_trajectory
 
 
 def _cameras(count: int = 6, names: tuple[str, ...] = ()) -> Cameras:
@@ -65,6 +65,16 @@ def test_comments_and_blank_lines_are_passed_over(tmp_path):
     read = read_trajectory(path, _cameras(1))
     np.testing.assert_allclose(read.centers, [[1, 2, 3]])
     assert read.names == ("1.0",)
+
+
+@pytest.mark.parametrize(("unit", "metres"), [("mm", 0.001), ("cm", 0.01), ("m", 1.0)])
+def test_places_in_the_unit_that_the_head_names(tmp_path, unit, metres):
+    file = tmp_path / "path.csv"
+    head = f"time [s], x [{unit}], y [{unit}], z [{unit}], qx, qy, qz, qw\n"
+    file.write_text(head + "0, 100, 200, 300, 0, 0, 0, 1\n1, 100, 200, 400, 0, 0, 0, 1\n")
+    track = read_poses(file)
+    np.testing.assert_allclose(track.poses[1, :3, 3], metres * np.array([100, 200, 400]))
+    assert any("read as m" in note for note in track.notes) == (unit != "m")
 
 
 def test_repeated_timestamps_get_names_of_their_own(tmp_path):
