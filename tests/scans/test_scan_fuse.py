@@ -9,7 +9,6 @@ from scan_files import FAR, surface
 from scipy.spatial.transform import Rotation
 
 from gvtools.errors import DegenerateError, OptionError
-from gvtools.memory.ply import export_memory_ply
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.scans import registration
 from gvtools.scans.fuse import fuse_scan, point_spacing
@@ -65,13 +64,6 @@ def test_photographs_win_where_they_saw_the_surface_and_scans_fill_the_rest():
     np.testing.assert_allclose(shown.depth[0][valid], 2, atol=1e-3)
 
 
-def test_scanned_and_photographed_points_never_merge():
-    memory, alone = fused(), fused(photographed=False)
-    assert int(memory.scanned.sum()) == len(alone) and int((~memory.scanned).sum()) > 0
-    np.testing.assert_array_equal(memory.columns.colors[memory.scanned], alone.columns.colors)
-    assert "scanned" in repr(memory)
-
-
 def test_what_a_scanner_saw_refuses_generated_points_as_what_a_camera_saw_does():
     memory = fused(photographed=False)
     report = memory.fuse(points(wall(0.02), source=camera(name="b")), round=1, generated=True)
@@ -84,16 +76,6 @@ def test_back_ends_say_what_is_scanned(backend):
 
     shown = fused(photographed=False).project(camera(), options=SplatOptions(backend=backend))
     np.testing.assert_array_equal(shown.scanned, shown.valid)
-
-
-def test_files_keep_scanned_points_apart(tmp_path):
-    memory = fused()
-    memory.save(tmp_path / "memory.npz")
-    again = SpatialMemory.load(tmp_path / "memory.npz")
-    np.testing.assert_array_equal(again.scanned, memory.scanned)
-    export_memory_ply(memory, tmp_path / "memory.ply")
-    from_ply = SpatialMemory.from_ply(tmp_path / "memory.ply")
-    assert from_ply.scanned.any() and not from_ply.scanned.all() and not from_ply.generated.any()
 
 
 def test_a_scanned_thing_in_front_of_what_photographs_saw_is_let_through():
@@ -178,18 +160,6 @@ def test_a_given_placement_is_judged_and_kept(moved, fits):
     assert found.how == "given" and np.array_equal(found.world_from_scan, matrix)
     assert (found.fitness > 0.5) if fits else (found.fitness < 0.1)
     json.dumps(found.to_json(), allow_nan=False)
-
-
-@pytest.mark.slow
-def test_another_place_is_refused():
-    rng = np.random.default_rng(0)
-    u, v = rng.uniform(0, 6.3, (2, 20_000))
-    ball = np.stack([np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), np.cos(v)], 1)
-    ball += 0.3 * np.sin(5 * u)[:, None] * ball
-    with pytest.raises(DegenerateError, match="no placement of the scan is supported"):
-        register(Surface(ball), seen(surface(20_000)[0]), least=0.5, metric=False)
-    with pytest.raises(DegenerateError, match="20 points of the scan"):
-        register(Surface(ball[:20]), seen(surface(20_000)[0]), least=0.5, metric=False)
 
 
 def test_a_given_similarity_is_read_from_numbers_and_files(tmp_path):
