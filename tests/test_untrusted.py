@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from gvtools.errors import GvError, ProjectError, printable
-from gvtools.scenes.scene import Finding, natural_key
+from gvtools.scenes.scene import Finding
 from gvtools.untrusted import (
     is_file,
     load_array,
@@ -179,11 +179,6 @@ def test_an_error_is_one_printable_line():
     assert long.endswith("; do that")
     assert Finding("info", "a\nb").message == r"a\nb"
     assert printable("plain text") == "plain text"
-
-
-def test_names_with_thousands_of_digits_are_sorted():
-    names = ["img10", "img2", "img" + "9" * 5000, "img" + "8" * 5000]
-    assert sorted(names, key=natural_key)[:2] == ["img2", "img10"]
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le-marked"])

@@ -15,7 +15,6 @@ from phone_exports import polycam, record3d, record3d_export, scanner_app, stray
 from PIL import Image
 
 from gvtools.errors import OptionError, ProjectError
-from gvtools.scenes.calibration import sky_findings
 from gvtools.scenes.inspection import inspect
 from gvtools.scenes.project import is_project, open_project
 from gvtools.scenes.rgbd import RgbdOptions
@@ -81,26 +80,11 @@ def test_frames_whose_picture_is_absent_or_damaged_are_left_out(export, pattern,
         view.load()
 
 
-def test_an_export_may_lie_inside_of_the_folder_that_is_given(tmp_path: Path) -> None:
-    polycam(tmp_path / "a")
-    record3d(tmp_path / "b.r3d")
-    with pytest.raises(ProjectError, match=r"expected one of: .*Polycam.*mean .*a, .*b\.r3d"):
-        open_project(tmp_path)
-
-
 def test_a_transforms_json_that_a_converter_left_is_read_first(tmp_path: Path) -> None:
     polycam(tmp_path)
     (tmp_path / "transforms.json").write_text("{}")
     with pytest.raises(ProjectError, match=r"transforms\.json"):
         open_project(tmp_path)
-
-
-def test_the_sky_is_told_where_a_phone_was_turned() -> None:
-    upright = np.eye(4)
-    upright[1, 1] = upright[2, 2] = -1  # y of the world is up, y of the picture down
-    turned = np.array([[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1.0]])
-    assert sky_findings(upright[None], 1) == []
-    assert "to the right of pictures" in sky_findings(turned[None], 1)[0].message
 
 
 # --- Stray Scanner ----------------------------------------------------------------------------
@@ -237,15 +221,6 @@ def rewritten(path: Path, *, without: str = "", **metadata: Any) -> Path:
         for name, data in held.items():
             new.writestr(name, data)
     return path
-
-
-def test_record3d_archives_with_gaps(tmp_path: Path) -> None:
-    record3d(tmp_path / "scan.r3d")
-    scene = open_project(rewritten(tmp_path / "scan.r3d", without="rgbd/1.jpg"))
-    assert scene.names == ("0.jpg", "2.jpg", "3.jpg")
-    assert "1 of 4 frames have no picture: dropped (1.jpg)" in told(scene)
-    scene = open_project(rewritten(tmp_path / "scan.r3d", without="rgbd/2.depth"))
-    assert [view.has_depth for view in scene] == [True, False, True]
 
 
 def test_record3d_intrinsics_follow_pictures_of_another_size(tmp_path: Path) -> None:

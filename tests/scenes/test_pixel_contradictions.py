@@ -12,7 +12,7 @@ import pytest
 
 from gvtools.cameras import concatenate
 from gvtools.scenes.inspection import inspect
-from gvtools.scenes.pixel_contradictions import PixelCheck, probed
+from gvtools.scenes.pixel_contradictions import probed
 from gvtools.scenes.scene import Frame, Scene, SparsePoints, View
 
 
@@ -77,12 +77,6 @@ def test_two_swapped_pictures_are_named_alone(room):
         for view, picture in zip(room.views, rgb, strict=True)
     ]
     assert "2 of 8 photographs" in said(replace(room, views=tuple(views)))[0]
-
-
-def test_pictures_that_are_cleared_without_the_doubtful_ones_are_not_said(room, monkeypatch):
-    check = PixelCheck(room)
-    monkeypatch.setattr(check, "agreements", lambda without=(): {0: 0.8 if without else 0.6})
-    assert check.findings() == []
 
 
 @pytest.mark.parametrize(

@@ -4,22 +4,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from itertools import combinations
 from pathlib import Path
 
 import cv2
 import numpy as np
-import pytest
 import skimage.data
 
 from gvtools.cameras import Cameras
-from gvtools.scenes.colmap import read_colmap
 from gvtools.scenes.inspection import (
-    DISAGREEING,
     contradiction_findings,
     contradictions,
-    disagreement,
-    homography,
     inspect,
     thumbnail,
 )
@@ -112,52 +106,6 @@ def test_one_swapped_picture_is_told_without_depth_too() -> None:
     assert "04.png" in message
 
 
-def test_cameras_that_are_not_near_each_other_say_nothing() -> None:
-    scene = walk(wrong=(2, 6, 10), spread=0.5)
-    apart = replace(scene, views=scene.views[::2])
-    assert contradiction_messages(apart) == []
-    assert contradiction_messages(without_depth(apart)) == []
-
-
-def test_pictures_without_contrast_cannot_be_compared() -> None:
-    scene = walk(views=2)
-    flat = thumbnail(Frame(np.full((HEIGHT, WIDTH, 3), 128, np.uint8)))
-    other = thumbnail(scene.views[0].load())
-    assert disagreement(flat, other, homography((flat, other), scene.cameras, (0, 1))) is None
-    assert disagreement(other, other, np.eye(3)) == 0
-
-
-def test_a_search_that_ends_early_finds_the_same_contradictions() -> None:
-    scene = walk(wrong=(1, 3, 4, 8))
-    pictures = [thumbnail(view.load()) for view in scene]
-    agree = 0
-    for a, b in combinations(range(len(scene)), 2):
-        pair = pictures[a], pictures[b]
-        H = homography(pair, scene.cameras, (a, b))
-        whole = disagreement(*pair, H)
-        early = disagreement(*pair, H, enough=DISAGREEING)
-        assert whole is not None and early is not None
-        assert whole <= early
-        assert (whole > DISAGREEING) == (early > DISAGREEING)
-        agree += early <= DISAGREEING
-    assert 0 < agree < 66
-
-
-def test_masked_pixels_are_not_compared() -> None:
-    scene = walk(views=2)
-    frames = [view.load() for view in scene]
-    spoilt = frames[1].rgb.copy()
-    spoilt[:, : WIDTH // 3] = frames[1].rgb[::-1, ::-1][:, : WIDTH // 3]
-    mask = np.ones((HEIGHT, WIDTH), np.bool_)
-    mask[:, : WIDTH // 3] = False
-    first = thumbnail(frames[0])
-    H = homography((first, first), scene.cameras, (0, 1))
-    open_to_all = disagreement(first, thumbnail(Frame(spoilt)), H)
-    masked = disagreement(first, thumbnail(Frame(spoilt, mask=mask)), H)
-    assert open_to_all is not None and masked is not None
-    assert masked == 0 < open_to_all
-
-
 def points_of(scene: Scene, *, shared: bool) -> SparsePoints:
     """Points on the wall; each view's own, or all of them in all views."""
     rng = np.random.default_rng(0)
@@ -180,16 +128,3 @@ def test_near_views_that_share_no_sparse_point_are_told() -> None:
     assert contradiction_messages(replace(scene, points=points_of(scene, shared=True))) == []
     (message,) = contradiction_messages(replace(scene, points=points_of(scene, shared=False)))
     assert "0 of 40 sparse points shared" in message
-
-
-@pytest.mark.data
-def test_swapped_photographs_of_a_real_scene_are_told(shared: Path) -> None:
-    scene = read_colmap(shared / "data" / "fox_colmap")
-    views = list(scene.views)
-    a, b = 0, len(views) // 2
-    views[a], views[b] = (
-        replace(views[a], load=views[b].load),
-        replace(views[b], load=views[a].load),
-    )
-    (message,) = contradiction_messages(replace(scene, views=tuple(views)))
-    assert views[a].name in message or views[b].name in message

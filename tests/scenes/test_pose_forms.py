@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from walls import blotches, camera_at, photograph, write_project
 
-from gvtools.scenes.inspection import inspect
 from gvtools.scenes.pose_forms import pose_findings
 from gvtools.scenes.project import open_project
 
@@ -82,8 +80,3 @@ def test_focal_lengths_of_pictures_that_were_cropped(tmp_path):
     file.write_text(json.dumps(data))
     (found,) = pose_findings(open_project(file))
     assert "focal lengths 1.25 times as long fit" in found.message
-
-
-def test_a_project_beside_the_working_folder_is_read(room, monkeypatch):
-    monkeypatch.chdir(room.parent / "images")
-    assert inspect(open_project(type(room)(os.path.relpath(room))), probes=1).ok

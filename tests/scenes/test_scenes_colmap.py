@@ -94,29 +94,6 @@ def test_unused_cameras_absent_and_unregistered_images_are_reported(tmp_path):
     assert reprojection_errors(scene).max() < 1e-3
 
 
-def test_several_cameras_and_sizes(tmp_path):
-    import pycolmap
-
-    reconstruction = workspace(tmp_path, "PINHOLE", num_rigs=2)
-    second = reconstruction.cameras[max(reconstruction.cameras)]
-    second.rescale(new_width=WIDTH // 2, new_height=HEIGHT // 2)
-    small = [
-        image.name
-        for image in reconstruction.images.values()
-        if image.camera_id == second.camera_id
-    ]
-    for name in small:
-        save(tmp_path / "images" / name, ramp(WIDTH // 2, HEIGHT // 2))
-    reconstruction.write_binary(tmp_path / "sparse" / "0")
-    assert isinstance(second, pycolmap.Camera)
-    scene = read_colmap(tmp_path)
-    assert sorted(set(scene.cameras.width.tolist())) == [WIDTH // 2, WIDTH]
-    assert any("2 different sizes" in finding.message for finding in scene.findings)
-    for view in scene:
-        frame = view.load()
-        assert frame.rgb.shape == (view.camera.height[0], view.camera.width[0], 3)
-
-
 @pytest.mark.parametrize("model", ["SIMPLE_RADIAL", "OPENCV_FISHEYE", "FOV"])
 def test_mask_and_depth_go_through_the_mapping_of_the_image(tmp_path, model):
     reconstruction = workspace(tmp_path, model)
@@ -192,14 +169,6 @@ def test_pinhole_model_with_zero_coefficients_passes_untouched(tmp_path):
     np.testing.assert_array_equal(scene.views[0].load().rgb, ramp())
 
 
-def test_further_models_are_named(tmp_path):
-    reconstruction = workspace(tmp_path)
-    (tmp_path / "sparse" / "1").mkdir()
-    reconstruction.write_binary(tmp_path / "sparse" / "1")
-    messages = [finding.message for finding in read_colmap(tmp_path).findings]
-    assert "model 0 is read; further models are not: 1 (4 images)" in messages
-
-
 def test_the_largest_model_is_read_and_any_other_can_be_chosen(tmp_path):
     small = workspace(tmp_path)
     (tmp_path / "sparse/0").rename(tmp_path / "sparse/1")
@@ -214,11 +183,6 @@ def test_the_largest_model_is_read_and_any_other_can_be_chosen(tmp_path):
     assert open_as(tmp_path, {"model": 0}).names == open_project(tmp_path, model=0).names
     with pytest.raises(ProjectError, match="no COLMAP model of number 7; it holds 0, 1"):
         open_project(tmp_path, model=7)
-
-
-def test_a_text_model_beside_the_pictures_is_found(tmp_path):
-    workspace(tmp_path, text=True, place="sparse_txt")
-    assert len(open_project(tmp_path)) == 4
 
 
 def test_picture_of_another_size_is_an_error_finding_and_raises_when_loaded(tmp_path):
@@ -264,30 +228,6 @@ def test_a_text_model_that_contradicts_the_binary_one_beside_it_is_said(tmp_path
     line = "images.bin is read, and images.txt beside it differs: image 1 is pose ["
     assert any(line in message for message in said) == (scale != 1)
     assert any(f"sparse_txt, a model of {4 - scale} images" in message for message in said)
-
-
-@pytest.mark.parametrize(
-    "form",
-    [
-        lambda name: name.replace("/", "\\"),
-        lambda name: f"project/{name}",
-        lambda name: name.replace(".png", ".JPG"),
-        str.upper,
-        lambda name: name.rpartition("/")[2],
-    ],
-)
-def test_names_of_another_form_find_the_one_picture_that_fits(tmp_path, form):
-    reconstruction = workspace(tmp_path, "PINHOLE")
-    for number, image in enumerate(reconstruction.images.values()):
-        name = f"left/view{number}.png"
-        (tmp_path / "images" / image.name).rename(save(tmp_path / "images" / name, ramp()))
-        image.name = form(name)
-    reconstruction.write_binary(tmp_path / "sparse/0")
-    scene = read_colmap(tmp_path)
-    assert len(scene) == 4 and scene.views[0].load().rgb.shape == (HEIGHT, WIDTH, 3)
-    said = [found for found in scene.findings if "named otherwise" in found.message]
-    assert len(said) == 1 and said[0].message.startswith("4 pictures")
-    assert not [found for found in scene.findings if found.level == "warning"]
 
 
 @pytest.mark.parametrize("classic", [False, True])

@@ -11,14 +11,12 @@ from scenes_workspace import ramp, save
 from gvtools.errors import ProjectError
 from gvtools.scenes.images import (
     check_size,
-    fit_depth,
     orientation_of,
     read_depth,
     read_header,
     read_image,
     read_mask,
     resize_nearest,
-    same_aspect,
 )
 
 
@@ -77,13 +75,6 @@ def test_truncated_absent_and_foreign_files_are_named(tmp_path, suffix):
         read_image(path)
 
 
-def test_mask_is_black_or_not(tmp_path):
-    mask = np.array([[0, 1], [128, 255]], np.uint8)
-    np.testing.assert_array_equal(read_mask(save(tmp_path / "m.png", mask)), mask > 0)
-    wide = mask.astype(np.uint16)
-    np.testing.assert_array_equal(read_mask(save(tmp_path / "w.png", wide)), mask > 0)
-
-
 def test_black_of_a_mask_stored_with_loss_is_black(tmp_path):
     x, y = np.meshgrid(np.arange(64), np.arange(64))
     mask = np.hypot(x - 32, y - 32) < 20
@@ -120,37 +111,12 @@ def test_depth_units_and_invalid_codes(tmp_path):
     assert read_depth(tmp_path / "d.npy").dtype == np.float32
 
 
-def test_depth_that_is_none(tmp_path):
-    save(tmp_path / "rgb.png", ramp())
-    with pytest.raises(ProjectError, match="8 bits a channel"):
-        read_depth(tmp_path / "rgb.png")
-    np.save(tmp_path / "c.npy", np.zeros((4, 5, 3)))
-    with pytest.raises(ProjectError, match=r"shape \(4, 5, 3\)"):
-        read_depth(tmp_path / "c.npy")
-    np.save(tmp_path / "o.npy", np.array([{}]), allow_pickle=True)
-    with pytest.raises(ProjectError, match="unreadable"):
-        read_depth(tmp_path / "o.npy")
-    np.savez(tmp_path / "k.npz", z=np.zeros(3))
-    with pytest.raises(ProjectError, match="with the key 'depth'"):
-        read_depth(tmp_path / "k.npz")
-
-
 def test_nearest_resize_is_pillows():
     rng = np.random.default_rng(1)
     array = rng.uniform(size=(9, 12)).astype(np.float32)
     for size in ((24, 18), (4, 3), (32, 24)):
         peer = Image.fromarray(array).resize(size, Image.Resampling.NEAREST)
         np.testing.assert_array_equal(resize_nearest(array, *size), np.asarray(peer))
-
-
-def test_aspects():
-    assert same_aspect((1999, 1333), (6000, 4000))
-    assert same_aspect((256, 192), (1920, 1440))
-    assert same_aspect((1920, 1440), (256, 192))
-    assert not same_aspect((640, 480), (640, 400))
-    assert not same_aspect((480, 640), (640, 480))
-    with pytest.raises(ProjectError, match="10x20 for a picture of 30x30"):
-        fit_depth(np.zeros((20, 10), np.float32), 30, 30, path="d.png")
 
 
 @pytest.mark.parametrize("bits", [8, 10, 12, 14, 16])

@@ -13,7 +13,6 @@ from gvtools.errors import ProjectError
 from gvtools.scenes.colmap import read_colmap
 from gvtools.scenes.inspection import inspect, reprojection_errors
 from gvtools.scenes.rgbd import SEVENSCENES
-from gvtools.scenes.scene import Scene
 
 
 def test_report_of_a_model(tmp_path):
@@ -99,13 +98,6 @@ def test_pictures_of_one_colour_are_warned_of(tmp_path):
         save(path, np.zeros((72, 96, 3), np.uint8))
     found = [finding.message for finding in inspect(read_colmap(tmp_path)).findings]
     assert any(line.startswith("4 of 4 pictures show one colour alone") for line in found)
-
-
-def test_scene_without_views_is_not_ok(tmp_path):
-    report = inspect(Scene(tmp_path, "rgbd", ()))
-    assert not report.ok
-    assert [finding.message for finding in report.findings] == ["no view; expected at least one"]
-    assert report.views == 0
 
 
 def test_intrinsics_that_no_camera_has_and_poses_that_points_contradict_are_warned_of(tmp_path):

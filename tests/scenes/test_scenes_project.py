@@ -2,8 +2,6 @@
 from __future__ import annotations
 
 import shutil
-import subprocess
-import sys
 import zipfile
 from pathlib import Path
 
@@ -90,13 +88,6 @@ def test_options_of_another_kind(tmp_path):
         open_project(tmp_path / "scan", images=tmp_path)
 
 
-def test_import_is_quick():
-    heavy = "{'torch', 'open3d', 'pycolmap', 'matplotlib', 'scipy', 'skimage', 'numba'}"
-    code = f"import sys, gvtools.scenes.project; print({heavy} & set(sys.modules))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "set()"
-
-
 def test_pictures_without_cameras_are_told_from_unknown_folders(tmp_path):
     for index in range(3):
         save(tmp_path / f"{index}.jpg", ramp())
@@ -125,8 +116,3 @@ def test_alpha_of_pictures(tmp_path, alpha, masked, value):
     save(tmp_path / "images" / "a.png", picture * np.uint8([1, 1, 1, 0]))
     levels = [item.level for item in open_project(tmp_path, alpha=alpha).findings]
     assert ("warning" in levels) == masked  # all of it is transparent
-
-
-def test_alpha_of_another_name(tmp_path):
-    with pytest.raises(OptionError, match="expected one of mask, ignore, white, black"):
-        open_project(tmp_path, alpha="none")

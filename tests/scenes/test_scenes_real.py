@@ -59,31 +59,6 @@ def test_reprojection_stays_at_the_models_own_error(shared, name, published, for
     assert np.isfinite(reprojection_errors(scene)).all()
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "fern_colmap",
-        *(pytest.param(f"{n}_colmap", marks=pytest.mark.slow) for n in ("fox", "sceaux")),
-    ],
-)
-def test_workspace_written_undistorted_by_pycolmap_reads_alike(shared, name, tmp_path):
-    import pycolmap
-
-    source = shared / "data" / name
-    pycolmap.undistort_images(tmp_path / "dense", source / "sparse/0", source / "images")
-    dense = read_colmap(tmp_path / "dense")
-    ours = read_colmap(source)
-    assert dense.names == ours.names
-    np.testing.assert_allclose(dense.cameras.K, ours.cameras.K, atol=1e-9)
-    np.testing.assert_array_equal(dense.cameras.width, ours.cameras.width)
-    assert not any("undistorted to" in finding.message for finding in dense.findings)
-    report = inspect(dense, probes=2)
-    assert report.reprojection_px == pytest.approx(models_own_error(source / "sparse/0"), abs=0.05)
-    first = ours.names[0]
-    difference = np.abs(dense[first].load().rgb.astype(int) - ours[first].load().rgb.astype(int))
-    assert difference.mean() < 3  # pycolmap stored it as JPEG once more
-
-
 def test_fox_cameras_agree_between_colmap_and_transforms(shared):
     import pycolmap
 
@@ -114,12 +89,6 @@ def test_kitchen_scan_is_read_whole(shared):
     assert report.depth.coverage == pytest.approx(0.72, abs=0.03)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("part", ["reg", "clip"])
-def test_all_of_a_scan_contradicts_nothing(shared, part):
-    inspected(open_project(shared / f"data/sevenscenes_{part}"))
-
-
 def contrast_at_depth_edges(frame):
     """Median colour gradient, within a pixel, where depth jumps between valid neighbours."""
     from scipy import ndimage
@@ -144,27 +113,3 @@ def test_registration_moves_depth_edges_onto_colour_edges(shared):
     for name in registered.names[::10]:
         before = contrast_at_depth_edges(plain[name].load())
         assert contrast_at_depth_edges(registered[name].load()) > 1.25 * before
-
-
-def test_registration_reproduces_the_registered_scan(shared):
-    ours = open_project(shared / "data/sevenscenes_clip", rgbd=CLIP)
-    theirs = open_project(shared / "data/sevenscenes_reg")
-    for name in ("frame-000560.color.jpg", "frame-000590.color.jpg"):
-        a, b = ours[name].load().depth, theirs[name].load().depth
-        both = (a > 0) & (b > 0)
-        assert both.mean() > 0.98 * (b > 0).mean()
-        assert np.median(np.abs(a - b)[both]) < 0.002
-
-
-def test_redwood_frames_agree_in_depth(shared):
-    scene = open_project(shared / "data/redwood_rgbd5")
-    assert len(scene) == 5
-    first, last = scene.views[0], scene.views[4]
-    depth, other = first.load().depth, last.load().depth
-    points = first.camera.rays()[depth > 0] * depth[depth > 0][:, None]
-    pose = first.camera.world_from_cam[0]
-    xy, z = last.camera.project(points @ pose[:3, :3].T + pose[:3, 3])
-    column, row = np.floor(xy[0]).astype(int).T
-    inside = (column >= 0) & (column < 640) & (row >= 0) & (row < 480)
-    seen = other[row[inside], column[inside]]
-    assert np.median(np.abs(seen - z[0][inside])[seen > 0]) < 0.007

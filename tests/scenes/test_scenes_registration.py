@@ -83,18 +83,6 @@ def test_a_plane_stays_a_closed_plane(degrees, normal, zoom):
         np.testing.assert_allclose(result[measured], expected[measured], rtol=1e-5)
 
 
-def test_same_camera_gives_the_same_depth():
-    rng = np.random.default_rng(0)
-    depth = rng.uniform(1, 9, SIZE).astype(np.float32)
-    depth[rng.random(SIZE) < 0.3] = 0
-    result = register_depth(
-        depth, DEPTH_K, DEPTH_K, color_from_depth=np.eye(4), width=SIZE[1], height=SIZE[0]
-    )
-    np.testing.assert_array_equal(result > 0, depth > 0)
-    near = np.abs(result - depth) / np.maximum(depth, 1)
-    assert near.max() < 0.05
-
-
 def test_silhouette_neither_grows_nor_leaks():
     depth = np.full(SIZE, 4.0, np.float32)
     depth[30:70, 40:90] = 1.5

@@ -10,7 +10,6 @@ from walls import camera_at, photograph
 
 from gvtools.cameras import Cameras
 from gvtools.errors import OptionError
-from gvtools.memory.back_projection import back_project
 from gvtools.scenes.resized import reduced, resized, seen_by
 from gvtools.scenes.scene import Frame, Scene, SparsePoints, View
 
@@ -77,11 +76,6 @@ def test_the_window_is_central_and_what_lies_outside_has_no_points():
     assert points_of(found).point_index.tolist() == [0, 0, 1, 1]
 
 
-def test_a_scene_of_that_size_is_left_alone():
-    whole = scene()
-    assert resized(whole, 90, 60)["a"].load is whole["a"].load
-
-
 def test_points_that_held_out_views_saw_are_left_out():
     whole = scene()
     both = seen_by(whole, ["a", "b"])
@@ -123,21 +117,6 @@ def test_cameras_pictures_depth_and_points_shrink_together(walls):
     # Small pictures stay as they are.
     assert out.views[1] is walls.views[1]
     assert "1 pictures are reduced" in out.findings[-1].message
-
-
-def test_the_reduced_view_shows_the_same_surfaces(walls):
-    whole, small = walls.views[0], reduced(walls, 160).views[0]
-    clouds = []
-    for view in (whole, small):
-        frame = view.load()
-        assert frame.depth is not None
-        points = back_project(frame.rgb, frame.depth, view.camera)
-        clouds.append(points.positions)
-    from scipy.spatial import cKDTree
-
-    distance, _ = cKDTree(clouds[0]).query(clouds[1])
-    # Nearest pixels are up to half an old pixel off the new centre, within the surface.
-    assert np.percentile(distance, 95) < 0.02
 
 
 def test_colours_are_averages(walls):

@@ -2,8 +2,6 @@
 from __future__ import annotations
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from gvtools.errors import OptionError
 from gvtools.scenes.selection import check_disjoint, select
@@ -30,21 +28,6 @@ NAMES = tuple(f"img{i}.png" for i in range(10))
 )
 def test_forms(spec, indices):
     assert select(NAMES, spec) == tuple(NAMES[i] for i in indices)
-
-
-@given(st.integers(1, 40), st.integers(1, 12), st.integers(0, 12))
-def test_every_is_pythons_slice_and_not_is_its_complement(count, step, offset):
-    names = [f"v{i}" for i in range(count)]
-    expected = tuple(names[offset::step])
-    spec = f"every:{step}+{offset}"
-    if not expected:
-        with pytest.raises(OptionError, match="none of"):
-            select(names, spec)
-        return
-    assert select(names, spec) == expected
-    if len(expected) < count:
-        rest = select(names, f"not:{spec}")
-        assert sorted((*rest, *expected)) == sorted(names)
 
 
 def test_names_in_a_file_and_names_with_commas_and_colons(tmp_path):

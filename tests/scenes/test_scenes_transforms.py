@@ -4,7 +4,6 @@ from __future__ import annotations
 import json
 import math
 import reprlib
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,12 +18,10 @@ from scenes_workspace import (
     ramp,
     save,
     transforms,
-    workspace,
 )
 
 from gvtools.cameras import Cameras
 from gvtools.errors import GvError, ProjectError
-from gvtools.scenes.colmap import read_colmap
 from gvtools.scenes.project import open_project
 from gvtools.scenes.selection import select
 from gvtools.scenes.transforms import read_transforms, read_transforms_cameras, write_transforms
@@ -45,20 +42,6 @@ def test_opengl_axes_names_and_order(tmp_path):
     np.testing.assert_allclose(scene.cameras.K[0], [[90, 0, 48], [0, 91, 36], [0, 0, 1]])
     np.testing.assert_array_equal(scene.views[0].load().rgb, ramp())
     assert not scene.metric
-
-
-def test_a_camera_at_plus_z_that_looks_down_minus_z_sees_the_origin(tmp_path):
-    # OpenGL's identity looks along -z: moved to z = +2, the world's origin is straight ahead.
-    save(tmp_path / "a.png", ramp())
-    pose = np.eye(4)
-    pose[2, 3] = 2
-    path = transforms(
-        tmp_path, [{"file_path": "a.png", "transform_matrix": pose.tolist()}], **PINHOLE
-    )
-    xy, z = read_transforms(path).cameras.project([[0, 0, 0], [0, 0.1, 0]])
-    np.testing.assert_allclose(z[0], 2)
-    np.testing.assert_allclose(xy[0, 0], [48, 36])
-    assert xy[0, 1, 1] < 36  # world y is up, the picture's y is down
 
 
 def test_blender_files_name_no_suffix_and_give_an_angle(tmp_path):
@@ -162,30 +145,6 @@ def test_masks_that_tell_nothing_are_said(tmp_path, value, said):
     assert ("masks " in messages(scene)) == bool(said) and said in messages(scene)
 
 
-def test_masks_are_given_and_missed_as_those_of_colmap(tmp_path):
-    names = ("a.png", "b.png", "c.png", "d.png")
-    black = np.zeros((HEIGHT, WIDTH), np.uint8)
-    for name in names:
-        save(tmp_path / "images" / name, ramp())
-    save(tmp_path / "ignore/a.png.png", black)
-    save(tmp_path / "own.png", black)
-    frames = [frame(f"images/{name}") for name in names]
-    frames[1]["mask_path"] = "own.png"
-    path = transforms(tmp_path, frames, **PINHOLE)
-    scene = read_transforms(path, masks=tmp_path / "ignore")
-    assert [view.load().mask is None for view in scene] == [False, False, True, True]
-    assert "no mask" not in messages(read_transforms(path))
-    reconstruction = workspace(tmp_path / "colmap")
-    for image in list(reconstruction.images.values())[2:]:
-        save(tmp_path / "ignore" / f"{image.name}.png", black)
-    for found in (scene, read_colmap(tmp_path / "colmap", masks=tmp_path / "ignore")):
-        assert any("2 of 4 frames have no mask" in item.message for item in found.findings)
-    for read in (read_transforms, read_colmap):
-        root = tmp_path / "colmap" if read is read_colmap else path
-        with pytest.raises(ProjectError, match=r"no such folder \(masks were expected there\)"):
-            read(root, masks=tmp_path / "absent")
-
-
 @pytest.mark.parametrize(
     ("change", "told"),
     [
@@ -257,15 +216,6 @@ def test_a_pose_and_depth_of_the_whole_file_are_no_frames_own(tmp_path):
         read_transforms(transforms(tmp_path, [one], **shared, transform_matrix=pose))
 
 
-def test_whole_numbers_may_be_written_as_floats(tmp_path):
-    save(tmp_path / "images/a.png", ramp())
-    shared = {**PINHOLE, "w": float(WIDTH), "h": float(HEIGHT), "is_fisheye": 0}
-    one = frame(mask_path=None, depth_file_path="")
-    scene = read_transforms(transforms(tmp_path, [one], **shared))
-    assert scene.cameras.width.tolist() == [WIDTH]
-    assert not scene.views[0].has_depth
-
-
 @pytest.mark.parametrize("name", ["/", "images/" + "a" * 5000, "a\0b.png"], ids=reprlib.repr)
 def test_paths_that_no_file_has_are_absent_or_refused(tmp_path, name):
     save(tmp_path / "images/a.png", ramp())
@@ -277,16 +227,6 @@ def test_paths_that_no_file_has_are_absent_or_refused(tmp_path, name):
     elif name != "/":
         scene = read_transforms(transforms(tmp_path, [frame(mask_path=name)], **PINHOLE))
         assert "1 of 1 frames have no mask" in messages(scene)
-
-
-def test_absolute_and_relative_pictures_may_be_mixed(tmp_path, monkeypatch):
-    save(tmp_path / "project/images/a.png", ramp())
-    save(tmp_path / "project/more/b.png", ramp())
-    frames = [frame(), frame(str(tmp_path / "project/more/b.png"))]
-    transforms(tmp_path / "project", frames, **PINHOLE)
-    monkeypatch.chdir(tmp_path)
-    scene = read_transforms(Path("project"))
-    assert scene.names == ("images/a.png", "more/b.png")
 
 
 @pytest.mark.parametrize(

@@ -148,17 +148,6 @@ def test_damage_is_found_named_and_mended(whole, tmp_path):
     assert contents(out) == contents(whole)
 
 
-def test_a_damaged_index_beside_a_shard_is_found_and_mended(whole, tmp_path):
-    out = copied(whole, tmp_path / "shards")
-    path = out / "shard-000000.json"
-    text = path.read_text()
-    path.write_text(text.replace("90.0", "91.0", 1))
-    (problem,) = verify(out)
-    assert "shard-000000.json: damaged" in problem
-    write_shards(small_collection(), out, options=SMALL)
-    assert contents(out) == contents(whole)
-
-
 def test_shards_that_are_cut_off_or_absent_are_one_line(whole, tmp_path):
     out = copied(whole, tmp_path / "shards")
     tar = out / "shard-000000.tar"
@@ -200,18 +189,6 @@ def test_another_conversion_and_foreign_files_are_refused(whole, tmp_path):
     with pytest.raises(OptionError, match="more than 0"):
         ShardOptions(megabytes=0)
     assert contents(out) == contents(whole)
-
-
-def test_an_index_of_another_version_or_damaged_is_one_line(whole, tmp_path):
-    out = copied(whole, tmp_path / "shards")
-    path = out / "index.json"
-    text = path.read_text()
-    path.write_text(text.replace('"version": 1', '"version": 9'))
-    with pytest.raises(ProjectError, match="of version 9; expected"):
-        open_shards(out)
-    path.write_text(text[: len(text) // 2])
-    with pytest.raises(ProjectError, match=r"index\.json: unreadable"):
-        open_shards(out)
 
 
 def test_a_data_set_without_its_folder_is_told_what_to_give(tmp_path, capsys):

@@ -29,11 +29,6 @@ def tars(folder: Path) -> list[str]:
     return [str(folder / shard.file) for shard in read_index(folder).shards]
 
 
-def expected() -> set[tuple[str, str]]:
-    collection = small_collection()
-    return {(name, view) for name in collection.names for view in collection.read(name).names}
-
-
 def place(sample: dict[str, bytes]) -> tuple[str, str]:
     camera = json.loads(sample["json"])
     return camera["scene"], camera["name"]
@@ -58,24 +53,3 @@ def test_pixels_and_cameras_are_those_of_the_scenes(folder):
         seen.append((scene, name))
     # Neighbouring views follow each other.
     assert seen == [(s, view) for s in collection.names for view in collection.read(s).names]
-
-
-@pytest.mark.slow  # torch waits 5 s for workers that webdataset has kept
-def test_two_workers_see_every_sample_once(folder):
-    data = wds.WebDataset(tars(folder), shardshuffle=False, workersplitter=wds.split_by_worker)
-    loader = torch.utils.data.DataLoader(data.map(place), batch_size=None, num_workers=2)
-    seen = list(loader)
-    assert len(seen) == 21 and {tuple(each) for each in seen} == expected()
-
-
-def test_two_ranks_see_every_sample_once_between_them(folder, monkeypatch):
-    seen = []
-    for rank in (0, 1):
-        # How the package learns of its rank without a process group.
-        monkeypatch.setenv("RANK", str(rank))
-        monkeypatch.setenv("WORLD_SIZE", "2")
-        data = wds.WebDataset(tars(folder), shardshuffle=False, nodesplitter=wds.split_by_node)
-        own = [place(sample) for sample in data]
-        assert 0 < len(own) < 21
-        seen += own
-    assert len(seen) == 21 and set(seen) == expected()

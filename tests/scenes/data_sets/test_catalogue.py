@@ -9,14 +9,11 @@ import yaml
 
 from gvtools.errors import OptionError
 from gvtools.scenes.data_sets.catalogue import (
-    LAYOUTS,
     DataSetSpec,
-    layout_of,
     load_spec,
     parse_spec,
     spec_names,
 )
-from gvtools.specs import name_key
 
 FOLDER = Path(__file__).parents[3] / "data_specs" / "data_sets"
 # Scenes and images of the paper's table of training data, in its order.
@@ -71,34 +68,6 @@ def test_geometry_is_the_papers_rule(specs: dict[str, DataSetSpec]) -> None:
             assert (spec.geometry.source, spec.geometry.own_share) == ("estimated", 0), name
         else:
             assert (spec.geometry.source, spec.geometry.own_share) == ("mixed", 2 / 3), name
-
-
-@pytest.mark.parametrize("name", spec_names())
-def test_a_spec_is_found_by_file_and_by_printed_name(name: str) -> None:
-    spec = load_spec(name)
-    assert name_key(spec.name) == name
-    assert load_spec(spec.name) == spec
-    assert load_spec(spec.name.upper()) == spec
-
-
-@pytest.mark.parametrize("name", spec_names())
-def test_a_spec_says_what_a_reader_needs(name: str) -> None:
-    spec = load_spec(name)
-    assert spec.files and spec.sources and spec.traps and spec.camera.intrinsics
-    assert spec.home.startswith(("http://", "https://"))
-    if spec.depth is None:
-        return
-    assert spec.depth.invalid
-    if spec.depth.measures in ("disparity", "buffer"):
-        assert spec.depth.formula and spec.depth.unit_m is None
-
-
-def test_every_layout_is_known() -> None:
-    specs = [load_spec(name) for name in spec_names()]
-    assert {spec.layout for spec in specs} == set(LAYOUTS)
-    for spec in specs:
-        found = layout_of(spec)
-        assert found.holds and callable(found.scenes) and callable(found.reader)
 
 
 def test_a_wrong_spec_is_named() -> None:

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import shutil
-import sys
-import types
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -19,19 +15,15 @@ from data_sets.miniature import Expected, layout_named, read_miniature
 from data_sets.room_frames import rendered_frames
 from PIL import Image
 
-from gvtools.errors import OptionError, ProjectError
-from gvtools.scenes.calibration import number_table
+from gvtools.errors import ProjectError
 from gvtools.scenes.data_sets.synthetic import (
     CAMERAS,
     SKY_FROM,
     buffer_depth,
     halved,
-    ned_poses,
     packed_depth,
 )
 from gvtools.scenes.images import exr_depth, hdf5_array
-from gvtools.scenes.matching import numbers_in
-from gvtools.scenes.photographs import first_size
 from gvtools.scenes.scene import Scene
 
 WRITERS = {
@@ -234,20 +226,6 @@ def test_a_right_handed_world_of_mvs_synth_is_left_as_it_is(written: Written) ->
     np.testing.assert_allclose(written.read().cameras.cam_from_world, before, atol=1e-12)
 
 
-@of("gta_sfm")
-def test_a_damaged_picture_in_an_hdf5_file_is_an_error_when_it_is_loaded(written: Written) -> None:
-    import h5py
-
-    (path,) = written.root.rglob("*.hdf5")
-    with h5py.File(path, "a") as file:
-        del file["image_0"]
-        file["image_0"] = np.zeros(40, np.uint8)
-    scene = written.read()
-    with pytest.raises(ProjectError, match=r"image_0: unreadable \(no picture\)"):
-        scene["image_0"].load()
-    assert scene["image_1"].load().rgb.shape == (48, 64, 3)
-
-
 def test_omniworlds_depth_buffer_is_not_linear(tmp_path: Path) -> None:
     """Values of yangzhou24/OmniWorld's load_depth, worked out by hand from its formula."""
     raw = np.array([[0, 98, 99, 32768, 62258, 65500, 65501, 65535]], np.uint16)
@@ -306,15 +284,6 @@ def test_springs_sky_is_told_by_its_map_alone(written: Written) -> None:
     assert (depth[:2, :3] == 0).all()
 
 
-def test_hdf5_and_exr_name_the_extra_that_reads_them(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "h5py", None)
-    monkeypatch.setitem(sys.modules, "OpenEXR", None)
-    with pytest.raises(OptionError, match=r"gvtools\[data\]"):
-        hdf5_array(tmp_path / "a.h5", "x")
-    with pytest.raises(OptionError, match=r"gvtools\[data\]"):
-        exr_depth(tmp_path / "a.exr", channels=("Y",))
-
-
 def test_errors_of_array_files_say_what_is_there(tmp_path: Path) -> None:
     import h5py
     import OpenEXR
@@ -339,62 +308,3 @@ def test_errors_of_array_files_say_what_is_there(tmp_path: Path) -> None:
         exr_depth(tmp_path / "half.exr", channels=("Y",))
     with pytest.raises(ProjectError, match="no such file"):
         exr_depth(tmp_path / "none.exr", channels=("Y",))
-
-
-def test_numbers_and_tables(tmp_path: Path) -> None:
-    for name in (
-        "rgb_00003.jpg",
-        "rgb_00010.jpg",
-        "rgb_x.jpg",
-        "a_rgb_00001.jpg",
-        "rgb_00001.jpg~",
-    ):
-        (tmp_path / name).touch()
-    assert numbers_in(tmp_path, "rgb_{:05d}.jpg") == {3, 10}
-    assert numbers_in(tmp_path / "none", "rgb_{:05d}.jpg") == set()
-    assert first_size(tmp_path.iterdir()) is None
-    assert number_table(tmp_path / "none.txt", 3).shape == (0, 3)
-    path = tmp_path / "rows.txt"
-    path.write_text("a b\n1 2\n\n3 4\n")
-    np.testing.assert_array_equal(number_table(path, 2, skip=1), [[1, 2], [3, 4]])
-    with pytest.raises(ProjectError, match="could not convert"):
-        number_table(path, 2)
-    with pytest.raises(ProjectError, match="row 1 of 3 has 2 numbers\\); expected 7"):
-        ned_poses(path)
-
-
-def _official_reader() -> Any:
-    """tartanair's TartanAirImageReader, without the downloads and CUDA that its package imports."""
-    spec = importlib.util.find_spec("tartanair")
-    if spec is None or not spec.submodule_search_locations:
-        pytest.skip("no package tartanair; pip install --no-deps tartanair")
-    folder = Path(spec.submodule_search_locations[0])
-    package = types.ModuleType("official_tartanair")
-    package.__path__ = [str(folder)]
-    sys.modules[package.__name__] = package
-    stub = types.ModuleType("official_tartanair.tartanair_module")
-    stub.TartanAirModule = object  # type: ignore[attr-defined]
-    sys.modules[stub.__name__] = stub
-    spec = importlib.util.spec_from_file_location("official_tartanair.reader", folder / "reader.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    try:
-        spec.loader.exec_module(module)
-    finally:
-        del sys.modules[package.__name__], sys.modules[stub.__name__]
-    return module.TartanAirImageReader()
-
-
-@of("tartanair", "tartanair_v2")
-def test_the_official_tool_kit_reads_the_miniatures(written: Written) -> None:
-    official = _official_reader()
-    for view in written.read():
-        image, depth = view.files
-        frame = view.load()
-        np.testing.assert_array_equal(official.read_rgb(str(image)), frame.rgb)
-        read = official.read_depth(str(depth))
-        np.testing.assert_array_equal(np.where(read > SKY_FROM, 0, read), frame.depth)
-        # Its distances assume the optical centre in the middle of pixels counted from 0.5.
-        rays = np.linalg.norm(view.camera.rays(), axis=-1)
-        np.testing.assert_allclose(official.read_dist(str(depth)), rays * read, rtol=1e-5)
