@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from gvtools.cameras import Cameras
 from gvtools.errors import DegenerateError, ShapeError
 from gvtools.evaluation.depth_reprojection import depth_reprojection
 from gvtools.evaluation.feature_consistency import feature_consistency
-from gvtools.evaluation.images import image_figures, psnr, relative_depth_error, ssim
+from gvtools.evaluation.images import image_figures, psnr, ssim
 from gvtools.evaluation.posed_picture import PosedPicture
 from gvtools.evaluation.statistics import mean_interval
 from gvtools.evaluation.trajectories import (
@@ -27,27 +26,6 @@ from gvtools.evaluation.trajectories import (
 pytestmark = pytest.mark.filterwarnings("error")
 
 NOISE = np.random.default_rng(0).random((20, 24, 3))
-COLORS: dict[str, Any] = {
-    "noise": NOISE,
-    "black": np.zeros_like(NOISE),
-    "grey": np.full_like(NOISE, 0.3),
-    "white": np.ones_like(NOISE),
-    "bytes": (NOISE * 255).astype(np.uint8),
-    "half": NOISE.astype(np.float16),
-}
-
-
-@settings(max_examples=40, deadline=None)
-@given(st.floats(0, 1), st.floats(0, 1))
-def test_two_constant_pictures_have_their_closed_form(first, second):
-    one, other = np.full((12, 12, 3), first), np.full((12, 12, 3), second)
-    found = ssim(one, other)
-    # Without variance only the luminance term of SSIM is left.
-    wanted = (2 * first * second + 1e-4) / (first**2 + second**2 + 1e-4)
-    assert found == pytest.approx(wanted, abs=1e-9)
-    gap = (first - second) ** 2
-    ratio = psnr(one, other)
-    assert ratio == (math.inf if gap == 0 else pytest.approx(-10 * math.log10(gap), rel=1e-9))
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 255.0, -1.01])
@@ -70,26 +48,10 @@ def test_small_and_empty_pictures_have_what_they_can_have(size):
         ssim(picture, picture)
 
 
-DEPTH = np.random.default_rng(1).uniform(1, 2, (20, 24))
-
-
-@settings(max_examples=30, deadline=None)
-@given(st.integers(-38, 38), st.just(0.0) | st.floats(1e-30, 2))
-def test_relative_depth_errors_have_no_unit(power, factor):
-    truth = DEPTH * 10.0**power
-    found = relative_depth_error(truth * factor, truth)
-    if factor == 0:
-        assert found is None
-    else:
-        assert found == pytest.approx(abs(factor - 1), abs=1e-15)
-
-
 @pytest.mark.parametrize(
     ("values", "mean", "n"),
     [
-        ([], None, 0),
         ([None, math.nan], None, 0),
-        ([math.inf, 1.0], math.inf, 2),
         ([-math.inf, 1.0], -math.inf, 2),
         ([math.inf, -math.inf], None, 2),
         ([1e-30], 1e-30, 1),
@@ -104,20 +66,12 @@ SIZE = (24, 32)
 TEXTURE = np.random.default_rng(0).integers(0, 256, (*SIZE, 3), dtype=np.uint8)
 
 
-def wall(
-    *,
-    depth: float | None = 2.0,
-    shift: float = 0.0,
-    rgb: np.ndarray = TEXTURE,
-    mask: np.ndarray | None = None,
-) -> PosedPicture:
-    size = rgb.shape[:2]
+def wall(*, depth: float | None = 2.0, shift: float = 0.0) -> PosedPicture:
     pose = np.eye(4)
     pose[0, 3] = -shift
-    K = np.array([[[30.0, 0, size[1] / 2], [0, 30, size[0] / 2], [0, 0, 1]]])
-    camera = Cameras(K, pose[None], np.array([size[1]]), np.array([size[0]]), ("c",))
-    lengths = None if depth is None else np.full(size, depth, np.float32)
-    return PosedPicture(f"at {shift:g}", camera, rgb, lengths, mask)
+    camera = Cameras.pinhole(SIZE[1], SIZE[0], focal=30, cam_from_world=pose)
+    lengths = None if depth is None else np.full(SIZE, depth, np.float32)
+    return PosedPicture(f"at {shift:g}", camera, TEXTURE, lengths, None)
 
 
 @settings(max_examples=30, deadline=None)
@@ -152,13 +106,6 @@ def path(count: int = 9, *, unit: float = 1.0) -> np.ndarray:
     return poses
 
 
-def turned(poses: np.ndarray, angle: float, axis: tuple[float, float, float]) -> np.ndarray:
-    rotation = Rotation.from_rotvec(angle * np.array(axis) / np.linalg.norm(axis)).as_matrix()
-    out = poses.copy()
-    out[:, :3, :3] = rotation @ poses[:, :3, :3]
-    return out
-
-
 @settings(max_examples=30, deadline=None)
 @given(st.integers(-29, 29))
 def test_errors_scale_with_the_unit(power):
@@ -178,9 +125,11 @@ def test_errors_scale_with_the_unit(power):
     np.testing.assert_allclose(scaled, plain, rtol=1e-9)
 
 
-@pytest.mark.parametrize("angle", [0.0, 1e-16, 1e-8, 1e-3, np.pi - 1e-6, np.pi - 1e-12, np.pi])
+@pytest.mark.parametrize("angle", [0.0, 1e-8, np.pi - 1e-12, np.pi])
 def test_angles_are_exact_near_none_and_near_a_half_turn(angle):
-    other = turned(path(), angle, (1, 2, 2))
+    other = path()
+    turn = Rotation.from_rotvec(angle * np.array([1, 2, 2]) / 3).as_matrix()
+    other[:, :3, :3] = turn @ other[:, :3, :3]
     errors = absolute_errors(path(), other, align="none")
     assert errors.rotation_deg is not None
     for value in (errors.rotation_deg.min, errors.rotation_deg.max):

