@@ -126,15 +126,6 @@ def test_faint_ones_go_and_take_their_memory_with_them():
     np.testing.assert_array_equal(people.moments, before.moments[:, kept])
 
 
-def test_all_fade_by_a_share_of_their_opacity():
-    people = population()
-    people.values[:, LOGIT] = np.linspace(-4, 4, len(people))
-    before = 1 / (1 + np.exp(-people.values[:, LOGIT]))
-    people.fade(0.1)
-    after = 1 / (1 + np.exp(-people.values[:, LOGIT]))
-    np.testing.assert_allclose(after, 0.9 * before, rtol=1e-5)
-
-
 def some_values() -> np.ndarray:
     values = rough_gaussians().values
     values[:, LOGIT] = np.linspace(-5, 6, len(values))
@@ -193,14 +184,6 @@ def sizes(some):
 
 def colors_of(places):
     return np.full((len(places), 3), 100, np.uint8)
-
-
-def test_points_of_a_grid_are_as_wide_as_it():
-    places = np.mgrid[0:1.25:0.25, 7:8.25:0.25, 900:901.25:0.25].reshape(3, -1).T
-    some = from_points(places, colors_of(places), frame=FRAME)
-    np.testing.assert_allclose(sizes(some), 0.25, rtol=1e-3)
-    np.testing.assert_allclose(some.values[:, :3], places, rtol=1e-6)
-    assert some.frame is FRAME
 
 
 def test_sizes_are_distances_to_the_nearest_neighbours():
