@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-from functools import partial
-from pathlib import Path
-
 import numpy as np
 import pytest
-from walls import camera_at, photograph
 
 from gvtools.cameras import Cameras
 from gvtools.depth.options import StereoOptions
@@ -16,7 +12,6 @@ from gvtools.depth.stereo.plane_sweep import PlaneSweepStereo
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.procedural.stereo_sample import write_motorcycle
 from gvtools.scenes.project import open_project
-from gvtools.scenes.scene import Frame, Scene, View
 
 SIZE = (60, 80)
 CELLS = np.random.default_rng(3).integers(40, 200, (64, 64, 3), dtype=np.uint8)
@@ -101,29 +96,6 @@ def test_what_was_generated_explains_nothing():
     rgb, depth = wall()
     memory.observe(rgb, depth, camera(), round=1, generated=True)
     assert depth_from_memory(memory, camera(), rgb, least=0.1) is None
-
-
-pytest_plugins = ("wall_fixtures",)
-
-
-@pytest.mark.parametrize("step", [(0.2, 0, 0), pytest.param((0, -0.15, 0), marks=pytest.mark.slow)])
-@pytest.mark.parametrize("second_turn", [(0, 0, 0), (1.5, -2, 1)])
-def test_depth_is_exact_in_both_views(textures, step, second_turn):
-    views, depths = [], []
-    for i, (center, turn) in enumerate((((0, 0, 0), (0, 0, 0)), (step, second_turn))):
-        picture = photograph(camera_at(center, turn=turn, name=f"{i}.png"), textures)
-        assert picture.depth is not None
-        depths.append(picture.depth)
-        views.append(View(f"{i}.png", picture.camera, partial(Frame, picture.rgb)))
-    scene = Scene(Path("pair"), "colmap", tuple(views))
-    source = PlaneSweepStereo(scene, options=StereoOptions(), views=scene.names)
-    for view, truth in zip(scene, depths, strict=True):
-        found = source.depth(scene, view, view.load()).depth
-        known = found > 0
-        # A strip as wide as the disparity is seen by one camera alone.
-        assert known.mean() > 0.8
-        error = np.abs(found / truth - 1)[known]
-        assert np.median(error) < 0.001 and (error > 0.05).mean() < 0.01
 
 
 def test_the_motorcycle_pair_has_its_recorded_depth(tmp_path):

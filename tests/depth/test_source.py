@@ -11,7 +11,7 @@ from scenes_workspace import workspace
 from tiny_scan import write_scan
 
 from gvtools.cameras import Cameras
-from gvtools.depth import choice, colmap_patch_match
+from gvtools.depth import choice
 from gvtools.depth.choice import choose_source, rough_source
 from gvtools.depth.colmap_patch_match import ColmapPatchMatch
 from gvtools.depth.options import StereoOptions
@@ -57,34 +57,31 @@ def with_blob(depth: float = 2.0) -> np.ndarray:
 OTHERS = [camera(0.1), camera(-0.1), camera(0.15)]
 
 
-def test_what_others_look_through_is_contradicted():
-    wrong = contradictions(with_blob(), camera(), [(wall(), each) for each in OTHERS])
-    np.testing.assert_array_equal(wrong, with_blob() < FAR)
+def seen(depth: np.ndarray, cameras: list[Cameras]) -> list[tuple[np.ndarray, Cameras]]:
+    return [(depth, each) for each in cameras]
 
 
-def test_one_view_alone_contradicts_nothing():
-    witnesses = [(wall(), each) for each in OTHERS[: LEAST - 1]]
-    assert not contradictions(with_blob(), camera(), witnesses).any()
-    blind = [(np.zeros_like(wall()), each) for each in OTHERS]
-    assert not contradictions(with_blob(), camera(), blind).any()
+SMALL = [each.resized(WIDTH // 2, HEIGHT // 2) for each in OTHERS]
 
 
-def test_what_as_many_others_confirm_stays():
-    near = wall(2.0)
-    agreeing, piercing = [(near, each) for each in OTHERS[:2]], [(wall(), each) for each in OTHERS]
-    assert not contradictions(with_blob(), camera(), [*agreeing, *piercing[:2]])[
-        with_blob() < FAR
-    ].any()
-    assert contradictions(with_blob(), camera(), [*agreeing, *piercing])[with_blob() < FAR].all()
-
-
-def test_what_others_do_not_see_for_something_nearer_stays():
-    assert not contradictions(wall(), camera(), [(wall(1.0), each) for each in OTHERS]).any()
-
-
-@pytest.mark.parametrize("off", [0.99, 0.97])
-def test_noise_is_no_contradiction(off):
-    assert not contradictions(with_blob(FAR * off), camera(), [(wall(), c) for c in OTHERS]).any()
+@pytest.mark.parametrize(
+    ("depth", "witnesses", "wrong"),
+    [
+        (with_blob(), seen(wall(), OTHERS), True),
+        (with_blob(), seen(wall()[::2, ::2], SMALL), True),
+        (with_blob(), seen(wall(), OTHERS[: LEAST - 1]), False),
+        (with_blob(), seen(wall(0.0), OTHERS), False),
+        # As many confirm it, and fewer than look through.
+        (with_blob(), seen(wall(2.0), OTHERS[:2]) + seen(wall(), OTHERS[:2]), False),
+        (with_blob(), seen(wall(2.0), OTHERS[:2]) + seen(wall(), OTHERS), True),
+        # Hidden by something nearer; noise.
+        (wall(), seen(wall(1.0), OTHERS), False),
+        (with_blob(0.97 * FAR), seen(wall(), OTHERS), False),
+    ],
+)
+def test_what_more_views_look_through_than_confirm_is_contradicted(depth, witnesses, wrong):
+    found = contradictions(depth, camera(), witnesses)
+    np.testing.assert_array_equal(found, wrong & (with_blob() < FAR))
 
 
 def test_a_real_object_in_front_of_a_wall_stays():
@@ -111,50 +108,26 @@ def test_beside_something_thin_a_view_does_not_look_through():
     assert not contradictions(bar, camera(), witnesses).any()
 
 
-def test_what_masks_leave_out_neither_speaks_nor_counts():
-    def view(name: str, depth: np.ndarray, use: bool) -> View:
-        frame = Frame(np.zeros((HEIGHT, WIDTH, 3), np.uint8), depth, np.full(depth.shape, use))
-        return View(name, camera(0.0, name), lambda: frame, has_depth=True)
-
-    for first, others in ((True, False), (False, True)):
-        views = (
-            view("a", with_blob(), first),
-            view("b", wall(), others),
-            view("c", wall(), others),
-        )
-        scene = Scene(Path("."), "rgbd", views)
-        source = RecordedDepth([each.name for each in views])
-        found = source.depth(scene, views[0], views[0].load())
-        assert found.contradicted == 0
-        np.testing.assert_array_equal(found.depth, with_blob())
+def view_of(name: str, x: float, depth: np.ndarray, *, use: bool = True) -> View:
+    frame = Frame(np.zeros((HEIGHT, WIDTH, 3), np.uint8), depth, np.full(depth.shape, use))
+    return View(name, camera(x, name), lambda: frame, has_depth=True)
 
 
-def test_views_of_another_size_are_compared_where_they_look():
-    half = np.full((HEIGHT // 2, WIDTH // 2), FAR, np.float32)
-    small = [(half, each.resized(WIDTH // 2, HEIGHT // 2)) for each in OTHERS]
-    np.testing.assert_array_equal(contradictions(with_blob(), camera(), small), with_blob() < FAR)
-
-
-def test_recorded_depth_is_dropped_counted_and_not_trusted():
-    def view(name: str, x: float, depth: np.ndarray) -> View:
-        frame = Frame(np.zeros((HEIGHT, WIDTH, 3), np.uint8), depth, None)
-        return View(name, camera(x, name), lambda: frame, has_depth=True)
-
+@pytest.mark.parametrize(("first", "others"), [(True, False), (False, True), (True, True)])
+def test_recorded_depth_is_dropped_and_counted_where_masks_let_it_speak(first, others):
     views = (
-        view("a", 0.0, with_blob()),
-        view("b", 0.1, wall()),
-        view("c", -0.1, wall()),
-        replace(view("d", 0.2, wall()), has_depth=False),
+        view_of("a", 0.0, with_blob(), use=first),
+        view_of("b", 0.1, wall(), use=others),
+        view_of("c", -0.1, wall(), use=others),
+        replace(view_of("d", 0.2, wall()), has_depth=False),
     )
     scene = Scene(Path("."), "rgbd", views)
-    first = views[0]
-    alone = RecordedDepth().depth(scene, first, first.load())
-    assert alone.contradicted == 0
+    alone = RecordedDepth().depth(scene, views[0], views[0].load())
     np.testing.assert_array_equal(alone.depth, with_blob())
-    checked = RecordedDepth([each.name for each in views]).depth(scene, first, first.load())
-    assert checked.contradicted == (with_blob() < FAR).sum()
-    np.testing.assert_array_equal(checked.depth, np.where(with_blob() < FAR, 0, wall()))
-    np.testing.assert_array_equal(first.load().depth, with_blob())
+    checked = RecordedDepth(scene.names).depth(scene, views[0], views[0].load())
+    wrong = (with_blob() < FAR) & first & others
+    assert (alone.contradicted, checked.contradicted) == (0, wrong.sum())
+    np.testing.assert_array_equal(checked.depth, np.where(wrong, 0, with_blob()))
 
 
 pytestmark = pytest.mark.usefixtures("unpainted")
@@ -197,13 +170,9 @@ def _with_points(scene: Scene) -> Scene:
     return replace(scene, points=points)
 
 
-def test_auto_takes_recorded_depth_where_all_have_it(scan):
+def test_auto_takes_recorded_depth_and_computes_the_rest(scan, monkeypatch):
     chosen = choose_source(scan, scan.names, "auto")
-    assert isinstance(chosen.source, RecordedDepth)
-    assert "every context view" in chosen.reason
-
-
-def test_auto_mixes_view_by_view(scan, monkeypatch):
+    assert isinstance(chosen.source, RecordedDepth) and "every context view" in chosen.reason
     monkeypatch.setattr(choice, "_stereo", lambda *_: Computed())
     partly = without_depth(scan, 1, 3)
     chosen = choose_source(partly, partly.names, "auto")
@@ -212,15 +181,10 @@ def test_auto_mixes_view_by_view(scan, monkeypatch):
     for i, view in enumerate(partly):
         found = chosen.source.depth(partly, view, view.load())
         assert found.source == ("computed" if i in (1, 3) else "recorded")
-        assert chosen.source.covers(view)
-
-
-def test_auto_computes_where_there_is_none(scan, monkeypatch):
-    monkeypatch.setattr(choice, "_stereo", lambda *_: Computed())
+        assert is_recorded(chosen.source, view) == (i not in (1, 3))
     bare = without_depth(scan, *range(6))
     chosen = choose_source(bare, bare.names, "auto")
-    assert chosen.source.name == "computed"
-    assert "plane-sweep" in chosen.reason
+    assert chosen.source.name == "computed" and "plane-sweep" in chosen.reason
 
 
 def test_settings_that_a_source_ignores_are_said(scan, tmp_path, capsys):
@@ -238,15 +202,6 @@ def test_settings_that_a_source_ignores_are_said(scan, tmp_path, capsys):
     assert capsys.readouterr().err.splitlines() == [
         "warning: stereo.window=5 changes nothing: no plane sweep computes depth here, but recorded"
     ]
-
-
-def test_what_is_recorded_is_told_from_what_is_computed(scan):
-    partly = without_depth(scan, 1)
-    mixed = MixedDepth(RecordedDepth(), Computed())
-    assert [is_recorded(mixed, view) for view in partly][:3] == [True, False, True]
-    assert not is_recorded(RecordedDepth(), partly.views[1])
-    # Asked to compute, a source does not read what lies there.
-    assert not is_recorded(Computed(), scan.views[0])
 
 
 def test_a_rough_source_is_a_small_sweep_without_posing(scan, tmp_path):
@@ -277,30 +232,21 @@ def test_patch_match_comes_first_where_there_is_cuda(tmp_path, monkeypatch):
     assert choose_source(bare, bare.names, "auto").source.name == "computed"
 
 
-def test_a_single_view_leaves_nothing_to_compute_from(scan):
-    bare = without_depth(scan, *range(6))
-    with pytest.raises(ProjectError, match="at least 2 views"):
-        choose_source(bare, bare.names[:1], "auto")
-    with pytest.raises(ProjectError, match="at least 2"):
-        choose_source(bare, bare.names[:1], "plane-sweep")
-
-
 def test_what_a_project_cannot_give_is_refused(scan, tmp_path):
-    with pytest.raises(OptionError, match="rgbd"):
-        choose_source(scan, scan.names, "colmap")
-    with pytest.raises(OptionError, match="plane-sweep"):
-        choose_source(scan, scan.names, "guess")
-    with pytest.raises(CheckpointError, match="needs weights"):
-        choose_source(scan, scan.names, "da3")
     bare = without_depth(scan, *range(6))
-    with pytest.raises(ProjectError, match="add depth maps"):
-        choose_source(bare, bare.names, "sensor")
     workspace(tmp_path / "colmap")
-    scene = read_colmap(tmp_path / "colmap")
-    with pytest.raises(OptionError, match="colmap project"):
-        choose_source(scene, scene.names, "sensor")
-    with pytest.raises(ProjectError, match=r"no CUDA.*patch_match_stereo"):
-        choose_source(scene, scene.names, "colmap")
+    colmap = read_colmap(tmp_path / "colmap")
+    for scene, count, asked, error, said in (
+        (scan, 6, "colmap", OptionError, "rgbd"),
+        (scan, 6, "guess", OptionError, "plane-sweep"),
+        (scan, 6, "da3", CheckpointError, "needs weights"),
+        (bare, 6, "sensor", ProjectError, "add depth maps"),
+        (bare, 1, "auto", ProjectError, "at least 2 views"),
+        (colmap, 6, "sensor", OptionError, "colmap project"),
+        (colmap, 6, "colmap", ProjectError, r"no CUDA.*patch_match_stereo"),
+    ):
+        with pytest.raises(error, match=said):
+            choose_source(scene, scene.names[:count], asked)
 
 
 def test_patch_match_gets_a_workspace_of_the_given_views_alone(tmp_path, monkeypatch):
@@ -359,7 +305,6 @@ def test_patch_match_that_fails_is_said(tmp_path, monkeypatch):
         ColmapPatchMatch(scene, scene.names).depth(scene, scene.views[0], scene.views[0].load())
     with pytest.raises(ProjectError, match="sparse points"):
         ColmapPatchMatch(replace(scene, points=None), scene.names)
-    assert colmap_patch_match.has_patch_match() in (True, False)
 
 
 @pytest.mark.parametrize("factor", [1.0, 1.3])

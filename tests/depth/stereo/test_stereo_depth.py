@@ -73,18 +73,6 @@ def test_the_same_twice_and_after_other_views(slanted, stereo):
     np.testing.assert_array_equal(one.confidence, two.confidence)
 
 
-def test_torch_and_compiled_back_ends_agree():
-    scene = plane_scene(slope=(0.25, -0.15), count=3).scene
-    options = OPTIONS.replaced(device="cpu", sources=2, best=1)
-    maps = [
-        swept(scene, "v1", options=options.replaced(backend=backend)).depth
-        for backend in ("cpu", "torch")
-    ]
-    both = (maps[0] > 0) & (maps[1] > 0)
-    assert ((maps[0] > 0) == (maps[1] > 0)).mean() > 0.99
-    assert np.quantile(np.abs(maps[0][both] / maps[1][both] - 1), 0.98) < 2e-3
-
-
 def test_other_views_are_never_looked_at(slanted):
     def forbidden() -> Frame:
         raise AssertionError("a held-out picture was read")
@@ -105,15 +93,6 @@ def test_a_view_outside_the_pool_gets_depth_but_gives_none(slanted):
     error, share = error_and_share(found.depth, slanted.depths[2])
     assert error < 0.005 and share > 0.8
     assert all("v2" not in stereo.raw(scene[name]).sources for name in stereo.views)
-
-
-def test_blank_surfaces_stay_unknown():
-    made = plane_scene(blank=True, count=4)
-    view = made.scene["v2"]
-    found = swept(made.scene)
-    x = view.camera.centers[0, 0] + made.depths[2] * view.camera.rays()[..., 0]
-    assert (found.depth[x > 0.45] == 0).mean() > 0.98
-    assert (found.depth[x < 0.15] > 0).mean() > 0.8
 
 
 @pytest.mark.slow
@@ -224,7 +203,7 @@ def plain_trimmed(depth: np.ndarray, rgb: np.ndarray, radius: int) -> np.ndarray
     return depth
 
 
-@pytest.mark.parametrize("rim", [1, 2, 3, 4])
+@pytest.mark.parametrize("rim", [1, 4])
 def test_a_rim_in_the_sky_goes_and_the_roof_stays(rim):
     depth, rgb = roof(rim)
     clean = trim_outlines(depth, rgb, 5)
@@ -277,12 +256,10 @@ def test_growth_takes_candidates_only_and_changes_nothing_known():
 def test_growth_fills_what_no_view_confirms_and_leaves_blank_surfaces_unknown():
     made = plane_scene(blank=True)
     scene, view = made.scene, made.scene["v2"]
-    options = StereoOptions(levels=2, align=False, speckle=20, tolerance=0.004)
-    known = {}
-    for pixels in (0, 20):
-        chosen = options.replaced(regrow=pixels)
-        stereo = PlaneSweepStereo(scene, options=chosen, views=scene.names)
-        known[pixels] = stereo.depth(scene, view, view.load()).depth
+    options = OPTIONS.replaced(tolerance=0.004)
+    known = {
+        pixels: swept(scene, options=options.replaced(regrow=pixels)).depth for pixels in (0, 20)
+    }
     x = view.camera.centers[0, 0] + made.depths[2] * view.camera.rays()[..., 0]
     textured = x < 0.15
     assert (known[20][textured] > 0).mean() > (known[0][textured] > 0).mean()
@@ -292,21 +269,13 @@ def test_growth_fills_what_no_view_confirms_and_leaves_blank_surfaces_unknown():
     assert np.median(error) < 0.02
 
 
-# One pair of shading and noise; the others with --runslow.
 @pytest.mark.parametrize(
-    ("shading", "noise"),
-    [("bowl", 0.006)]
-    + [
-        pytest.param(*pair, marks=pytest.mark.slow)
-        for pair in (("ramp", 0.0), ("ramp", 0.006), ("bowl", 0.0))
-    ],
+    ("shading", "noise"), [("bowl", 0.006), pytest.param("ramp", 0.0, marks=pytest.mark.slow)]
 )
 def test_shaded_walls_are_not_guessed(shading, noise):
     scene = niche_scene(shading, noise)
-    view = scene["v2"]
-    stereo = PlaneSweepStereo(scene, options=StereoOptions(align=False), views=scene.names)
-    known = stereo.depth(scene, view, view.load()).depth
-    truth, inside = niche_depth(view.camera)
+    known = swept(scene, options=StereoOptions(align=False)).depth
+    truth, inside = niche_depth(scene["v2"].camera)
     back = ndimage.binary_erosion(inside, iterations=5)
     assert (known[back] > 0).mean() < 0.05
     wall = ~inside
@@ -391,8 +360,7 @@ def test_depth_follows_the_scene_units(scale):
         pose[:, :3, 3] *= scale
         views.append(replace(view, camera=replace(view.camera, cam_from_world=pose)))
     scene = replace(made.scene, views=tuple(views))
-    stereo = PlaneSweepStereo(scene, options=OPTIONS, views=scene.names)
-    depth = stereo.depth(scene, scene["v1"], scene["v1"].load()).depth
+    depth = swept(scene, "v1").depth
     known = depth > 0
     assert known.mean() > 0.7
     assert np.median(np.abs(depth[known] / (scale * made.depths[1][known]) - 1)) < 0.005
