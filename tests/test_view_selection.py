@@ -106,28 +106,12 @@ def test_what_hides_behind_a_photographs_own_surface_is_not_seen_by_it():
     assert chosen(wall(0.5)) == ["far"]
 
 
-@pytest.mark.parametrize("scale", [1e-6, 1e6])
-def test_the_choice_hangs_on_no_unit(scale):
-    target = looking((0, 0, 0), 0.0, "target")
-    context = views(
-        looking((0.1 * scale, 0, 0), 1.2, "turned"), looking((0, 0, -2 * scale), 0.0, "behind")
-    )
-    assert covisible(context, target, wall(2.0 * scale)[None], 1) == ["behind"]
-
-
 def test_without_depth_the_nearest_stand_in():
     target = looking((0, 0, 0), 0.0, "target")
     context = views(looking((3, 0, 0), 0.0, "far"), looking((0.1, 0, 0), 0.0, "near"))
     for nothing in (0.0, np.nan, np.inf):
         depth = np.full((1, 30, 40), nothing, np.float32)
         assert covisible(context, target, depth, 1) == ["near"]
-
-
-def test_a_smaller_unit_gives_distance_more_weight():
-    target = looking((0, 0, 0), 0.0, "target")
-    context = views(looking((1, 0, 0), 0.0, "far"), looking((0.1, 0, 0), 1.0, "turned"))
-    chosen = [nearest_views(context, target, 1, unit=unit)[0] for unit in (0.1, 10.0)]
-    assert [context.names[row] for row in chosen] == ["turned", "far"]
 
 
 def test_points_behind_and_beside_a_camera_are_not_in_its_view():

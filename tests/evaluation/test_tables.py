@@ -2,9 +2,7 @@ from __future__ import annotations
 
 import csv
 import io
-from typing import Any
 
-import numpy as np
 import pytest
 
 from gvtools.evaluation.tables import (
@@ -97,13 +95,6 @@ def test_numbers_as_readers_see_them(value, digits, shown, in_latex):
     assert markdown(table).splitlines()[-1] == f"| {shown} |"
     assert latex(table).splitlines()[6].strip() == f"{in_latex} \\\\"
     assert float(next(csv.reader([csv_text(table).splitlines()[1]]))[0]) == value
-
-
-def test_numpys_numbers_are_numbers():
-    row: Any = (np.float32(0.284), np.float32("nan"), np.int64(3))
-    table = Table((Column("a", digits=3), Column("b"), Column("c", digits=2)), (row,))
-    assert markdown(table).splitlines()[-1] == "| 0.284 | – | 3 |"
-    assert csv_text(table).splitlines()[1].split(",")[1:] == ["", "3"]
 
 
 @pytest.mark.parametrize("note", ["# no heading", "- no list", "12. no list", "===", "+ no", "*"])

@@ -222,17 +222,6 @@ def test_a_binned_point_is_the_mean_of_its_four_pixels():
     np.testing.assert_array_equal(binned.free_depth, every.free_depth)
 
 
-def test_only_blocks_that_are_narrow_enough_are_binned():
-    rgb, depth = wall(16, 8, NEAR)
-    depth[:, 8:] = FAR
-    between = back_project(rgb, depth, pinhole(16, 8), **blocks(3 * NEAR / FOCAL))
-    near = between.positions[:, 2] == NEAR
-    assert np.all(between.spacing == between.positions[:, 2] / np.float32(FOCAL))
-    assert near.sum() < len(back_project(rgb, depth, pinhole(16, 8))) / 4
-    every = back_project(rgb, depth, pinhole(16, 8))
-    assert (~near).sum() == (every.positions[:, 2] == FAR).sum()
-
-
 def test_far_blocks_are_binned_where_voxels_widen_with_them():
     rgb, depth = wall(16, 8, NEAR)
     depth[:, 8:] = FAR

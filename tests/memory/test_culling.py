@@ -33,26 +33,6 @@ def test_points_in_front_of_a_cell_by_the_margin_are_in_free_space(seed, toleran
     np.testing.assert_array_equal(found, expected)
 
 
-def test_a_wall_frees_what_is_before_it_and_nothing_else():
-    source = camera(width=64, height=48, focal=60)
-    grid = plane_view(source, 4.0).free_depth
-    where = np.array(
-        [(0, 0, 2), (0, 0, 3.8), (0, 0, 3.95), (0, 0, 5), (0, 0, -2), (9, 0, 2)], np.float32
-    )
-    found = in_free_space(where, [_view(source, grid)], tolerance=0.03)
-    assert found.tolist() == [True, True, False, False, False, False]
-
-
-def test_a_cell_with_an_unmeasured_pixel_frees_nothing():
-    source = camera(width=64, height=48, focal=60)
-    depth = np.full((48, 64), 4, np.float32)
-    depth[24, 32] = 0
-    grid = plane_view(source, depth).free_depth
-    where = np.array([(0.01, 0.01, 2), (0.5, 0.01, 2)], np.float32)
-    found = in_free_space(where, [_view(source, grid)], tolerance=0.03)
-    assert found.tolist() == [False, True]
-
-
 def test_no_view_and_no_grid_free_nothing():
     where = np.array([(0, 0, 2)], np.float32)
     assert not in_free_space(where, [], tolerance=0.0).any()

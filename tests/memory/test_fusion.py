@@ -69,19 +69,6 @@ def test_fusion_does_what_a_plain_dictionary_does(seed, views, capacity, degrees
             assert one.agreement == pytest.approx(two.agreement, rel=1e-5)
 
 
-@settings(max_examples=20, deadline=None)
-@given(seed=st.integers(0, 2**32 - 1), voxel=st.floats(0.003, 3), far=st.floats(0, 1000))
-def test_voxels_are_the_distinct_floors_of_position_over_edge(seed, voxel, far):
-    rng = np.random.default_rng(seed)
-    where = (rng.normal(0, 1, (300, 3)) + far * rng.normal(0, 1, 3)).astype(np.float32)
-    memory = SpatialMemory(voxel, options=ONE_EDGE)
-    report = memory.fuse(points(where), round=0)
-    cells = np.floor(where.astype(float) * (1.0 / voxel))
-    assert memory.voxels == report.voxels == len(memory) == len(np.unique(cells, axis=0))
-    stored = np.floor(memory.columns.positions.astype(float) * (1.0 / voxel))
-    np.testing.assert_array_equal(np.unique(stored, axis=0), np.unique(cells, axis=0))
-
-
 def test_points_of_one_voxel_are_averaged_by_confidence():
     memory = SpatialMemory(1.0, options=ONE_EDGE)
     fresh = points(
@@ -119,15 +106,6 @@ def test_directions_beyond_the_threshold_stand_side_by_side(degrees, kept):
         memory.fuse(points([(0, 0, 4.25)], source=source), round=0)
     assert len(memory) == kept
     assert memory.voxels == 1
-
-
-def test_a_close_up_is_not_averaged_into_a_distant_view():
-    memory = SpatialMemory(0.1, options=ONE_EDGE)
-    memory.fuse(points([(0.05, 0.05, 8.05)], spacing=0.8), round=0)
-    memory.fuse(points([(0.05, 0.05, 8.05)], spacing=0.2), round=0)
-    assert len(memory) == 2
-    memory.fuse(points([(0.05, 0.05, 8.05)], spacing=0.7), round=0)
-    assert len(memory) == 2
 
 
 def test_observed_points_pass_generated_ones_by():
@@ -205,26 +183,6 @@ def test_a_far_wall_is_kept_once_and_seen_whole():
         assert np.abs(seen.rgb[0, 2:-2, 40:-3] * 255 - (200, 90, 30)).max() < 0.6
 
 
-def test_a_coarser_look_leaves_what_was_seen_finely_as_it_is():
-    memory = SpatialMemory(0.1)
-    memory.fuse(points([PLACE], spacing=0.1, source=camera(name="near")), round=0)
-    aside = (PLACE[0] + 0.4, *PLACE[1:])
-    far = points([aside], spacing=0.9, colors=(0, 0, 255), source=camera(name="far"))
-    assert memory.fuse(far, round=0).added == 1
-    records = memory.columns
-    np.testing.assert_allclose(memory.positions[0], PLACE, rtol=1e-6)
-    assert records.colors[0].tolist() == [128, 128, 128]
-    np.testing.assert_allclose(records.spacing[:2], (0.1, 0.9), rtol=1e-6)
-    assert memory.confidence.tolist() == [1.0, 1.0] and records.level[:2].tolist() == [0, 3]
-
-
-def test_a_finer_look_stands_on_its_own():
-    memory = SpatialMemory(0.1)
-    memory.fuse(points([PLACE], spacing=0.9, source=camera(name="far")), round=0)
-    assert memory.fuse(points([PLACE], spacing=0.1), round=0).added == 1
-    assert memory.columns.level[:2].tolist() == [3, 0] and memory.voxels == 2
-
-
 @pytest.mark.parametrize(("known", "made"), [(0.1, 0.9), (0.9, 0.1), (0.9, 0.3), (0.3, 0.9)])
 def test_observed_content_of_any_level_shuts_generated_content_out(known, made):
     memory = SpatialMemory(0.1)
@@ -289,33 +247,6 @@ def test_pictures_of_a_memory_are_those_of_its_file(tmp_path):
     np.testing.assert_array_equal(live, stored)
     one, two = memory.project(source), loaded.project(source)
     np.testing.assert_array_equal(one.rgb, two.rgb)
-
-
-def test_a_view_in_parts_is_the_view():
-    rng = np.random.default_rng(3)
-    where = rng.uniform((-1, -1, 2), (1, 1, 3), (400, 3))
-    # Each place was seen at one footprint, as by a camera.
-    spacing = 0.05 + 0.4 * (where[:, 0] + 1)
-    whole, parts = SpatialMemory(0.1), SpatialMemory(0.1)
-    for memory in (whole, parts):
-        memory.fuse(points(where, spacing=0.2, source=camera(name="first")), round=0)
-    second = camera(center=(0.01, 0, 0), name="second")
-    # Each half's voxels are its own: averages within a voxel are of one fusion.
-    level = whole.levels.of(spacing.astype(np.float32))
-    cell = np.floor(where * (10.0 / 2.0**level)[:, None])
-    _, number = np.unique(np.column_stack([level, cell]), axis=0, return_inverse=True)
-    half = number.ravel() % 2 == 0
-    whole.fuse(points(where, spacing=spacing, source=second), round=0)
-    for rows in (half, ~half):
-        parts.fuse(points(where[rows], spacing=spacing[rows], source=second), round=0)
-    assert len(np.unique(whole.columns.level[: len(whole)])) == 4
-    order = [np.lexsort(memory.columns.positions.T) for memory in (whole, parts)]
-    for name in ("positions", "colors", "confidence", "spacing", "level"):
-        one, two = (
-            getattr(memory.columns, name)[: len(memory)][rows]
-            for memory, rows in zip((whole, parts), order, strict=True)
-        )
-        np.testing.assert_array_equal(one, two, err_msg=name)
 
 
 @pytest.mark.parametrize("seed", range(4))

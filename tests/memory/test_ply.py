@@ -45,22 +45,6 @@ def test_plyfile_reads_what_the_memory_holds(exported):
     np.testing.assert_array_equal(vertex["generated"], memory.generated)
 
 
-def test_open3d_opens_it_with_the_attributes(exported):
-    import open3d as o3d
-
-    memory, path = exported
-    cloud = o3d.t.io.read_point_cloud(str(path))
-    np.testing.assert_allclose(cloud.point.positions.numpy(), memory.positions, atol=1e-6)
-    np.testing.assert_array_equal(cloud.point.colors.numpy(), memory.columns.colors[: len(memory)])
-    for name, expected in (
-        ("confidence", memory.confidence),
-        ("spacing", memory.columns.spacing[: len(memory)]),
-        ("generated", memory.generated),
-        ("view", memory.columns.view[: len(memory)]),
-    ):
-        np.testing.assert_array_equal(cloud.point[name].numpy()[:, 0], expected, err_msg=name)
-
-
 @pytest.mark.parametrize(("far", "kind"), [(0.0, "f4"), (5e6, "f8")])
 def test_far_origins_get_double_coordinates(far, kind, tmp_path):
     rng = np.random.default_rng(0)
@@ -160,15 +144,6 @@ def test_other_kinds_of_ply_are_refused(header, tmp_path):
         read_ply(tmp_path / "other.ply")
     with pytest.raises(MemoryFileError, match="cannot be read"):
         read_ply(tmp_path / "absent.ply")
-
-
-def test_any_table_survives(tmp_path):
-    rng = np.random.default_rng(0)
-    table = np.zeros(50, [("x", "<f8"), ("y", "<f4"), ("z", "<f4"), ("n", "<i4"), ("b", "u1")])
-    for name in "xyznb":
-        table[name] = rng.integers(0, 255, 50)
-    write_ply(tmp_path / "table.ply", table, comments=("a note",))
-    np.testing.assert_array_equal(read_ply(tmp_path / "table.ply"), table)
 
 
 def wall(offset: float = 0.0) -> np.ndarray:

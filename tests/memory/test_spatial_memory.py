@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from memory_scenes import camera, plane_view, points, random_points, saved_bytes
 from scipy.spatial.transform import Rotation
 
@@ -55,16 +53,6 @@ def test_forgetting_the_last_round_leaves_no_trace(seed, tmp_path):
     assert saved_bytes(again, tmp_path) == saved_bytes(_fused(rounds), tmp_path)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_forgetting_after_loading_is_forgetting(seed, tmp_path):
-    rounds = _rounds(seed, 3)
-    before = saved_bytes(_fused(rounds[:2]), tmp_path)
-    _fused(rounds).save(tmp_path / "whole.npz")
-    loaded = SpatialMemory.load(tmp_path / "whole.npz")
-    loaded.forget(round=2)
-    assert saved_bytes(loaded, tmp_path) == before
-
-
 @pytest.mark.parametrize("forgotten", [0, 1])
 def test_forgetting_an_earlier_round_keeps_what_later_ones_stored(forgotten, tmp_path):
     memory = _fused(_rounds(4, 3))
@@ -99,32 +87,6 @@ def test_forgetting_an_earlier_round_keeps_what_later_ones_stored(forgotten, tmp
     assert saved_bytes(memory, tmp_path) == saved_bytes(
         SpatialMemory(0.4, options=OPTIONS), tmp_path
     )
-
-
-@pytest.mark.parametrize("cut", [1, 2])
-def test_resuming_from_a_file_gives_the_bytes_of_an_uninterrupted_run(cut, tmp_path):
-    rounds = _rounds(7, 3)
-    whole = saved_bytes(_fused(rounds), tmp_path)
-    _fused(rounds[:cut]).save(tmp_path / "half.npz")
-    resumed = SpatialMemory.load(tmp_path / "half.npz")
-    assert saved_bytes(_fused(rounds[cut:], start=cut, memory=resumed), tmp_path) == whole
-
-
-@settings(max_examples=15, deadline=None)
-@given(seed=st.integers(0, 2**32 - 1), cut=st.integers(1, 199))
-def test_fusing_in_two_parts_fills_the_same_voxels(seed, cut):
-    rng = np.random.default_rng(seed)
-    where = rng.normal((0, 0, 3), 0.5, (200, 3))
-    whole, parts = SpatialMemory(0.2), SpatialMemory(0.2)
-    whole.fuse(points(where), round=0)
-    parts.fuse(points(where[:cut]), round=0)
-    parts.fuse(points(where[cut:]), round=0)
-    assert parts.voxels == whole.voxels == len(whole) == len(parts)
-
-    def cells(memory):
-        return np.unique(np.floor(memory.columns.positions.astype(float) * (1.0 / 0.2)), axis=0)
-
-    np.testing.assert_array_equal(cells(whole), cells(parts))
 
 
 def test_agreement_of_later_rounds_raises_confidence_and_changes_nothing_else():
@@ -270,15 +232,6 @@ def test_a_turned_memory_is_saved_exported_and_undone(tmp_path):
     )
     loaded.forget(round=2)
     assert not loaded.generated.any() and 0 < len(loaded) < len(memory)
-
-
-def test_points_of_another_frame_are_refused():
-    memory = SpatialMemory(0.1, axes=TURN)
-    source = camera()
-    shape = int(source.height[0]), int(source.width[0])
-    points = back_project(np.zeros((*shape, 3), np.uint8), np.ones(shape, np.float32), source)
-    with pytest.raises(ShapeError, match="back-project with the memory's frame"):
-        memory.fuse(points, round=0)
 
 
 @pytest.mark.parametrize(

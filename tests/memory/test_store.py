@@ -24,18 +24,14 @@ from gvtools.memory.store.octree import (
     ROOT,
     WHOLE,
     Octree,
-    cell_coordinates,
     cell_keys,
 )
 from gvtools.memory.store.tile import DOUBLINGS, thinned_copy
 from gvtools.memory.store.tile_set import TileSet
 from gvtools.memory.store.voxel_index import (
-    COORDINATE_OFFSET,
-    MOST_LEVEL,
     NO_RECORD,
     VoxelIndex,
     VoxelLevels,
-    block_key,
     find_block,
     find_voxel,
     insert_voxel,
@@ -63,15 +59,6 @@ def test_the_cloud_holds_every_attribute_in_the_memory_that_kernels_write():
     np.testing.assert_array_equal(_attribute(memory, "round")[:, 0], memory.views.round[view])
     for expected in (memory.generated, memory.views.generated[view]):
         np.testing.assert_array_equal(_attribute(memory, "generated")[:, 0], expected)
-
-
-def test_an_agreement_shows_in_a_cloud_that_was_taken_before():
-    memory = SpatialMemory(0.5)
-    memory.fuse(points([(0.1, 0.1, 2.1)], confidence=0.5), round=0)
-    memory.columns.reserve(10)
-    cloud = memory.cloud
-    memory.fuse(points([(0.3, 0.3, 2.3)], confidence=0.75), round=1)
-    assert cloud.point.confidence.numpy().tolist() == [[1.25]]
 
 
 def test_growth_keeps_what_is_there_and_a_cloud_of_before_stays_whole():
@@ -111,35 +98,6 @@ def test_observing_is_lifting_and_fusing():
     lifted = plane_view(camera(**SIZE), 2.0)
     assert whole.points == len(lifted) and not whole.dropped["masked"]
     assert (report + whole).dropped["masked"] == 600
-
-
-def test_open3d_works_on_the_cloud_as_on_any():
-    memory = random_memory(3, most=200)
-    cloud, positions = memory.cloud, memory.columns.positions
-    low, high = np.percentile(positions, 30, axis=0), np.percentile(positions, 70, axis=0)
-    inside = ((positions >= low) & (positions <= high)).all(axis=1)
-    box = o3d.t.geometry.AxisAlignedBoundingBox(
-        o3d.core.Tensor(low.astype(np.float32)), o3d.core.Tensor(high.astype(np.float32))
-    )
-    assert len(cloud.crop(box).point.positions) == inside.sum() > 0
-    made = cloud.select_by_mask(o3d.core.Tensor(memory.generated))
-    np.testing.assert_array_equal(
-        made.point.confidence.numpy()[:, 0], memory.confidence[memory.generated]
-    )
-    coarse = cloud.voxel_down_sample(0.5)
-    assert 0 < len(coarse.point.positions) < len(memory)
-    copy = cloud.clone()
-    copy.estimate_normals(10)
-    assert copy.point.normals.shape == [len(memory), 3] and "normals" not in memory.cloud.point
-
-
-@pytest.mark.parametrize("kind", ["ply", "pcd"])
-def test_open3d_writes_every_attribute(kind, tmp_path):
-    memory, path = random_memory(3), tmp_path / f"cloud.{kind}"
-    assert o3d.t.io.write_point_cloud(str(path), memory.cloud)
-    read = o3d.t.io.read_point_cloud(str(path))
-    for name in ATTRIBUTES:
-        np.testing.assert_array_equal(read.point[name].numpy(), _attribute(memory, name))
 
 
 def test_a_memory_of_its_own_cloud_is_the_same_memory():
@@ -235,17 +193,6 @@ def test_float_colours_are_those_of_the_photograph_and_others_are_refused():
         of_bytes.observe(rgb, None, view, round=1)
 
 
-def test_block_keys_are_unique_and_not_negative():
-    far = COORDINATE_OFFSET - 1
-    axis = (-far, -2, -1, 0, 1, 7, far)
-    keys = {
-        int(block_key(x, y, z, level))
-        for x in axis for y in axis for z in axis for level in (0, 1, MOST_LEVEL)
-    }  # fmt: skip
-    assert len(keys) == 3 * len(axis) ** 3
-    assert min(keys) >= 0
-
-
 @settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), batches=st.integers(1, 5))
 def test_blocks_are_numbered_like_a_dictionary_would(seed, batches):
@@ -311,35 +258,6 @@ def test_a_voxel_of_any_level_lies_in_one_cell():
         cell_of: dict[tuple[int, int], int] = {}
         for voxel, cell in zip(keys_at(positions, level), cells.tolist(), strict=True):
             assert cell_of.setdefault(voxel, cell) == cell
-
-
-def test_tiles_follow_divisions():
-    tree, levels = Octree(), VoxelLevels(VOXEL)
-    rng = np.random.default_rng(1)
-    positions = rng.uniform(0.1, 5.0, (300, 3)).astype(np.float32)
-    spacing = np.full(300, VOXEL, np.float32)
-    numbers, made = tree.tiles_of(positions, spacing, levels, free=0)
-    assert made == [WHOLE] and not numbers.any()
-    level = 4
-    node = WHOLE
-    tree.divide(node)
-    while node[0] > level:
-        tree.divided.add(node)
-        cell = cell_coordinates(cell_keys(positions[:1], VOXEL))[0] >> (node[0] - 1)
-        node = (node[0] - 1, *cell.tolist())
-    tree.divided.add(node)
-    numbers, made = tree.tiles_of(positions, spacing, levels, free=1)
-    cells = cell_coordinates(cell_keys(positions, VOXEL)) >> (level - 1)
-    assert {n[1:] for n in made} == set(map(tuple, cells.tolist()))
-    of = {
-        tuple(cell): number for cell, number in zip(cells.tolist(), numbers.tolist(), strict=True)
-    }
-    assert of == {n[1:]: i for i, n in enumerate(made, 1)}
-    families = tree.families()
-    assert set(families) == {node} and sorted(families[node]) == sorted(made)
-    tree.join(node, made, 50)
-    numbers, made = tree.tiles_of(positions, spacing, levels, free=51)
-    assert made == [] and set(numbers.tolist()) == {50}
 
 
 def test_new_tiles_are_as_large_as_divided_ones_in_proportion_to_their_voxels():

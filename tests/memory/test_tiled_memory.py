@@ -163,11 +163,6 @@ def test_a_view_none_of_whose_points_is_usable_changes_nothing(tmp_path):
     assert (report.added, len(memory), len(memory.views)) == (0, before, VIEWS + 1)
 
 
-def test_forgetting_unknown_rounds_is_refused(tiled):
-    with pytest.raises(OptionError, match="round 7 is not in the memory"):
-        tiled[0].forget(round=7)
-
-
 def test_compaction_joins_tiles_and_changes_nothing_else(tmp_path, monkeypatch):
     memory, _ = in_tiles(tmp_path)
     expected, _ = in_ram()

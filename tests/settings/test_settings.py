@@ -1,29 +1,20 @@
 from __future__ import annotations
 
 import json
-from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gvtools.depth.options import FoundationOptions, StereoOptions
+from gvtools.depth.options import StereoOptions
 from gvtools.errors import OptionError
-from gvtools.scenes.rgbd import RgbdOptions
 from gvtools.settings import changes, listing, markdown, with_file, with_texts, with_values
-from gvtools.settings.base import Settings, entries, keys
-from gvtools.training.corruption import CorruptionOptions
+from gvtools.settings.base import keys
 from gvtools.training.options import (
-    DataOptions,
-    DenoiserStageOptions,
-    EncoderStageOptions,
-    HeadsStageOptions,
-    OptimizerOptions,
-    ReflowStageOptions,
     TrainingSettings,
 )
 from pipelines.cli import main
-from pipelines.reconstruction.settings import FusionOptions, RunSettings, SavingsOptions
+from pipelines.reconstruction.settings import RunSettings
 
 RUN = RunSettings()
 
@@ -82,36 +73,6 @@ def test_a_bad_file_is_named(tmp_path, text):
     path.write_text(text)
     with pytest.raises(OptionError, match=r"c\.json: "):
         with_file(RUN, path)
-
-
-SECTIONS: list[tuple[Settings, str]] = [
-    (kind(), name)
-    for kind in (FusionOptions, SavingsOptions, StereoOptions, FoundationOptions, RgbdOptions,
-                 RunSettings, OptimizerOptions, EncoderStageOptions, DenoiserStageOptions,
-                 ReflowStageOptions, HeadsStageOptions, DataOptions, CorruptionOptions)
-    for name, entry in entries(kind).items()
-    if entry.limits
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("section", "name"), SECTIONS, ids=[f"{type(s).__name__}.{n}" for s, n in SECTIONS]
-)
-def test_a_range_holds_its_ends_and_nothing_beyond(section, name):
-    for end, limit in entries(type(section))[name].limits.items():
-        beyond = limit + (1 if end in ("at most", "less than") else -1)
-        included = end.startswith("at")
-        for value in [beyond, float("nan"), *([] if included else [limit])]:
-            with pytest.raises(OptionError, match=rf"{name} .*; expected "):
-                section.replaced(**{name: value})
-        # Other fields have to fit an end.
-        room: dict[str, Any] = {}
-        if name == "views" and isinstance(section, StereoOptions):
-            room = {"sources": 8}
-        if name == "scene_share" and limit == 1:
-            room = {"scenes": ("scan",)}
-        if included and not (name == "sources" and limit == 0):
-            assert getattr(section.replaced(**room, **{name: limit}), name) == limit
 
 
 FIELDS = st.fixed_dictionaries(
