@@ -29,7 +29,6 @@ from gvtools.appearance.fit_options import (
     most_gaussians,
 )
 from gvtools.appearance.loss import ESTIMATE, ESTIMATE_TOLERANCE, add_depth
-from gvtools.appearance.splat.project_kernels import SH
 from gvtools.appearance.splat.splat import Lens, Splat
 from gvtools.poses.views import FitView, reduce_view
 
@@ -268,16 +267,6 @@ def test_a_photograph_that_is_masked_everywhere_validates_nothing():
     assert np.isfinite(fit.left_out_psnr())
     fit._add_validation()
     assert list(fit.predicted) == [second]
-
-
-def test_harmonics_join_one_degree_after_the_other(views):
-    fit = Fit(rough_gaussians(), views, options=FitOptions())
-    for degree, share in ((0, 0.0), (1, 0.13), (2, 0.25)):
-        for _ in range(3):
-            fit.step(share)
-        used = SH + 3 * (degree + 1) ** 2
-        assert fit.gaussians.values[:, used - 3 : used].any()
-        assert not fit.gaussians.values[:, used:].any()
 
 
 def test_there_are_never_more_gaussians_than_allowed(views):

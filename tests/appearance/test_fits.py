@@ -8,7 +8,6 @@ from splat_scene import photographs, rough_gaussians, walk
 
 from gvtools.appearance import fit as module
 from gvtools.appearance import fit_options
-from gvtools.appearance.appearance import mean_picture
 from gvtools.appearance.fit import Fit, run_fits, with_chosen_backdrop
 from gvtools.appearance.fit_options import FitOptions
 
@@ -59,35 +58,12 @@ def test_all_fits_together_have_no_more_gaussians_than_allowed():
     assert len(run_fits(fit_of(steps=900, most_gaussians=alone))) == 1
 
 
-def test_progress_grows_to_the_end():
-    told: list[float] = []
-    run_fits(fit_of(steps=30), report=lambda fit, share: told.append(share))
-    assert told == sorted(told)
-    assert told == pytest.approx([1 / 3, 2 / 3, 1.0, 1.0])
-
-
 def test_fits_end_when_left_out_photographs_gain_nothing(monkeypatch):
     gains = iter([0.5, 0.01, 0.5])
     monkeypatch.setattr(module, "_gain", lambda fits, fit: next(gains))
     assert len(run_fits(fit_of(8, steps=160))) == 3
     gains = iter([0.5, -0.01, 0.5])
     assert len(run_fits(fit_of(8, steps=160))) == 2
-
-
-def test_what_another_fit_gains_is_that_of_the_mean_of_both():
-    first, second = fit_of(8, steps=60), fit_of(8, steps=60)
-    second.rng = np.random.default_rng(5)
-    for fit in (first, second):
-        fit.run()
-    gain = module._gain([first], second)
-    alone = first.psnr_of(first.predicted)
-    both = {
-        row: mean_picture([shown, second.predicted[row]]) for row, shown in first.predicted.items()
-    }
-    assert gain == pytest.approx(first.psnr_of(both) - alone, abs=1e-6)
-    assert gain != 0
-    assert module._gain([first], first) == pytest.approx(0, abs=1e-6)
-    assert module._gain([first], fit_of(steps=1)) is None
 
 
 def test_a_fit_that_goes_on_with_another_stays_the_only_one():

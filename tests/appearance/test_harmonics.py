@@ -18,7 +18,7 @@ from gvtools.appearance.splat.splat import Lens, Splat
 from gvtools.cameras import Cameras
 from gvtools.errors import MemoryFileError
 from gvtools.memory.store.local_frame import LocalFrame
-from gvtools.splats import harmonics, turn_gaussians, turn_harmonics
+from gvtools.splats import harmonics, turn_gaussians
 
 AXES = Rotation.from_rotvec([0.4, -1.1, 2.0]).as_matrix()
 
@@ -44,15 +44,6 @@ def test_harmonics_are_those_of_splat_files():
     drawn = np.random.default_rng(0).normal(size=(50, 3))
     drawn /= np.linalg.norm(drawn, axis=1, keepdims=True)
     np.testing.assert_allclose(harmonics(drawn, 2), reference(torch.from_numpy(drawn)), atol=1e-12)
-
-
-def test_harmonics_turn_within_their_degree():
-    matrix = turn_harmonics(AXES)
-    np.testing.assert_allclose(matrix @ matrix.T, np.eye(16), atol=1e-12)
-    outside = np.ones((16, 16), bool)
-    for first, last in ((0, 1), (1, 4), (4, 9), (9, 16)):
-        outside[first:last, first:last] = False
-    np.testing.assert_allclose(matrix[outside], 0, atol=1e-12)
 
 
 def test_turned_gaussians_give_the_same_picture(coloured):

@@ -16,7 +16,6 @@ from gvtools.appearance.population import (
     FAINTEST,
     LARGEST,
     MOST_OPAQUE,
-    NEGLIGIBLE,
     NEIGHBOURS,
     SHRINK,
     Population,
@@ -130,15 +129,6 @@ def some_values() -> np.ndarray:
     values = rough_gaussians().values
     values[:, LOGIT] = np.linspace(-5, 6, len(values))
     return values
-
-
-def test_a_negligible_share_leaves_all_as_they_are():
-    values = some_values()
-    sample = Sample(values, NEGLIGIBLE / 2, rng=np.random.default_rng(0))
-    gradients, seen = np.ones((3, VALUES), np.float32), np.array([1, 5, 9])
-    assert sample.values is values
-    np.testing.assert_array_equal(sample.back(seen, gradients), seen)
-    assert (gradients == 1).all()
 
 
 def test_those_that_are_left_stop_the_light_of_those_that_are_missing():

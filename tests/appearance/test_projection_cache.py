@@ -126,14 +126,6 @@ def test_holes_take_the_colours_of_gaussians_that_show_a_surface(memory, monkeyp
     assert (colors[guess] == 0.75).all() and (colors[~guess] == 0.25).all()
 
 
-def test_a_camera_that_sees_nothing_sees_what_comes(memory):
-    away = CachedProjection(memory, camera(0.0, np.pi))
-    assert not away.guidance().valid.any()
-    fuse(memory, camera(0.0, np.pi), 5, generated=True, round=1)
-    assert same(away.guidance(), memory.project(away.camera))
-    assert away.guidance().generated.any()
-
-
 def test_looking_ahead_beside_fusions_gives_the_picture_of_a_whole_projection(memory):
     """As a run does: generated content of a round arrives while the next round is looked at."""
     fuse(memory, camera(-0.6, -0.2), 3, generated=True, round=1)

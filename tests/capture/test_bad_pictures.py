@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import cv2
 import numpy as np
@@ -13,11 +11,10 @@ import pycolmap
 import pytest
 from command_line import refused
 from PIL import Image, ImageFilter
-from scipy.spatial.transform import Rotation
 from walls import walk
 
-from gvtools.capture.mapping import _explained, find_cameras
-from gvtools.capture.matching import MappingTask, only_turned
+from gvtools.capture.mapping import find_cameras
+from gvtools.capture.matching import MappingTask
 from gvtools.capture.photographs import complete_masks, copy_upright, find_photographs
 from gvtools.capture.project import capture_photographs
 from gvtools.errors import ProjectError
@@ -189,35 +186,6 @@ def test_a_walk_past_something_flat_is_kept_and_told(texture: Image.Image, tmp_p
     true = np.array([[x, 0.1 * (index % 2), 0] for index, x in enumerate(places)])
     there = fit_similarity(found, true).apply(found)
     assert np.linalg.norm(there - true, axis=1).max() < 0.02
-
-
-def test_a_turn_is_told_from_a_walk_by_its_homographies() -> None:
-    K = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
-    turned, walked = [], []
-    for step in range(1, 6):
-        R = Rotation.from_euler("yx", [3.0 * step, step], degrees=True).as_matrix()
-        away = np.outer([0.05 * step, 0, 0], [0.1, 0, 1])
-        turned.append((2.5 * K @ R @ np.linalg.inv(K), (320, 240)))
-        walked.append((K @ (R - away) @ np.linalg.inv(K), (320, 240)))
-    assert only_turned(turned) and not only_turned(walked) and not only_turned([])
-
-
-def test_matches_of_another_place_are_no_fault_of_the_model() -> None:
-    def model(names: list[str], points: int) -> Any:
-        images = {
-            key: SimpleNamespace(image_id=key, name=name, has_pose=True)
-            for key, name in enumerate(names)
-        }
-        track = SimpleNamespace(elements=[SimpleNamespace(image_id=key) for key in images])
-        return SimpleNamespace(
-            images=images, num_reg_images=lambda: len(names),
-            points3D={key: SimpleNamespace(track=track) for key in range(points)},
-        )  # fmt: skip
-
-    models = [model(["c", "d"], 10), model(["a", "b", "e"], 90)]
-    pairs = {("a", "b"): 100, ("c", "d"): 50, ("b", "d"): 20}
-    assert _explained(models, pairs) == pytest.approx(90 / 120)
-    assert _explained(models[1:], pairs) == pytest.approx(90 / 170)
 
 
 def test_pictures_of_phones_that_are_not_read_are_named(texture, tmp_path):

@@ -69,9 +69,7 @@ def test_poses_are_found_from_colour_and_depth(walked, recording, captured) -> N
     for path in recording.glob("frame-*"):
         assert (captured / path.name).read_bytes() == path.read_bytes()
     assert not list(captured.parent.glob(".*"))
-
-
-def test_found_poses_keep_all_their_digits(captured) -> None:
+    # All their digits are kept.
     pose = np.loadtxt(captured / "frame-000005.pose.txt")
     np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-9)
 

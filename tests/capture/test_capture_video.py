@@ -54,8 +54,5 @@ def test_a_video_without_motion_is_refused(tmp_path: Path, wall: np.ndarray) -> 
     path = write_video(tmp_path / "still.mp4", [wall[:, :WIDTH].copy()] * 20)
     with pytest.raises(ProjectError, match="expected a camera that moves"):
         pick_frames(path, tmp_path / "frames", progress=lambda n: None)
-    (tmp_path / "no.mp4").write_bytes(b"no video")
-    with pytest.raises(ProjectError, match="no video that OpenCV reads"):
-        pick_frames(tmp_path / "no.mp4", tmp_path / "frames", progress=lambda n: None)
     with pytest.raises(OptionError, match="expected 2 or more"):
         pick_frames(path, tmp_path / "frames", count=1, progress=lambda n: None)

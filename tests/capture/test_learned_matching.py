@@ -17,7 +17,6 @@ from gvtools.capture.mapping import find_cameras
 from gvtools.capture.matching import MappingTask
 from gvtools.errors import CheckpointError, OptionError
 from gvtools.features import Features, LightGlueMatcher, SiftMatcher
-from gvtools.procedural.room_sample import write_room
 from gvtools.scenes.project import open_project
 
 
@@ -113,16 +112,6 @@ def test_what_a_matcher_finds_becomes_a_model(room: Path, tmp_path: Path) -> Non
     mapped = find_cameras(MappingTask(room / "images", [names], tmp_path, learned=SiftMatcher()))
     assert mapped.matching == "all pairs"
     assert error_of(mapped.model, room, least=6) < 0.03
-
-
-@pytest.mark.slow
-def test_a_model_comes_of_random_networks(weights, tmp_path):
-    """What DISK with random weights finds in neighbours is alike enough for a rough model."""
-    room = write_room(tmp_path / "room", views=10, width=360, height=270).folder
-    names = sorted(path.name for path in (room / "images").iterdir())[:4]
-    matcher = LightGlueMatcher("disk", weights=weights, max_features=1024)
-    mapped = find_cameras(MappingTask(room / "images", [names], tmp_path, learned=matcher))
-    assert error_of(mapped.model, room, least=4) < 0.2
 
 
 @pytest.mark.slow

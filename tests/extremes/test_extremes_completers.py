@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from gvtools.completers import Completer, Completion, ContextView, create
-from gvtools.completers.geoverse.composition import MOST, correct_depth
 from gvtools.completers.push_pull import push_pull, push_pull_depth
 from gvtools.errors import OptionError, ShapeError
 from gvtools.guidance import Guidance
@@ -177,14 +176,6 @@ def test_depth_of_a_photograph_that_is_none_counts_as_none(completers, name):
     np.testing.assert_array_equal(made.depth, plain.depth)
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_arrays_that_do_not_fit_each_other_are_refused(completers, name):
-    known = micro.guidance(1, size=SIZE)
-    for changes in ({"rgb": known.rgb[..., :1]}, {"valid": known.valid[0]}):
-        with pytest.raises(ShapeError, match="guidance"):
-            complete(completers, name, micro.context_views(1), replace(known, **changes))
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float16])
 @pytest.mark.parametrize("size", [(1, 1), (1, 9), (65, 47)])
 def test_one_known_pixel_fills_everything_and_none_fills_nothing(dtype, size):
@@ -196,19 +187,3 @@ def test_one_known_pixel_fills_everything_and_none_fills_nothing(dtype, size):
     rounding = 4 * torch.finfo(dtype).eps
     for filled in (push_pull(values, valid), push_pull_depth(values[:, :1], valid)):
         torch.testing.assert_close(filled, torch.full_like(filled, 2.5), rtol=rounding, atol=0)
-
-
-def halves() -> tuple[torch.Tensor, torch.Tensor]:
-    generator = torch.Generator().manual_seed(0)
-    valid = torch.zeros(1, 1, 16, 16, dtype=torch.bool)
-    valid[..., :8] = True
-    return torch.rand(1, 3, 16, 16, generator=generator) + 0.5, valid
-
-
-def test_a_correction_of_depth_saturates():
-    filled, valid = halves()
-    wild = torch.where(valid, filled[:, :1], filled[:, :1] * 1e30)
-    for made, hint, factor in ((wild, filled[:, :1], MOST), (filled[:, :1], wild, 1 / MOST)):
-        found = correct_depth(filled[:, :1], made, hint, valid=valid)
-        hole = ~valid
-        torch.testing.assert_close(found[hole], factor * filled[:, :1][hole])

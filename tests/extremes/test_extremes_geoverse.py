@@ -12,7 +12,6 @@ from gvtools.completers.geoverse.flow import (
     MOST_SHIFT,
     check_bounds,
     clean_from_velocity,
-    integrate,
     interpolate,
     interval_bounds,
     interval_times,
@@ -20,7 +19,6 @@ from gvtools.completers.geoverse.flow import (
     sample,
     seeded_noise,
     shift_time,
-    training_times,
     unshift_time,
     velocity_from_clean,
     velocity_target,
@@ -134,23 +132,6 @@ def test_grids_of_any_length_fall_strictly(steps, shift):
     assert len(check_bounds(interval_bounds(steps, shift=shift))) == steps + 1
 
 
-def test_one_time_and_no_sample_change_nothing():
-    state = torch.ones(1, 2)
-    assert torch.equal(integrate(lambda x, t: x, state, (1.0,)), state)
-    assert sample(lambda x, t: x, state[:0], (1, 0)).shape == (0, 2)
-
-
-def test_training_times_keep_their_ends_at_every_shift():
-    uniform = torch.tensor([0.0, 1 - 2**-24])
-    for shift in (1 / MOST_SHIFT, 1.0, MOST_SHIFT):
-        for most in (0.999, 1.0):
-            times = training_times(uniform, shift=shift, most=most)
-            assert times[0] == 0 and 0 < times[1] <= 1
-    for most in (0.0, 1.1, math.nan):
-        with pytest.raises(OptionError, match="training time"):
-            training_times(uniform, most=most)
-
-
 @settings(max_examples=150, deadline=None)
 @given(
     st.floats(0.001, 0.95),
@@ -194,25 +175,6 @@ def everywhere(images: torch.Tensor) -> torch.Tensor:
 def test_constant_pictures_of_any_brightness_size_and_precision_have_no_weight(value, dtype, size):
     images = torch.full((1, 2, 3, *size), value, dtype=dtype)
     assert not gradient_weights(images, everywhere(images)).any()
-
-
-@pytest.mark.parametrize("size", [(1, 1), (1, 9), (9, 1), (2, 2)])
-def test_the_smallest_pictures_have_weights(size):
-    images = pictures(size=size)
-    weights = gradient_weights(images, everywhere(images))
-    assert weights.shape == (1, 2, *size)
-    assert weights.isfinite().all()
-    assert bool(weights.any()) is (size != (1, 1))
-
-
-@pytest.mark.parametrize("poison", [math.nan, math.inf, 3e38])
-def test_masks_of_nothing_and_of_one_pixel_leave_no_trace_of_the_rest(poison):
-    images = torch.full((1, 2, 3, *SIZE), poison)
-    valid = torch.zeros(1, 2, *SIZE, dtype=torch.bool)
-    assert not gradient_weights(images, valid).any()
-    valid[0, 1, 4, 4] = True
-    images[0, 1, :, 4, 4] = 0.5
-    assert not gradient_weights(images, valid).any()
 
 
 @pytest.mark.parametrize("poison", [math.nan, math.inf, -math.inf])

@@ -180,17 +180,6 @@ def test_seven_decades_of_depth_in_one_picture(near, far, voxel, backend):
     assert seen.valid[0, 2:-2, -60:-4].all()
 
 
-@pytest.mark.parametrize("backend", BLENDING)
-def test_what_is_nearer_than_a_voxel_is_left_open_and_not_misdrawn(backend):
-    """The documented end of the range: the camera stands inside the voxel."""
-    source = camera(**WIDE)
-    memory = SpatialMemory(1e-2)
-    memory.fuse(plane_view(source, _halves(1e-4, 5e4)), round=0)
-    seen = memory.project(source, options=SplatOptions(backend=backend))
-    assert seen.depth[seen.valid].min() == pytest.approx(5e4, rel=1e-5)
-    assert not seen.valid[0, :, : WIDE["width"] // 2 - 4].any()
-
-
 def test_what_is_too_far_is_counted():
     source = camera(**WIDE)
     memory = SpatialMemory(1e-4)
@@ -355,19 +344,6 @@ def test_all_points_in_one_pixel(count, backend):
     np.testing.assert_allclose(
         seen.rgb[seen.valid] * 255, np.tile((10, 20, 30), (len(beside), 1)), atol=0.01
     )
-
-
-@pytest.mark.parametrize("degrees", [1.0, 60.0, 170.0])
-@pytest.mark.parametrize("shift", [0.5, 1e-3, 1 - 1e-3])
-def test_every_part_of_a_pixel_belongs_to_one_pixel(shift, degrees):
-    f = focal(degrees)
-    columns, rows = np.meshgrid(np.arange(SIZE["width"]), np.arange(SIZE["height"]))
-    depth = 4.0
-    x = (columns + shift - SIZE["width"] / 2) / f * depth
-    y = (rows + shift - SIZE["height"] / 2) / f * depth
-    xyz = [axis.ravel().astype(np.float32) for axis in (x, y, np.full(x.shape, depth))]
-    image = project_nearest(np.stack(xyz, 1), camera(**SIZE, focal=f))
-    np.testing.assert_array_equal(image.index, np.arange(columns.size).reshape(columns.shape))
 
 
 @pytest.mark.parametrize("backend", BLENDING)

@@ -20,7 +20,6 @@ from scipy.spatial import cKDTree
 from gvtools.cameras import Cameras, check_usable
 from gvtools.errors import OptionError, ShapeError
 from gvtools.memory.back_projection import back_project
-from gvtools.memory.ply import export_memory_ply
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.splat.api import SplatOptions
 from gvtools.memory.store.voxel_index import VOXEL_RANGE, rounded_origin
@@ -108,21 +107,6 @@ def test_an_origin_where_float64_is_coarser_than_voxels_is_refused():
     with pytest.raises(OptionError, match="move the scene nearer to 0 or take an edge of") as e:
         SpatialMemory(2e-8, origin=(0, -1e7, 0))
     assert "\n" not in str(e.value)
-
-
-@pytest.mark.parametrize("scale", [1e-6, 1e-3, 1, 1e4])
-def test_a_ply_of_any_unit_keeps_its_points(scale, tmp_path):
-    rng = np.random.default_rng(0)
-    offset = np.array((0.4, -12.3, 7.45))
-    where = offset + scale * rng.uniform(-1, 1, (400, 3))
-    memory = SpatialMemory(0.05 * scale, origin=offset)
-    memory.fuse(points(where, origin=offset, spacing=0.05 * scale), round=0)
-    path = tmp_path / "cloud.ply"
-    export_memory_ply(memory, path)
-    again = SpatialMemory.from_ply(path)
-    apart, _ = cKDTree(again.positions).query(memory.positions)
-    # A fiftieth of the voxels that were written: points that shared a voxel are averaged.
-    assert np.median(apart) < 1e-3 * scale
 
 
 def test_an_origin_in_whole_units_stays_where_it_suffices():

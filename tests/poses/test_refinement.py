@@ -69,17 +69,19 @@ def test_relative_poses_come_back_and_the_whole_stays_where_it_was(views, truth)
     np.testing.assert_allclose(align_poses(found, poses_of(some)), np.eye(4), atol=1e-9)
 
 
-def test_views_may_be_of_different_sizes(views, truth):
+def test_views_may_have_sizes_and_intrinsics_of_their_own(views, truth):
     some = off(views)
-    for row in (0, 5):
+    for row in (0, 3, 5):
         view = some[row]
         assert view.depth is not None
-        some[row] = replace(
-            view,
-            rgb=view.rgb[::2, ::2],
-            depth=view.depth[::2, ::2],
-            K=np.diag([0.5, 0.5, 1]) @ view.K,
-        )
+        K, rgb, depth = view.K.copy(), view.rgb[::2, ::2], view.depth[::2, ::2]
+        if row == 3:
+            K[:2, 2] += 4
+            rgb = np.pad(view.rgb, ((4, 0), (4, 0), (0, 0)), mode="edge")[:-4, :-4]
+            depth = np.pad(view.depth, ((4, 0), (4, 0)))[:-4, :-4]
+        else:
+            K[:2] /= 2
+        some[row] = replace(view, K=K, rgb=rgb, depth=depth)
     before, after = pose_errors(poses_of(some), truth), pose_errors(agreeing_poses(some), truth)
     assert after[0] < 0.6 * before[0]
 
@@ -112,33 +114,15 @@ def test_the_unit_of_length_does_not_matter(views, truth, unit):
     np.testing.assert_allclose(found, expected, atol=2e-3)
 
 
-def test_views_may_have_intrinsics_of_their_own(views, truth):
-    some = off(views)
-    wide = some[3]
-    K = wide.K.copy()
-    K[:2, 2] += 4
-    rgb = np.pad(wide.rgb, ((4, 0), (4, 0), (0, 0)), mode="edge")[:-4, :-4]
-    assert wide.depth is not None
-    depth = np.pad(wide.depth, ((4, 0), (4, 0)))[:-4, :-4]
-    some[3] = replace(wide, K=K, rgb=rgb, depth=depth)
-    before, after = pose_errors(poses_of(some), truth), pose_errors(agreeing_poses(some), truth)
-    assert after[0] < 0.5 * before[0]
-
-
 def test_views_that_see_nothing_in_common_stay_where_they_were(views):
-    apart = [
-        replace(view, cam_from_local=view.cam_from_local @ _shift(100 * row))
-        for row, view in enumerate(views[:3])
-    ]
+    apart = []
+    for row, view in enumerate(views[:3]):
+        pose = view.cam_from_local.copy()
+        pose[0, 3] += 100 * row
+        apart.append(replace(view, cam_from_local=pose))
     np.testing.assert_allclose(agreeing_poses(apart), poses_of(apart), atol=1e-6)
     empty = [replace(view, depth=np.zeros_like(view.depth)) for view in views[:3]]
     np.testing.assert_array_equal(agreeing_poses(empty), poses_of(empty))
-
-
-def _shift(x: float) -> np.ndarray:
-    motion = np.eye(4)
-    motion[0, 3] = x
-    return motion
 
 
 def test_every_camera_is_compared_with_the_nearest():

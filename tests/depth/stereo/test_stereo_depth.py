@@ -211,13 +211,6 @@ def test_a_rim_in_the_sky_goes_and_the_roof_stays(rim):
     assert (clean[30:] == 2).all()
 
 
-def test_depth_of_a_whole_wall_stays_round_a_hole():
-    rgb = np.full((60, 60, 3), 128, np.uint8)
-    depth = np.full((60, 60), 2.0, np.float32)
-    depth[20:30, 20:30] = 0
-    np.testing.assert_array_equal(trim_outlines(depth, rgb, 5), depth)
-
-
 def test_compiled_trimming_equals_the_plain_one():
     rng = np.random.default_rng(0)
     rgb = np.repeat(np.repeat(rng.integers(0, 80, (6, 8, 3)), 5, 0), 5, 1).astype(np.uint8)
@@ -239,18 +232,6 @@ def test_growth_stops_at_colour_at_depth_and_after_its_steps():
     near = regrow(seed, candidates, rgb, 0.03, 7)
     y, x = np.mgrid[0:60, 0:60]
     np.testing.assert_array_equal(near > 0, np.abs(y - 45) + np.abs(x - 10) <= 7)
-
-
-def test_growth_takes_candidates_only_and_changes_nothing_known():
-    rng = np.random.default_rng(1)
-    rgb = np.full((40, 40, 3), 90, np.uint8)
-    depth = np.where(rng.uniform(size=(40, 40)) < 0.2, 2.0, 0.0).astype(np.float32)
-    candidates = np.where(rng.uniform(size=(40, 40)) < 0.5, 2.02, 0.0).astype(np.float32)
-    grown = regrow(depth, candidates, rgb, 0.03, 5)
-    np.testing.assert_array_equal(grown[depth > 0], depth[depth > 0])
-    new = (grown > 0) & (depth == 0)
-    assert new.any()
-    np.testing.assert_array_equal(grown[new], candidates[new])
 
 
 def test_growth_fills_what_no_view_confirms_and_leaves_blank_surfaces_unknown():

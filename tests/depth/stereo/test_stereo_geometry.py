@@ -16,7 +16,6 @@ from gvtools.depth.stereo.filtering import agreement
 from gvtools.depth.stereo.geometry import (
     choose_sources,
     estimate_range,
-    parallax,
     range_of_depths,
     seen_points,
 )
@@ -117,11 +116,6 @@ def test_only_candidates_are_chosen():
     chosen = choose_sources(scene, "v2", ("v0", "v1", "v2"), count=4, depths=depths)
     assert set(chosen) == {"v0", "v1"}
     assert choose_sources(scene, "v2", ("v2",), count=4, depths=depths) == ()
-
-
-def test_parallax_of_a_right_triangle():
-    angle = parallax(np.zeros(3), np.array([[1.0, 0, 0]]), np.array([[0.0, 0, 1]]))
-    assert angle[0, 0] == pytest.approx(45)
 
 
 def test_agreement_counts_and_averages_views():
