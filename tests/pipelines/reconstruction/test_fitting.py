@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 import signal
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +19,7 @@ from gvtools.appearance.population import from_points
 from gvtools.appearance.splat.project_kernels import VALUES
 from gvtools.depth.foundation import FoundationDepth
 from gvtools.depth.source import DepthMap
-from gvtools.errors import DegenerateError, MemoryFileError, ProjectError
+from gvtools.errors import DegenerateError, MemoryFileError
 from gvtools.memory.projection import project
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.store.local_frame import LocalFrame
@@ -150,13 +149,6 @@ def test_resuming_after_round_0_gives_the_same_bytes_without_a_second_fit(
     assert untimed(tmp_path / "run") == untimed(whole)
 
 
-def test_a_damaged_fit_is_named_when_a_run_is_resumed(whole, scan, tmp_path):
-    out = shutil.copytree(whole, tmp_path / "run")
-    (out / FITTED).write_bytes((out / FITTED).read_bytes()[:-3000])
-    with pytest.raises(ProjectError, match=r"appearance\.npz: damaged"):
-        run(scan, out, resume=True)
-
-
 def test_a_run_that_nothing_can_be_fitted_to_goes_on_without_and_resumes(
     scan, unfitted, tmp_path, monkeypatch, capsys
 ):
@@ -173,26 +165,15 @@ def test_a_run_that_nothing_can_be_fitted_to_goes_on_without_and_resumes(
     assert (unfitted[0] / "memory.npz").read_bytes() == (out / "memory.npz").read_bytes()
 
 
-@pytest.mark.parametrize("row", [0, 1])
-def test_without_steps_or_time_a_run_knows_nothing_of_gaussians(scan, unfitted, row):
-    out = unfitted[row]
+def test_without_steps_or_time_a_run_knows_nothing_of_gaussians(scan, unfitted):
+    out = unfitted[1]
+    assert results(out).keys() == results(unfitted[0]).keys()
     assert not (out / FITTED).exists()
     plan = planned(scan, f"refine.{out.name}=0")
     memory = memory_of_round_0(out)
     guidance = project(memory, plan.targets.cameras[[0]], options=plan.config.splat)
     shown = guidance_of(out, 1)[guidance.valid[0]]
     assert np.abs(guidance.rgb[0][guidance.valid[0]] * 255 - shown).max() <= 0.51
-    # The memory is that of the photographs at the given poses.
-    by_hand = _empty_memory(plan, Path())
-    for name in plan.context:
-        view = plan.scene[name]
-        frame = view.load()
-        depth = plan.source.depth(plan.scene, view, frame).depth
-        by_hand.observe(
-            frame.rgb, depth, view.camera, round=0, mask=frame.mask,
-            options=plan.config.back_projection, pixel_binning=plan.config.savings.pixel_binning,
-        )  # fmt: skip
-    np.testing.assert_array_equal(by_hand.positions, memory.positions)
 
 
 @pytest.mark.parametrize("points", [60, 0])
@@ -280,12 +261,6 @@ def test_recorded_or_named_depth_is_not_replaced(scan, bare):
     assert Fitted(ONE).apply(planned(bare)).source.name == "fitted"
 
 
-def test_nothing_is_fitted_to_views_that_tell_no_depth(tmp_path, monkeypatch):
-    scan = write_colmap_scan(tmp_path / "scan", views=10, points=6)
-    monkeypatch.setattr(Sweep, "of", lambda plan, begins: None)
-    assert fit_appearance(planned(scan, "refine.steps=1"), QUIET) is None
-
-
 def test_refined_poses_move_context_and_targets(scan):
     plan = planned(scan)
     context = plan.scene.subset(plan.context).cameras.cam_from_world.copy()
@@ -301,11 +276,7 @@ def test_refined_poses_move_context_and_targets(scan):
         plan.scene.subset(others).cameras.cam_from_world,
     )
     kept = Fitted(ONE).apply(plan)
-    np.testing.assert_array_equal(
-        kept.scene.subset(plan.context).cameras.cam_from_world,
-        plan.scene.subset(plan.context).cameras.cam_from_world,
-    )
-    assert kept.config.voxel == plan.config.voxel and kept.source is plan.source
+    assert kept.scene is plan.scene and kept.source is plan.source
 
 
 def test_photographs_with_fitted_depth_enter_the_memory_smaller(bare, monkeypatch):
@@ -371,14 +342,6 @@ def test_a_photograph_does_not_validate_a_memory_that_has_seen_it(scan):
     grey = Picture(np.full(frame.rgb.shape, 0.5, np.float32), ones)
     fitted = Fitted(ONE, predicted={name: grey})
     assert fitted.with_best_blend(plan, memory).appearance.blend == Blend()
-
-
-def test_a_run_with_validation_photographs_keeps_the_blend_that_they_chose(scan, whole, fit):
-    plan = planned(scan)
-    assert list(fit.predicted) == [plan.context[4]]
-    chosen = fit.with_best_blend(fit.apply(plan), memory_of_round_0(whole))
-    assert chosen.appearance.blend != Blend()
-    assert Fitted.load(whole / FITTED).appearance.blend == chosen.appearance.blend
 
 
 def test_a_networks_depth_guides_the_fit_and_its_failures_do_not_stop_it(

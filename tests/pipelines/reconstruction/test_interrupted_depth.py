@@ -6,7 +6,6 @@ The pictures are of the tiny scan and the depth comes from the plane sweep itsel
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -153,17 +152,3 @@ def test_why_a_view_has_no_depth_outlasts_the_interrupt(scan, tmp_path, monkeypa
     assert "1 of 4 views have no depth" in capsys.readouterr().err
     assert results(out) == results(straight)
     assert untimed(out) == untimed(straight)
-
-
-def test_a_first_round_that_is_done_anew_is_taken_up_too(scan, whole, tmp_path, monkeypatch, asked):
-    """A finished run whose first round was removed, and that was interrupted on its way back."""
-    out = tmp_path / "run"
-    shutil.copytree(whole, out)
-    shutil.rmtree(out / "round_000")
-    with monkeypatch.context() as patch:
-        stop_before(patch, 6, KeyboardInterrupt())
-        assert reconstruct(scan, out, "--resume") == 1
-    asked.clear()
-    assert reconstruct(scan, out, "--resume") == 0
-    assert len(asked) == 1
-    assert results(out) == results(whole)

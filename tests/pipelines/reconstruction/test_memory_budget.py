@@ -3,14 +3,11 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 from run_files import Killed, reconstructed
 from tiny_scan import write_scan
 
-from gvtools.memory.spatial_memory import TiledMemory
 from gvtools.memory.store import tile_set
-from gvtools.runs.run import load_memory, load_run
 from pipelines.cli import main
 from pipelines.reconstruction import run as runs
 
@@ -89,22 +86,12 @@ def test_a_run_goes_on_after_a_kill_with_any_budget(
     assert_same_results(out, in_ram)
 
 
-def test_rounds_are_forgotten_when_a_run_is_read(tiled, in_ram):
-    found, expected = (load_memory(path, up_to=1) for path in (tiled, in_ram))
-    assert isinstance(found, TiledMemory) and not found.in_ram
-    assert (len(found), found.voxels, found.rounds) == (
-        len(expected), expected.voxels, expected.rounds,
-    )  # fmt: skip
-    assert isinstance(load_run(tiled).memory, TiledMemory)
-
-
 def test_render_export_and_view_read_tiles(scan, tiled, in_ram, tmp_path, capsys):
     for name, path in (("tiled", tiled), ("ram", in_ram)):
         out = str(tmp_path / name)
         assert main(["render", str(path), "--cameras", str(scan), "--out", out, "--quiet"]) == 0
-        for form, suffix in (("ply", "ply"), ("glb", "glb")):
-            file = str(tmp_path / f"{name}.{suffix}")
-            assert main(["export", str(path), "--format", form, "--out", file, "--quiet"]) == 0
+        file = str(tmp_path / f"{name}.ply")
+        assert main(["export", str(path), "--format", "ply", "--out", file, "--quiet"]) == 0
     pictures = sorted((tmp_path / "ram").rglob("*.png"))
     assert pictures
     for picture in pictures:
@@ -113,4 +100,4 @@ def test_render_export_and_view_read_tiles(scan, tiled, in_ram, tmp_path, capsys
     assert (tmp_path / "tiled.ply").stat().st_size == (tmp_path / "ram.ply").stat().st_size
     shot = tmp_path / "shot.png"
     assert main(["view", str(tiled), "--screenshot", str(shot), "--quiet"]) == 0
-    assert np.asarray(shot.stat().st_size) > 1000
+    assert shot.stat().st_size > 1000

@@ -1,4 +1,4 @@
-"""Whole runs that must agree: again, the world moved, views listed otherwise, a fusion in parts."""
+"""Whole runs that must agree: the world moved, or views listed otherwise."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 from tiny_scan import write_scan
 
-from gvtools.memory.back_projection import back_project
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.scenes.project import open_project
 from gvtools.scenes.scene import Frame, Scene, View
@@ -104,8 +103,6 @@ def worst(one: Run, two: Run) -> float:
     "world",
     [
         World(scale=1e-4),
-        pytest.param(World(shift=(1e4, -3e4, 5e3)), marks=pytest.mark.slow),
-        pytest.param(World(rotation=(0.3, -1.1, 0.6)), marks=pytest.mark.slow),
         World(scale=41.0, rotation=(-0.7, 0.2, 2.0), shift=(800.0, 0.3, -7000.0)),
     ],
     ids=str,
@@ -147,11 +144,8 @@ def busy(tmp_path_factory) -> Scene:
     return replace(scene, views=tuple(painted(i, view) for i, view in enumerate(scene.views)))
 
 
-@pytest.mark.parametrize(
-    "more",
-    ["fusion.voxel_scale=1.07", pytest.param("fusion.voxel_scale=2.37", marks=pytest.mark.slow)],
-)
-def test_so_does_one_whose_edge_is_measured_and_whose_pixels_are_joined(busy, tmp_path, more):
+def test_so_does_one_whose_edge_is_measured_and_whose_pixels_are_joined(busy, tmp_path):
+    more = "fusion.voxel_scale=1.07"
     world = World(scale=41.0, rotation=(-0.7, 0.2, 2.0))
     names = busy.names
     context = f"context={','.join([*names[::2], names[1]])}"
@@ -169,43 +163,3 @@ def test_views_listed_in_another_order_give_the_same_run(scene, plain, tmp_path)
     listed = replace(scene, views=tuple(scene.views[i] for i in order))
     found = run(listed, tmp_path / "run", GIVEN)
     assert found.bytes == plain.bytes and worst(plain, found) == np.inf
-
-
-@pytest.mark.slow
-def test_nor_does_the_order_matter_to_refined_poses(scene, tmp_path):
-    one = run(scene, tmp_path / "one")
-    two = run(replace(scene, views=scene.views[::-1]), tmp_path / "two")
-    assert one.bytes == two.bytes and worst(one, two) == np.inf
-
-
-def test_targets_in_another_order_see_the_same_context(scene, plain, tmp_path):
-    """Without completions, which one target hands to the next, order is all that changes."""
-    one = run(scene, tmp_path / "one", GIVEN, "completer=none")
-    two = run(scene, tmp_path / "two", GIVEN, "completer=none", targets=TARGETS[::-1])
-    assert worst(one, two) == np.inf and one.bytes == two.bytes
-
-
-def test_a_fusion_cut_in_two_is_the_whole_one(scene, plain, tmp_path):
-    """Halves of a picture in turn, saved and loaded between."""
-    frame = plain.memory.frame
-    whole, halves = (
-        SpatialMemory(plain.memory.voxel, origin=frame.origin, axes=frame.axes) for _ in range(2)
-    )
-    for name in CONTEXT:
-        view = scene[name]
-        shown = view.load()
-        assert shown.depth is not None
-        whole.fuse(back_project(shown.rgb, shown.depth, view.camera, frame=frame), round=0)
-        for half in (np.s_[:, :48], np.s_[:, 48:]):
-            mask = np.zeros(shown.depth.shape, np.bool_)
-            mask[half] = True
-            points = back_project(shown.rgb, shown.depth, view.camera, frame=frame, mask=mask)
-            halves.fuse(points, round=0)
-            halves.save(tmp_path / "memory.npz")
-            halves = SpatialMemory.load(tmp_path / "memory.npz")
-    assert halves.voxels == whole.voxels and len(halves) == len(whole)
-    for name in TARGETS:
-        one, two = whole.project(scene[name].camera), halves.project(scene[name].camera)
-        np.testing.assert_array_equal(one.valid, two.valid)
-        error = float(np.mean((one.rgb - two.rgb)[one.valid] ** 2))
-        assert error == 0 or -10 * np.log10(error) > 100

@@ -7,11 +7,10 @@ import errno
 import json
 import os
 import re
+from itertools import count
 from pathlib import Path
 
-import numpy as np
 import pytest
-from PIL import Image
 from run_files import Killed, reconstructed, report_of, results, untimed
 from tiny_scan import write_scan
 
@@ -65,49 +64,23 @@ def test_the_figures_agree_with_the_scene(whole):
     assert metrics["coverage_after"] > metrics["coverage"]
 
 
-def test_forgetting_the_last_round_gives_the_memory_before_it(whole, scan, tmp_path):
-    shorter = run(scan, tmp_path / "shorter", "rounds=1")
-    memory = SpatialMemory.load(whole / "memory.npz")
-    memory.forget(round=2)
-    memory.save(tmp_path / "forgotten.npz")
-    assert (tmp_path / "forgotten.npz").read_bytes() == (shorter / "memory.npz").read_bytes()
-
-
-def test_two_runs_give_the_same_bytes(whole, scan, tmp_path):
-    assert results(run(scan, tmp_path / "again")) == results(whole)
-
-
-@pytest.mark.parametrize(
-    "moment",
-    [
-        pytest.param(moment, marks=[] if moment % 9 == 6 else pytest.mark.slow)
-        for moment in range(0, 40, 3)
-    ],
-)
+@pytest.mark.parametrize("moment", range(6, 40, 9))
 def test_resuming_after_a_stop_gives_the_bytes_of_an_uninterrupted_run(
     whole, scan, tmp_path, monkeypatch, moment
 ):
-    """Stop at every third of the moments at which a file or folder takes its final name."""
-    out = tmp_path / "run"
-    calls = 0
-    real_replace, real_rename = os.replace, Path.replace
+    """Stop at some of the moments at which a file or folder takes its final name."""
+    out, calls = tmp_path / "run", count()
 
-    def count() -> None:
-        nonlocal calls
-        if calls == moment:
-            raise Killed
-        calls += 1
+    def stopping(rename):
+        def stopped(*args, **kwargs):
+            if next(calls) == moment:
+                raise Killed
+            return rename(*args, **kwargs)
 
-    def replace(*args, **kwargs):
-        count()
-        return real_replace(*args, **kwargs)
+        return stopped
 
-    def rename(self, target):
-        count()
-        return real_rename(self, target)
-
-    monkeypatch.setattr(os, "replace", replace)
-    monkeypatch.setattr(Path, "replace", rename)
+    monkeypatch.setattr(os, "replace", stopping(os.replace))
+    monkeypatch.setattr(Path, "replace", stopping(Path.replace))
     with contextlib.suppress(Killed):
         run(scan, out)
     monkeypatch.undo()
@@ -172,28 +145,14 @@ def test_a_disk_that_fills_up_leaves_the_rounds_before(whole, scan, tmp_path, mo
         ("depth=colmap", "rgbd"),
         ("depth=guess", "sensor"),
         ("targets=first:1", "allow-overlap"),
-        ("targets=every", "every:2"),
-        ("device=tpu", "cuda"),
         ("completer.sweps=1", "sweeps"),
-        ("completer.sweeps=-3", "at least 0"),
-        ("memory.weight_cap=0", "at least 1e-20"),
         ("memory.merge_angle_deg=-2", "at least 0 and at most 180"),
-        ("back_projection.grazing=2", "less than 1"),
-        ("fusion.voxel_percentile=300", "at most 100"),
     ],
 )
 def test_wrong_options_leave_no_folder(scan, tmp_path, setting, text):
     with pytest.raises(OptionError, match=text):
         run(scan, tmp_path / "run", setting)
     assert not (tmp_path / "run").exists()
-
-
-def test_no_context_depth_is_said(scan, tmp_path):
-    bare = write_scan(tmp_path / "bare")
-    for path in bare.glob("*.depth.png"):
-        Image.fromarray(np.zeros((72, 96), np.uint16)).save(path)
-    with pytest.raises(ProjectError, match="depth"):
-        run(bare, tmp_path / "run")
 
 
 @pytest.mark.parametrize("profile", RunSettings.presets["profile"])

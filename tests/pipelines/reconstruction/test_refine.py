@@ -11,8 +11,7 @@ from command_line import refused
 from run_files import reconstructed, results
 from tiny_scan import write_scan
 
-from gvtools.appearance import fit, fit_options
-from gvtools.errors import ProjectError
+from gvtools.appearance import fit_options
 from gvtools.files import write_json
 from gvtools.runs.poses import RunPoses
 from gvtools.runs.run import load_run
@@ -91,23 +90,6 @@ def test_refined_poses_go_on_from_the_saved_ones(copy):
     np.testing.assert_array_equal(after.poses.targets, target)
 
 
-def test_poses_that_predict_neighbours_better_are_kept(copy, monkeypatch):
-    saved = Fitted.load(copy / APPEARANCE)
-    scene, record = load_run(copy).scenes[0], refining_poses(copy)
-    given = scene.subset(record["context"]).cameras.cam_from_world
-    target = scene.subset(record["targets"]).cameras.cam_from_world
-    poses = RunPoses(given, target)
-    Fitted(saved.appearance, poses, spread=True).save(copy / APPEARANCE)
-    errors = iter([1.0, 0.5])
-    monkeypatch.setattr(fit, "prediction_error", lambda views, poses: next(errors))
-    refine(copy, steps=4, console=QUIET)
-    after = Fitted.load(copy / APPEARANCE)
-    assert after.spread
-    assert after.poses is not None
-    for before, now in [(given, after.poses.context), (target, after.poses.targets)]:
-        assert 0 < np.abs(now - before).max() < 0.003
-
-
 def test_photographs_are_shown_better_afterwards_by_a_moved_project(scan, copy, tmp_path, capsys):
     def error() -> float:
         appearance = Fitted.load(copy / APPEARANCE).appearance
@@ -145,18 +127,6 @@ def test_a_stop_at_any_moment_leaves_the_run_as_it_was(copy, monkeypatch):
             refine(copy, steps=1, console=QUIET)
         assert results(copy) == before, name
         assert os.listdir(copy.parent) == ["run"], name
-
-
-def test_a_full_disk_is_one_line_and_leaves_the_run_as_it_was(copy, monkeypatch):
-    before = results(copy)
-
-    def full(self, path):
-        raise OSError(28, os.strerror(28))
-
-    monkeypatch.setattr(Fitted, "save", full)
-    with pytest.raises(ProjectError, match=r"No space left.*as it was"):
-        refine(copy, steps=1, console=QUIET)
-    assert results(copy) == before
 
 
 def test_a_run_without_a_fit_gets_one_and_is_resumed_with_it(scan, tmp_path):
@@ -197,13 +167,6 @@ def test_what_cannot_be_refined_is_one_line_with_status_2(scan, copy, tmp_path, 
     assert "fingerprint" in line
     assert "project," not in line
     assert results(copy) == before
-
-
-def test_a_few_photographs_with_depth_are_fitted_as_well(scan, tmp_path):
-    out = run(scan, tmp_path / "run", "refine.steps=0", "context=first:3")
-    assert not (out / APPEARANCE).exists()
-    refine(out, steps=1, console=QUIET)
-    assert len(Fitted.load(out / APPEARANCE).appearance.gaussians) > 0
 
 
 def test_a_converged_fit_is_joined_by_another_if_there_are_steps(copy, monkeypatch, capsys):

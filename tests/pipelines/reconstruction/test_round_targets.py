@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from itertools import pairwise
 from types import SimpleNamespace
 from typing import Any, cast
@@ -65,12 +64,3 @@ def test_an_error_comes_where_the_round_begins(memory, monkeypatch):
         targets.prefetch_round(2)
         with pytest.raises(ZeroDivisionError):
             targets.of(2)
-
-
-def test_a_run_that_is_stopped_waits_for_one_target_at_most(memory, monkeypatch):
-    monkeypatch.setattr(CachedProjection, "prefetch", lambda self, snapshot: time.sleep(0.5))
-    start = time.monotonic()
-    with pytest.raises(KeyboardInterrupt), RoundTargets(plan(1, 20), memory) as targets:
-        targets.prefetch_round(2)
-        raise KeyboardInterrupt
-    assert time.monotonic() - start < 5

@@ -96,17 +96,6 @@ def test_exports_keep_it_apart_and_make_no_camera_of_a_station(runs, tmp_path):
     assert not [image.name for image in model.images.values() if "scan" in image.name]
 
 
-def test_viewers_tell_the_three_sources(runs):
-    from pipelines.viewing.source import ViewSource
-
-    shown = ViewSource(runs / "with").read()
-    counts = shown.counts(0)
-    assert counts.scanned > 0 and f"{counts.scanned:,} scanned" in counts.summary()
-    assert not [camera.name for camera in shown.cameras if camera.name.startswith("scan/")]
-    legend = shown.colors("source", np.arange(10)).legend
-    assert [name for _, name in legend.swatches] == ["observed", "generated", "scanned"]
-
-
 @pytest.mark.parametrize(
     ("options", "said"),
     [

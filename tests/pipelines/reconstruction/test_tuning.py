@@ -95,9 +95,16 @@ def test_a_resumed_run_takes_the_weights_that_it_tuned(
     assert pictures(out) == pictures(run)
 
 
-def test_another_tuning_is_another_run(run, scan, weights, capsys):
+def test_what_cannot_be_tuned_and_another_tuning_are_refused(run, scan, weights, tmp_path, capsys):
     line = refused(capsys, *words(scan, run, weights, "--set", "tune.steps=3"), "--resume")
     assert "settings differ" in line
+    out = tmp_path / "out"
+    none = ("--completer", "none", "--tune", "1")
+    line = refused(capsys, "reconstruct", scan, "--out", out, *none)
+    assert "completer none has no weights to tune" in line
+    few = ("--tune", "1", "--context", "first:3")
+    assert "expected at least 4" in refused(capsys, *words(scan, out, weights, *few))
+    assert not out.exists()
 
 
 @pytest.mark.slow
@@ -111,18 +118,3 @@ def test_weights_that_are_no_better_leave_the_run_as_it_is(scan, weights, tmp_pa
     assert json.loads((out / "run.json").read_text())["tuning"]["kept"] is False
     assert pictures(out) == pictures(plain)
     assert from_pretrained(out / "tuned").config.trained
-
-
-def test_bad_input_is_one_line(scan, weights, tmp_path, capsys):
-    def said(*more: object, given: Path = weights) -> str:
-        line = refused(capsys, *words(scan, tmp_path / "out", given, *more))
-        assert not (tmp_path / "out").exists()
-        return line
-
-    assert "tune.minutes" in said("--tune", "-1")
-    assert "expected at least 4" in said("--tune", "1", "--context", "first:3")
-    none = ("--completer", "none", "--tune", "1")
-    line = refused(capsys, "reconstruct", scan, "--out", tmp_path / "out", *none)
-    assert "completer none has no weights to tune" in line
-    untrained = write_micro_weights(tmp_path / "untrained", trained=False)
-    assert "untrained" in said("--tune", "1", given=untrained)

@@ -19,7 +19,7 @@ from gvtools.settings import with_texts
 from pipelines.cli import main
 from pipelines.reconstruction.prepare import make_plan
 from pipelines.reconstruction.settings import RunSettings
-from pipelines.reconstruction.voxel import NEIGHBOURS, SCALES, automatic_voxel, sufficient_scale
+from pipelines.reconstruction.voxel import SCALES, automatic_voxel, sufficient_scale
 
 pytestmark = pytest.mark.usefixtures("unpainted")
 
@@ -89,13 +89,6 @@ def test_where_some_views_tell_the_others_are_not_computed(tmp_path, photographs
     exact = render(world_from_cam(3))[1][row, column]
     edge = automatic_voxel(replace(scene, points=points), scene.names, Never(), percentile=20)
     assert edge == pytest.approx(np.percentile(exact, 20) / FOCAL, rel=1e-5)
-
-
-def test_photographs_with_points_sweep_nothing(photographs, swept, tmp_path, capsys):
-    words = ["reconstruct", str(photographs), "--refine", "0", "--out", str(tmp_path / "run")]
-    assert main([*words, "--dry-run"]) == 0
-    assert not swept
-    assert "computed now" not in capsys.readouterr().out
 
 
 def test_without_points_a_small_sweep_serves_and_is_said(photographs, swept):
@@ -200,12 +193,6 @@ def test_a_greater_loss_is_never_a_finer_edge(scan):
     scales = [scale_of(scene, loss) for loss in (0.0, 0.1, 1.0, 100.0)]
     assert scales == sorted(scales) and scales[-1] == SCALES[-1]
     assert set(scales) <= set(SCALES)
-
-
-def test_too_few_views_tell_nothing(scan):
-    scene = open_project(scan)
-    few = scene.names[:NEIGHBOURS]
-    assert sufficient_scale(scene, few, config=AT_FOOTPRINT, loss=9) == 1
 
 
 def test_a_run_takes_the_measured_edge_unless_told_otherwise(scan):
