@@ -80,15 +80,6 @@ def _sent(chunk: Chunk) -> Item:
     return facts, {name: array for name, array in arrays.items() if array is not None}
 
 
-def _check_count(path: Path, count: int, *, bits: int, room: int) -> None:
-    """Refuse more points than a file has bits for."""
-    if count < 0 or count * bits > 8 * max(room, 0):
-        raise MemoryFileError(
-            f"{path}: {room} bytes of points, but its header says {count} points of at least "
-            f"{bits} bits; the file is truncated or damaged; save it again"
-        )
-
-
 def read_las(path: Path, *, generated: bool) -> Iterator[Item]:
     """The header and the points of a LAS or LAZ, for ``read_apart``."""
     import laspy
@@ -99,7 +90,11 @@ def read_las(path: Path, *, generated: bool) -> Iterator[Item]:
         count, size = int(header.point_count), int(header.point_format.size)
         bits = LEAST_BITS if header.are_points_compressed else 8 * size
         room = path.stat().st_size - int(header.offset_to_point_data)
-        _check_count(path, count, bits=bits, room=room)
+        if count * bits > 8 * max(room, 0):
+            raise MemoryFileError(
+                f"{path}: {room} bytes of points, but its header says {count} points of at least "
+                f"{bits} bits; the file is truncated or damaged; save it again"
+            )
         # Since 1.3 more may come behind the points.
         bare = header.version.minor < 3 and not header.are_points_compressed
         if bare and room >= (count + 1) * size:
@@ -152,8 +147,11 @@ def read_e57(path: Path) -> Iterator[Item]:
         if not headers:
             raise MemoryFileError(f"{path}: no scan in it; expected at least one")
         for header in headers:
-            bits = _e57_bits(path, header)
-            _check_count(path, int(header.point_count), bits=bits, room=path.stat().st_size)
+            if _axes(header) is None:
+                raise MemoryFileError(
+                    f"{path}: a scan of {', '.join(header.point_fields) or 'nothing'}; expected "
+                    f"{', '.join(CARTESIAN)} or {', '.join(SPHERICAL)}"
+                )
         poses = [_e57_pose(path, header) for header in headers]
         stations = []
         for index, (header, pose) in enumerate(zip(headers, poses, strict=True)):
@@ -171,31 +169,6 @@ def read_e57(path: Path) -> Iterator[Item]:
 def _axes(header: Any) -> tuple[str, ...] | None:
     held = set(header.point_fields)
     return next((axes for axes in (CARTESIAN, SPHERICAL) if set(axes) <= held), None)
-
-
-def _e57_bits(path: Path, header: Any) -> int:
-    """The bits that a point's coordinates take."""
-    from pye57 import libe57
-
-    axes = _axes(header)
-    if axes is None:
-        raise MemoryFileError(
-            f"{path}: a scan of {', '.join(header.point_fields) or 'nothing'}; expected "
-            f"{', '.join(CARTESIAN)} or {', '.join(SPHERICAL)}"
-        )
-    bits, prototype = 0, libe57.StructureNode(header.points.prototype())
-    for axis in axes:
-        node = prototype.get(axis)
-        if node.type() == libe57.NodeType.E57_FLOAT:
-            single = libe57.FloatNode(node).precision() == libe57.FloatPrecision.E57_SINGLE
-            bits += 32 if single else 64
-            continue
-        scaled = node.type() == libe57.NodeType.E57_SCALED_INTEGER
-        number = libe57.ScaledIntegerNode(node) if scaled else libe57.IntegerNode(node)
-        bits += int(number.maximum() - number.minimum()).bit_length()
-    if not bits and header.point_count:
-        raise MemoryFileError(f"{path}: a scan whose points take no bytes; expected several points")
-    return bits
 
 
 def _e57_pose(path: Path, header: Any) -> NDArray[np.float64]:

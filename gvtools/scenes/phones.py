@@ -10,7 +10,6 @@ gvtools does.
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -332,7 +331,6 @@ _EXPORT = "EXR_RGBD"
 _PHOTOS = (".jpg", ".png")
 _CHANNELS = ("R", "Y", "Z")
 _NO_POSE = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
-_LZFSE_RATIO = 4000  # LZFSE packs no more bytes than this into one
 _LIDAR = (192, 256)  # width and height of depth maps where the metadata does not say
 
 
@@ -427,35 +425,9 @@ def _unpacked(path: Path, dtype: str, *, shape: tuple[int, int]) -> NDArray[Any]
         purpose=f"{path}: depth compressed by LZFSE",
         instead="or export EXR and JPG",
     )
-    count = np.dtype(dtype).itemsize * shape[0] * shape[1]
     expected = f"expected {shape[0]}x{shape[1]} values by LZFSE; {AGAIN}"
     with reading(path, expected, also=(lzfse.error,)):
-        return np.frombuffer(_decompressed(read_bytes(path), count), dtype).reshape(shape)
-
-
-def _decompressed(data: bytes, size: int) -> bytes:
-    """What LZFSE packed, which has to be of so many bytes.
-
-    The package's own function takes ever more memory for damaged data. The library inside it, which
-    takes a buffer of fixed size, is called where it can be found.
-    """
-    import lzfse
-
-    try:
-        decode = ctypes.CDLL(lzfse.__file__).lzfse_decode_buffer
-    except (OSError, AttributeError):
-        return bytes(lzfse.decompress(data))
-    if size > _LZFSE_RATIO * len(data):
-        raise ValueError(f"{len(data)} bytes for {size}")
-    decode.restype = ctypes.c_size_t
-    decode.argtypes = [
-        ctypes.c_void_p, ctypes.c_size_t, ctypes.c_char_p, ctypes.c_size_t, ctypes.c_void_p,
-    ]  # fmt: skip
-    buffer = ctypes.create_string_buffer(size + 1)
-    found = decode(buffer, size + 1, data, len(data), None)
-    if found != size:
-        raise ValueError(f"damaged, or {found} bytes")
-    return buffer.raw[:size]
+        return np.frombuffer(lzfse.decompress(read_bytes(path)), dtype).reshape(shape)
 
 
 RECORD3D = Layout.of_folder(
