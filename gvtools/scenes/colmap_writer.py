@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
-from gvtools.errors import ProjectError, ShapeError
+from gvtools.errors import ProjectError
 from gvtools.files import full_disk
 from gvtools.scenes.colmap_model import CAMERAS, model_files
 
@@ -42,8 +42,6 @@ def write_colmap(
         points: (N, 3), with (N, 3) ``colors``; None is black.
         point_index: (M,), for each track element its point, with ``view_index`` and (M, 2) ``xy``.
     """
-    if len(set(cameras.names)) != len(cameras):
-        raise ShapeError("cameras: two views share a name; a model needs unique image names")
     if colors is None:
         colors = np.zeros(points.shape, np.uint8)
     model = build_reconstruction(
@@ -114,12 +112,7 @@ def _add_cameras(model: pycolmap.Reconstruction, cameras: Cameras) -> list[int]:
 
     known: dict[tuple[float, ...], int] = {}
     ids = []
-    for K, width, height, name in zip(
-        cameras.K, cameras.width, cameras.height, cameras.names, strict=True
-    ):
-        expected = np.array([[K[0, 0], 0, K[0, 2]], [0, K[1, 1], K[1, 2]], [0, 0, 1]])
-        if not np.allclose(K, expected, atol=1e-9) or not np.isfinite(K).all():
-            raise ShapeError(f"cameras: K of {name!r} has skew or is no pinhole matrix: {K}")
+    for K, width, height in zip(cameras.K, cameras.width, cameras.height, strict=True):
         key = (K[0, 0], K[1, 1], K[0, 2], K[1, 2], int(width), int(height))
         if key not in known:
             known[key] = len(known) + 1

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
-from gvtools.errors import ProjectError, ShapeError
+from gvtools.errors import ProjectError
 from gvtools.files import replaced_when_written
 from gvtools.optional import require
 from gvtools.ranges import PICTURE_OUTLIERS, WHOLE, to_bytes, white_of
@@ -296,8 +296,6 @@ def _load_colmap(path: Path) -> NDArray[np.float32]:
 def write_depth_map(path: Path, depth: ArrayLike) -> None:
     """Write (H, W) z-depth, scene units, 0 = none, in COLMAP's form."""
     values = np.asarray(depth, "<f4")
-    if values.ndim != 2:
-        raise ShapeError(f"{path}: depth of shape {values.shape}; expected (H, W)")
     head = f"{values.shape[1]}&{values.shape[0]}&1&".encode()
     with replaced_when_written(path) as temporary:
         temporary.write_bytes(head + values.tobytes())

@@ -301,8 +301,6 @@ class Contradiction:
     """Two views whose poses cannot both be right."""
 
     names: tuple[str, str]  # of the two
-    distance: float  # between the camera centres, scene units
-    degrees: float  # between their orientations
     # share of the comparable area in which the pictures differ; None where the pictures could
     # not be compared
     disagreement: float | None
@@ -406,7 +404,7 @@ def contradictions(
     cameras = scene.cameras
     tracks = None if scene.points is None else _Tracks.of(scene.points, len(scene))
     found = []
-    for a, b, distance, degrees in _near_pairs(cameras, _reach(scene, depths, tracks)):
+    for a, b in _near_pairs(cameras, _reach(scene, depths, tracks)):
         points = None if tracks is None else tracks.shared(cameras, (a, b))
         unshared = points is not None and points[0] < SHARED * points[1]
         differs = None
@@ -417,7 +415,7 @@ def contradictions(
         if unshared or (differs is not None and differs > DISAGREEING):
             names = scene.views[a].name, scene.views[b].name
             shared, of = points or (None, None)
-            found.append(Contradiction(names, distance, degrees, differs, shared, of))
+            found.append(Contradiction(names, differs, shared, of))
     return sorted(found, key=lambda pair: -(pair.disagreement or 1.0))
 
 
@@ -509,8 +507,8 @@ def _reach(scene: Scene, depths: Mapping[int, float], tracks: _Tracks | None) ->
     return np.full(len(scene), min(NEAR * float(np.ptp(centers, axis=0).max()), step / 2))
 
 
-def _near_pairs(cameras: Cameras, reach: Float64) -> list[tuple[int, int, float, float]]:
-    """Pairs of nearly equal cameras: numbers, distance (scene units) and angle (degrees)."""
+def _near_pairs(cameras: Cameras, reach: Float64) -> list[tuple[int, int]]:
+    """Numbers of cameras that are nearly equal."""
     from scipy.spatial import KDTree
 
     centers, rotations = cameras.centers, cameras.cam_from_world[:, :3, :3]
@@ -528,5 +526,5 @@ def _near_pairs(cameras: Cameras, reach: Float64) -> list[tuple[int, int, float,
         distance = float(np.linalg.norm(centers[a] - centers[b]))
         degrees = float(turn_degrees(rotations[a], rotations[b]))
         if a != b and distance < min(reach[a], reach[b]) and degrees < NEAR_DEGREES:
-            near.append((a, b, distance, degrees))
+            near.append((a, b))
     return near

@@ -11,8 +11,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from gvtools.errors import ShapeError
-
 # Neighbouring depths that differ by less than this share a surface (relative to the nearer).
 SAME_SURFACE = 0.05
 # A footprint wider than this in the target (pixels) is a degenerate projection beside the camera.
@@ -36,15 +34,7 @@ def register_depth(
     z = np.ascontiguousarray(depth, np.float32)
     K_depth, K_color = np.asarray(depth_K, np.float64), np.asarray(color_K, np.float64)
     transform = np.asarray(color_from_depth, np.float64)
-    shapes = (z.ndim, K_depth.shape, K_color.shape, transform.shape)
-    if shapes != (2, (3, 3), (3, 3), (4, 4)):
-        raise ShapeError(
-            f"registration: depth {z.shape}, K {K_depth.shape} and {K_color.shape}, "
-            f"color_from_depth {transform.shape}; expected (h, w), (3, 3), (3, 3), (4, 4)"
-        )
     # homogeneous colour pixel = z * A @ (u, v, 1) + b
-    if not (np.isfinite(K_depth).all() and np.linalg.matrix_rank(K_depth) == 3):
-        raise ShapeError(f"registration: the depth camera's K {K_depth.tolist()} has no inverse")
     A = K_color @ transform[:3, :3] @ np.linalg.inv(K_depth)
     b = K_color @ transform[:3, 3]
     inverse = np.zeros((height, width), np.float32)

@@ -312,27 +312,18 @@ class ShardScenes:
 
     def __call__(self, name: str) -> Scene:
         """The scene of a name."""
-        if name not in self._numbers:
-            raise ProjectError(
-                f"{self.folder}: no scene {name!r}; first of {len(self._numbers)}: "
-                f"{next(iter(self._numbers))!r}"
-            )
-        views: list[View] = []
-        found = None
-        for number in self.index.scenes[self._numbers[name]].shards:
-            if not 0 <= number < len(self.index.shards):
-                raise ProjectError(f"{self.folder / INDEX}: names shard {number}; {AGAIN}")
-            listed = self.index.shards[number]
-            tar = named_file(self.folder, listed.file, where=str(self.folder / INDEX))
-            _check_size(tar, listed)
-            shard = read_shard_index(tar.with_suffix(".json"), listed.index_sha256)
-            found = next((scene for scene in shard.scenes if scene.name == name), None)
-            if found is None:
-                raise ProjectError(f"{tar}: holds nothing of {name!r}, which {INDEX} says; {AGAIN}")
-            views += [_view(tar, view) for view in shard.views if view.scene == found.number]
-        if found is None:
-            raise ProjectError(f"{self.folder / INDEX}: no shard of {name!r}; {AGAIN}")
-        return Scene(self.folder / name, found.kind, tuple(views), metric=found.metric)
+        scenes, views = list[SceneRecord](), list[View]()
+        with reading(self.folder / INDEX, AGAIN):
+            for number in self.index.scenes[self._numbers[name]].shards:
+                listed = self.index.shards[number]
+                tar = named_file(self.folder, listed.file, where=str(self.folder / INDEX))
+                _check_size(tar, listed)
+                shard = read_shard_index(tar.with_suffix(".json"), listed.index_sha256)
+                scenes.append(next(scene for scene in shard.scenes if scene.name == name))
+                own = scenes[-1].number
+                views += [_view(tar, view) for view in shard.views if view.scene == own]
+            kind, metric = scenes[-1].kind, scenes[-1].metric
+        return Scene(self.folder / name, kind, tuple(views), metric=metric)
 
 
 def verify(folder: Path, *, progress: Callable[[str], None] = lambda text: None) -> list[str]:
@@ -380,8 +371,7 @@ def _view(tar: Path, record: ViewRecord) -> View:
 
 
 def _load(tar: Path, record: ViewRecord) -> Frame:
-    where, shape = f"{tar}, view {record.name}", (record.height, record.width)
-    members = {}
+    where, members = f"{tar}, view {record.name}", {}
     with reading(where, AGAIN), regular(tar).open("rb") as file:
         for name, (offset, size, checksum) in record.members.items():
             file.seek(offset)
@@ -392,10 +382,4 @@ def _load(tar: Path, record: ViewRecord) -> Frame:
                     f"is; {AGAIN}"
                 )
             members[name] = content
-    frame = decoded(members, depth_unit=record.depth_unit, where=where)
-    shapes = {a.shape[:2] for a in (frame.rgb, frame.depth, frame.mask) if a is not None}
-    if shapes != {shape}:
-        raise ProjectError(f"{where}: pixels {shapes}; expected {shape}; {AGAIN}")
-    if frame.depth is not None and not (np.isfinite(frame.depth) & (frame.depth >= 0)).all():
-        raise ProjectError(f"{where}: depth that is not finite, or negative; {AGAIN}")
-    return frame
+    return decoded(members, depth_unit=record.depth_unit, where=where)

@@ -10,7 +10,7 @@ import pytest
 from scenes_workspace import workspace
 
 from gvtools.cameras import Cameras
-from gvtools.errors import GvError, ProjectError, ShapeError
+from gvtools.errors import GvError, ProjectError
 from gvtools.scenes.colmap import read_colmap
 from gvtools.scenes.colmap_writer import write_colmap
 from gvtools.scenes.images import read_depth, stored_depth_size, write_depth_map
@@ -256,16 +256,6 @@ def test_same_input_gives_same_bytes_and_no_leftovers(tmp_path):
     assert files == ["cameras.bin", "frames.bin", "images.bin", "points3D.bin", "rigs.bin"]
     for name in files:
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
-
-
-def test_names_and_matrices_that_a_model_cannot_hold(tmp_path):
-    data = tracks(cameras())
-    with pytest.raises(ShapeError, match="share a name"):
-        write_colmap(tmp_path, cameras(["a", "a", *"xyz"]), **data)
-    skewed = cameras()
-    skewed.K[0, 0, 1] = 3
-    with pytest.raises(ShapeError, match="skew"):
-        write_colmap(tmp_path, skewed, **data)
 
 
 def test_full_disk_leaves_the_earlier_model(tmp_path, monkeypatch):

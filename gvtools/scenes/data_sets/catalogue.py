@@ -15,7 +15,7 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, ValidationError
 
 from gvtools.errors import OptionError, ProjectError
 from gvtools.files import digest
@@ -86,18 +86,6 @@ class GeometrySource(SpecRecord):
     own_share: float = Field(ge=0, le=1)
     fallback: str  # what stands in where depth is missing or incomplete
 
-    @model_validator(mode="after")
-    def _share_fits(self) -> GeometrySource:
-        """Own geometry alone has a share of 1, an estimate alone one of 0."""
-        fits = {
-            "own": self.own_share == 1,
-            "estimated": self.own_share == 0,
-            "mixed": 0 < self.own_share < 1,
-        }
-        if not fits[self.source]:
-            raise ValueError(f"own_share is {self.own_share}, which is not {self.source} geometry")
-        return self
-
 
 class DataSetSpec(SpecRecord):
     """A data set: what it holds, how it is stored, on what terms, and how it is sampled."""
@@ -124,13 +112,6 @@ class DataSetSpec(SpecRecord):
     sources: Texts  # where each of these facts was read
     not_verified: Texts = ()  # which facts could not be verified, and why
     traps: Texts = ()  # what readers of this data set get wrong
-
-    @model_validator(mode="after")
-    def _trains_from_something(self) -> DataSetSpec:
-        """A data set to train on has images to weigh it by, and says where its geometry is from."""
-        if "training" in self.roles and (self.geometry is None or self.counts.images is None):
-            raise ValueError("a training data set needs geometry and counts.images")
-        return self
 
     @property
     def weight(self) -> float:

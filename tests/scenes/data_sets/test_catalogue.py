@@ -75,8 +75,6 @@ def test_a_wrong_spec_is_named() -> None:
     wrong = {
         "camera.pose": {**good, "camera": {**good["camera"], "pose": "cam2world"}},
         "depth.unit_cm": {**good, "depth": {**good["depth"], "unit_cm": 1}},
-        "own_share": {**good, "geometry": {**good["geometry"], "own_share": 1.0}},
-        "counts.images": {**good, "counts": {**good["counts"], "images": None}},
         "licence": {key: value for key, value in good.items() if key != "licence"},
     }
     for place, content in wrong.items():
