@@ -13,11 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.cameras import Cameras, concatenate, rigid_poses
+from gvtools.cameras import Cameras, Float64, concatenate, rigid_poses
 from gvtools.glb import drawn_nodes, glb_numbers, split_glb
 from gvtools.untrusted import PIXEL_BYTES, PIXEL_RATIO, open_picture, read_bytes
-
-Float64 = NDArray[np.float64]
 
 # A drawn camera's sides agree to this share: what is drawn is in float32.
 EXACT = 1e-3

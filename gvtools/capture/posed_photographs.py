@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.cameras import Cameras
+from gvtools.cameras import Cameras, Float64
 from gvtools.capture.mapping import shared_points
 from gvtools.capture.matching import Say
 from gvtools.capture.photographs import CapturedPhotograph, copy_upright, find_photographs
@@ -41,7 +41,6 @@ from gvtools.scenes.pose_forms import pose_contradiction, pose_findings
 from gvtools.scenes.resized import reduced
 from gvtools.scenes.scene import Finding, Scene
 
-Float64 = NDArray[np.float64]
 Pictures = NDArray[np.uint8]
 Size = tuple[int, int]  # width and height [px]
 

@@ -15,16 +15,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from gvtools.cameras import Cameras, rigid_poses
+from gvtools.cameras import Cameras, Float64, rigid_poses
 from gvtools.capture.matching import Say
 from gvtools.capture.project import REPORT, replaced_folder
 from gvtools.errors import ProjectError
 from gvtools.files import link_or_copy, write_json
-from gvtools.poses.odometry import RgbdFrames
-from gvtools.poses.recording import RecordingPoses, find_poses
+from gvtools.poses.recording import RecordingPoses, RgbdFrames, find_poses
 from gvtools.scenes.calibration import INTRINSICS
 from gvtools.scenes.images import UNREADABLE, read_depth
 from gvtools.scenes.matching import named
@@ -41,8 +39,6 @@ from gvtools.scenes.rgbd import (
 from gvtools.scenes.scene import Finding, Scene
 from gvtools.trajectories import level_up
 from gvtools.untrusted import open_picture
-
-Float64 = NDArray[np.float64]
 
 # Keyframes whose depth the picture shows.
 DRAWN = 12

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.cameras import Cameras
+from gvtools.cameras import Cameras, Float64
 from gvtools.features import quiet_colmap
 from gvtools.memory.store.local_frame import LocalFrame
 from gvtools.poses.colmap import (
@@ -38,7 +38,6 @@ from gvtools.similarity import align_poses
 if TYPE_CHECKING:
     import pycolmap
 
-Float64 = NDArray[np.float64]
 
 # Features of more pictures take minutes.
 MOST_VIEWS = 150
@@ -117,16 +116,12 @@ class AdjustedPoses:
 
     def refined(self, given: Cameras) -> RefinedPoses:
         """As ``RefinedPoses``; targets follow if their neighbours' corrections predict views."""
-        before, depth = given.cam_from_world, float(np.median(self.tracks.local(self.poses)[:, 2]))
+        depth = float(np.median(self.tracks.local(self.poses)[:, 2]))
+        before = given.cam_from_world
         found = RefinedPoses(before, self.poses, depth, False, self.errors, True, True)
-        motions = found.motions
-        alike = np.stack([
-            move_pose(pose, mean_near(pose, before, motions, depth=depth, but=[row]))
-            for row, pose in enumerate(before)
-        ])  # fmt: skip
         near, away = (
             float(np.median(self.tracks.reprojection_errors(given, poses)))
-            for poses in (alike, before)
+            for poses in (found.like_neighbours(), before)
         )
         return replace(found, spread=near < MAX_ERROR_RATIO * away)
 

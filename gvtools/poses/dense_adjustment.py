@@ -15,9 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.cameras import Cameras
-
-Float64 = NDArray[np.float64]
+from gvtools.cameras import Cameras, Float64
 
 # Standard deviation of a measured motion, pixels, and where it counts as an outlier, in deviations.
 SPREAD, OUTLIER = 0.25, 3.0

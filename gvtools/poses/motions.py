@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.cameras import invert_rigid
-
-Float64 = NDArray[np.float64]
+from gvtools.cameras import Float64
 
 # Views that a camera takes its correction from, and how fast their weight falls: it is proportional
 # to exp(-(distance / (NEAR_SHIFT typical depths) + angle of viewing directions [rad] / NEAR_TURN)).
@@ -102,14 +99,6 @@ def within(motion: Float64, shift: float, turn: float) -> bool:
     return bool(np.linalg.norm(motion[:3, 3]) <= shift and np.degrees(turn_of(motion)) <= turn)
 
 
-def chain_motions(motions: Iterable[Float64]) -> Float64:
-    """The product of relative poses (4, 4), the first one applied first."""
-    pose = np.eye(4)
-    for step in motions:
-        pose = step @ pose
-    return pose
-
-
 # An uncertain pair whose weight in the optimisation falls below this is wrong, and taken out.
 PRUNED = 0.25
 
@@ -128,42 +117,6 @@ class Pair:
     # share that agrees in depth.
     overlap: float = 1.0
     agreement: float = 1.0
-
-
-def connected_parts(count: int, pairs: Sequence[Pair]) -> list[list[int]]:
-    """Parts of the views that pairs connect, the largest first, each in order."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    rows = [pair.source for pair in pairs]
-    columns = [pair.target for pair in pairs]
-    links = coo_matrix((np.ones(len(pairs)), (rows, columns)), shape=(count, count))
-    number, label = connected_components(links, directed=False)
-    parts = [np.nonzero(label == part)[0].tolist() for part in range(number)]
-    return sorted(parts, key=lambda part: (-len(part), part[0]))
-
-
-def first_poses(views: Sequence[int], pairs: Sequence[Pair]) -> dict[int, Float64]:
-    """``world_from_cam`` of connected views along as few pairs as possible from the first one.
-
-    Pairs of neighbours in time come before loops.
-    """
-    near: dict[int, list[tuple[int, Float64]]] = {}
-    for pair in pairs:
-        # world_from_source = world_from_target @ target_from_source
-        near.setdefault(pair.target, []).append((pair.source, pair.target_from_source))
-        near.setdefault(pair.source, []).append(
-            (pair.target, invert_rigid(pair.target_from_source))
-        )
-    poses = {views[0]: np.eye(4)}
-    waiting = deque([views[0]])
-    while waiting:
-        at = waiting.popleft()
-        for other, step in near.get(at, ()):
-            if other not in poses:
-                poses[other] = poses[at] @ step
-                waiting.append(other)
-    return poses
 
 
 def optimise(start: dict[int, Float64], pairs: Sequence[Pair]) -> dict[int, Float64]:
@@ -192,10 +145,3 @@ def optimise(start: dict[int, Float64], pairs: Sequence[Pair]) -> dict[int, Floa
             ),
         )
     return {view: np.array(graph.nodes[node[view]].pose) for view in start}
-
-
-def residual(pair: Pair, poses: dict[int, Float64]) -> tuple[float, float]:
-    """By how much poses in metres depart from a measured pair: millimetres and degrees."""
-    predicted = invert_rigid(poses[pair.target]) @ poses[pair.source]
-    off = invert_rigid(pair.target_from_source) @ predicted
-    return float(np.linalg.norm(off[:3, 3]) * 1e3), float(np.degrees(turn_of(off)))

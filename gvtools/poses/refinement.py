@@ -7,7 +7,7 @@ agree with all pairs best; as a whole they are put where the given ones are.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -16,6 +16,7 @@ import torch
 from kornia.filters import gaussian_blur2d
 from numpy.typing import NDArray
 
+from gvtools.cameras import Float64
 from gvtools.o3d import o3d
 from gvtools.poses.motions import (
     Pair,
@@ -25,12 +26,10 @@ from gvtools.poses.motions import (
     nearest,
     nearest_pairs,
     optimise,
+    turn_of,
 )
-from gvtools.poses.odometry import BEYOND, TYPICAL_DEPTH, register
 from gvtools.poses.views import FitView, ReducedView, reduce_view
 from gvtools.similarity import align_poses
-
-Float64 = NDArray[np.float64]
 
 # Odometry compares pictures at this length of the longer side [px], each with so many neighbours.
 SIDE, NEIGHBORS = 320, 3
@@ -44,6 +43,18 @@ LEAST_BETTER = 0.01
 SMALLER, NEIGHBOURS, PIXELS = 2, 2, 4
 # With fewer of these inside, a pair does not count.
 FEWEST = 25
+# Odometry works on depth scaled to TYPICAL_DEPTH: Open3D's limits are metres for rooms. Points
+# farther apart than REGISTERED_APART do not belong together [scaled depth].
+TYPICAL_DEPTH, REGISTERED_APART = 2.0, 0.03
+# More than any scaled depth.
+BEYOND = 1e3
+# A pair counts when this share of a picture overlaps, and moves by less than this [scaled depth,
+# rad] from the given poses: more is not a tracker's error but a comparison that went wrong.
+OVERLAP, REGISTERED_SHIFT, REGISTERED_TURN = 0.1, 0.12, 0.07
+# Steps at half and all of the size.
+REGISTERED_ITERATIONS = (10, 5)
+# Its relative poses are rounded to so many digits, as threads add in any order.
+DIGITS = 9
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,15 +76,23 @@ class RefinedPoses:
     in_pixels: bool = False
 
     @property
-    def motions(self) -> NDArray[np.float64]:
+    def motions(self) -> Float64:
         """(V, 6) shift and turn from the given pose to the refined one, on the camera's side."""
         return motions_between(self.given, self.poses)
 
-    def corrected(self, pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    def corrected(self, pose: Float64) -> Float64:
         """(4, 4) another camera's pose, moved as the views near it were if ``spread``."""
         if not self.spread:
             return pose
         return move_pose(pose, mean_near(pose, self.given, self.motions, depth=self.depth))
+
+    def like_neighbours(self) -> Float64:
+        """(V, 4, 4) each given pose, moved as the views near it were."""
+        motions = self.motions
+        return np.stack([
+            move_pose(pose, mean_near(pose, self.given, motions, depth=self.depth, but=[row]))
+            for row, pose in enumerate(self.given)
+        ])  # fmt: skip
 
     def __str__(self) -> str:
         shift = np.median(np.linalg.norm(self.motions[:, :3], axis=1))
@@ -87,9 +106,7 @@ class RefinedPoses:
         )
 
 
-def refined_poses(
-    views: Sequence[FitView], poses: NDArray[np.float64] | None = None
-) -> RefinedPoses | None:
+def refined_poses(views: Sequence[FitView], poses: Float64 | None = None) -> RefinedPoses | None:
     """Poses on which neighbouring views agree; None where the given ones are as good.
 
     All views have depth and are in the order of the path; ``poses`` (V, 4, 4) are told by features,
@@ -110,20 +127,14 @@ def refined_poses(
     refined = RefinedPoses(given, poses, typical, False, (before, after), by_features)
     # Each view is once treated as another camera: does it look more like its refined neighbours
     # where it was given, or moved as they were?
-    motions = refined.motions
-    alike = [
-        move_pose(pose, mean_near(pose, given, motions, depth=typical, but=[row]))
-        for row, pose in enumerate(given)
-    ]
-    near = prediction_error(small, poses, at=np.stack(alike))
+    near = prediction_error(small, poses, at=refined.like_neighbours())
     away = prediction_error(small, poses, at=given)
     spread = near < away * (1 - LEAST_BETTER)
     return replace(refined, spread=spread)
 
 
-def agreeing_poses(views: Iterable[FitView]) -> NDArray[np.float64]:
+def agreeing_poses(views: Sequence[FitView]) -> Float64:
     """(V, 4, 4) refined ``cam_from_local``, on average where they were given."""
-    views = list(views)
     height, width = views[0].rgb.shape[:2]
     scale = min(1.0, SIDE / max(height, width))
     size = (round(width * scale), round(height * scale))
@@ -149,7 +160,7 @@ def _optimise(
     pairs = []
     for i, j in nearest_pairs(given, count=NEIGHBORS, shift=TYPICAL_DEPTH, by_angle=True):
         start = given[j] @ np.linalg.inv(given[i])
-        measured = register(images[i], images[j], K, size=size, start=start)
+        measured = _register((images[i], images[j]), K, size=size, start=start)
         if measured is not None:
             pairs.append(Pair(i, j, *measured, uncertain=True))
     if not pairs:
@@ -160,6 +171,34 @@ def _optimise(
         pairs.append(Pair(row, row + 1, motion, weight * np.eye(6), uncertain=False))
     poses = optimise({row: np.linalg.inv(pose) for row, pose in enumerate(given)}, pairs)
     return np.stack([np.linalg.inv(pose) for pose in poses.values()])
+
+
+def _register(
+    both: Sequence[o3d.geometry.RGBDImage], K: Float64, *, size: tuple[int, int], start: Float64
+) -> tuple[Float64, Float64] | None:
+    """The second image's pose (4, 4) from the first, and its information matrix (6, 6), or None.
+
+    Open3D's older odometry is half as fast as that of recordings; it starts from poses that are
+    nearly right, and gives, but for a rare case, the same every time.
+    """
+    odometry = o3d.pipelines.odometry
+    # Open3D counts pixels from the first one's centre.
+    intrinsics = o3d.camera.PinholeCameraIntrinsic(
+        *size, K[0, 0], K[1, 1], K[0, 2] - 0.5, K[1, 2] - 0.5
+    )
+    found, motion, weight = odometry.compute_rgbd_odometry(
+        *both, intrinsics, start, odometry.RGBDOdometryJacobianFromHybridTerm(),
+        odometry.OdometryOption(
+            iteration_number_per_pyramid_level=o3d.utility.IntVector(REGISTERED_ITERATIONS),
+            depth_diff_max=REGISTERED_APART, depth_min=0.0, depth_max=BEYOND,
+        ),
+    )  # fmt: skip
+    change = motion @ np.linalg.inv(start)
+    right = np.linalg.norm(change[:3, 3]) < REGISTERED_SHIFT and turn_of(change) < REGISTERED_TURN
+    # The last number of the weight counts the pixels that correspond.
+    if not (found and right and weight[5, 5] > OVERLAP * size[0] * size[1]):
+        return None
+    return motion.round(DIGITS), weight.round()
 
 
 def _depth(view: FitView) -> NDArray[np.float32]:
@@ -192,15 +231,21 @@ def _image(
 
 
 def comparable(views: Sequence[FitView]) -> list[ReducedView]:
-    """Views as ``prediction_error`` compares them: smaller, without their noise."""
-    return [_blur(reduce_view(view, SMALLER)) for view in views]
+    """Views as ``prediction_error`` compares them: smaller, without their noise.
+
+    Looking up between pixels would average it away, so that poses seemed better by which pictures
+    meet between pixels.
+    """
+    found = []
+    for view in views:
+        small = reduce_view(view, SMALLER)
+        smooth = gaussian_blur2d(torch.from_numpy(small.target)[None], (5, 5), (1.0, 1.0))
+        found.append(replace(small, target=smooth[0].numpy()))
+    return found
 
 
 def prediction_error(
-    small: Sequence[ReducedView],
-    poses: NDArray[np.float64],
-    *,
-    at: NDArray[np.float64] | None = None,
+    small: Sequence[ReducedView], poses: Float64, *, at: Float64 | None = None
 ) -> float:
     """Mean over pairs of neighbouring photographs of the median colour difference, 0 to 1.
 
@@ -227,17 +272,8 @@ def prediction_error(
     return float(np.mean(errors)) if errors else float("nan")
 
 
-def _blur(view: ReducedView) -> ReducedView:
-    """Without its noise, which looking up between pixels would average away.
-
-    Else poses seemed better that make pictures meet between pixels.
-    """
-    smooth = gaussian_blur2d(torch.from_numpy(view.target)[None], (5, 5), (1.0, 1.0))
-    return replace(view, target=smooth[0].numpy())
-
-
 def _look_up(
-    picture: NDArray[np.float32], points: NDArray[np.float64], K: NDArray[np.float64]
+    picture: NDArray[np.float32], points: Float64, K: Float64
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Colours (3, N) of a picture at points of its camera's frame, and which lie inside."""
     height, width = picture.shape[1:]

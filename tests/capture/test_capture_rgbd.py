@@ -17,8 +17,7 @@ from rgbd_walk import write_tum as write_tum_walk
 from gvtools.cameras import invert_rigid
 from gvtools.capture.rgbd_project import capture_rgbd
 from gvtools.errors import ProjectError
-from gvtools.poses.motions import residual
-from gvtools.poses.odometry import RgbdFrames, compare, start_from_features
+from gvtools.poses.recording import RgbdFrames, compare, residual, start_from_features
 from gvtools.scenes.project import open_project
 from gvtools.scenes.rgbd import RgbdOptions, count_unposed, read_unposed, rgbd_scene
 from pipelines.cli import main
@@ -162,7 +161,7 @@ def test_features_start_pairs_that_motion_alone_does_not(walked, recording) -> N
     frames = RgbdFrames(rgbd_scene(found))
     far = COUNT // 2
     truth = {0: poses[0], far: poses[far]}
-    start = start_from_features(frames.features(far), frames.features(0), frames.feature_K)
+    start = start_from_features(frames, far, 0)
     assert start is not None
     pair = compare(frames, far, 0, start=start)
     assert pair is not None

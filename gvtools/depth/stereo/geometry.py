@@ -8,12 +8,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gvtools.cameras import Cameras
+from gvtools.cameras import Cameras, Float64
 from gvtools.errors import DegenerateError
 from gvtools.scenes.scene import Scene, SparsePoints
 from gvtools.view_selection import in_view
-
-Float64 = NDArray[np.float64]
 
 # Sparse points of a view from which percentiles are taken.
 ENOUGH_POINTS = 25
