@@ -103,23 +103,15 @@ def model_in(root: Path, *, number: int | None = None, faces: bool = False) -> C
 
 
 def colmap_frames(
-    model: ColmapModel, picture_of: Callable[[RegisteredImage], Path], *, scaled: bool = False
+    model: ColmapModel, picture_of: Callable[[RegisteredImage], Path]
 ) -> list[PosedFrame]:
-    """The model's images as frames, named as the model names them.
-
-    With ``scaled``, pictures may have another size than the model's cameras.
-    """
+    """The model's images as frames, named as the model names them."""
     lenses: dict[int, LensParameters] = {}
     for key, camera in model.reconstruction.cameras.items():
         values = tuple(float(value) for value in camera.params)
         lenses[key] = LensParameters(camera.model_name, values, (camera.width, camera.height))
     return [
-        PosedFrame(
-            image.name,
-            picture_of(image),
-            lenses[image.camera_id] if scaled else model.views[image.camera_id],
-            image.cam_from_world,
-        )
+        PosedFrame(image.name, picture_of(image), lenses[image.camera_id], image.cam_from_world)
         for image in model.images
     ]
 

@@ -80,9 +80,9 @@ class PosedFrame:
 
     name: str  # the view's
     image: Path  # the picture, or the file that holds it among others
-    # Of pictures of ``lens.size``; a data set's picture of the same aspect and another size gets it
-    # scaled. Or the ways to the views of one picture. None where the layout lacks it.
-    lens: LensParameters | tuple[Undistortion, ...] | None
+    # Of pictures of ``lens.size``; one of the same aspect and another size gets it scaled. Or the
+    # way to the view itself. None where the layout lacks it.
+    lens: LensParameters | Undistortion | None
     pose: Float64 | None  # (4, 4) or (3, 4), OpenCV axes, scene units; None where there is none
     depth: Path | None = None  # the depth map, or the file that holds it
     # To (h, w) float32 z-depth in scene units, 0 = none.
@@ -106,11 +106,11 @@ class _Sieve:
     strict: bool
     dropped: dict[str, list[str]] = field(default_factory=dict)
     details: dict[str, list[str]] = field(default_factory=dict)
-    headers: list[ImageHeader] = field(default_factory=list)
+    headers: dict[Path, ImageHeader] = field(default_factory=dict)
     scaled: Counter[str] = field(default_factory=Counter)
     defects: list[float] = field(default_factory=list)
     sizes: dict[Path, int] = field(default_factory=dict)
-    resized: dict[LensParameters, tuple[Undistortion, ...]] = field(default_factory=dict)
+    lenses: dict[LensParameters, tuple[Undistortion, ...]] = field(default_factory=dict)
 
     def present(self, path: Path | None) -> Path | None:
         """The file, if it is there with content; an interrupted download may leave it empty."""
@@ -122,6 +122,11 @@ class _Sieve:
                 self.sizes[path] = 0
         return path if path is not None and self.sizes[path] > 0 else None
 
+    def header(self, path: Path) -> ImageHeader:
+        if path not in self.headers:
+            self.headers[path] = read_header(path)
+        return self.headers[path]
+
     def findings(self) -> list[Finding]:
         found = []
         for reason, names in self.dropped.items():
@@ -129,7 +134,8 @@ class _Sieve:
             line = f"{len(names)} of {self.total} frames {reason}: dropped ({listed})"
             found.append(Finding("warning", line, len(names)))
         found += [Finding("info", f"{count} {line}") for line, count in self.scaled.items()]
-        return found + rotation_findings(self.defects) + conversion_findings(self.headers)
+        found += rotation_findings(self.defects)
+        return found + conversion_findings([*self.headers.values()])
 
 
 def posed_scene(
@@ -152,7 +158,6 @@ def posed_scene(
     out, ``advice`` what to do where none can be used.
     """
     sieve = _Sieve(len(frames), strict)
-    lenses: dict[LensParameters, Undistortion] = {}
     photographs, read = list[Photograph](), list[PosedFrame]()
     for frame in sorted(frames, key=lambda item: natural_key(item.name)):
         for path in () if strict else (frame.image, frame.depth, frame.mask):
@@ -162,7 +167,7 @@ def posed_scene(
                 named_file(home or root, path, where=where, follow_links=True)
         try:
             pose = _rigid(frame, sieve, unposed=unposed)
-            views = _views(frame, lenses, sieve)
+            views = _views(frame, sieve)
         except _LeftOut as left:
             reason, *detail = left.args
             sieve.dropped.setdefault(reason, []).append(frame.name)
@@ -196,7 +201,7 @@ def posed_scene(
         photographs = [replace(item, white=white) for item in photographs]
     if strict:
         report += center_findings([item.lens for item in photographs])
-        report += header_findings([item for item in photographs if item.frame.read is None])
+        report += size_findings(photographs, sieve)
         report += map_findings(photographs)
     if white != WHOLE[-1]:
         report = [item for item in report if not item.message.endswith(UPPER)]
@@ -255,57 +260,38 @@ def _rigid(frame: PosedFrame, sieve: _Sieve, *, unposed: str) -> Float64:
     return rigid
 
 
-def _views(
-    frame: PosedFrame, lenses: dict[LensParameters, Undistortion], sieve: _Sieve
-) -> tuple[Undistortion, ...]:
-    """The frame's ways to pinhole cameras; ``lenses`` is added to."""
+def _views(frame: PosedFrame, sieve: _Sieve) -> tuple[Undistortion, ...]:
+    """The frame's ways to pinhole cameras, several of a project's panorama or wide fisheye."""
     if frame.lens is None:
         raise _LeftOut(NO_LENS)
-    if not isinstance(frame.lens, LensParameters):
-        return _resized(frame, frame.lens, sieve)
+    if isinstance(frame.lens, Undistortion):
+        return (frame.lens,)
     size = frame.lens.size
-    if frame.read is None and not sieve.strict:
+    if frame.read is None:
         try:
-            header = read_header(frame.image)
+            header = sieve.header(frame.image)
+            size = header.width, header.height
         except ProjectError as error:
-            raise _LeftOut(UNREADABLE, str(error)) from None
-        sieve.headers.append(header)
-        size = header.width, header.height
+            if not sieve.strict:  # else it is an error of its own
+                raise _LeftOut(UNREADABLE, str(error)) from None
     line = f"{size[0]}x{size[1]} for cameras of {frame.lens.size[0]}x{frame.lens.size[1]}"
     if size != frame.lens.size and not same_aspect(size, frame.lens.size):
-        raise _LeftOut(OTHER_ASPECT, line)
+        if not sieve.strict:
+            raise _LeftOut(OTHER_ASPECT, line)
+        size = frame.lens.size
     if size != frame.lens.size:
         sieve.scaled[f"pictures of {line}: intrinsics scaled"] += 1
     try:
-        params = scaled_lens(frame.lens, size)
-        if params not in lenses:
-            what = str(frame.image) if sieve.strict else frame.name
-            lenses[params] = undistortion(params.model, params.values, size, what=what)
-        return (lenses[params],)
+        lens = scaled_lens(frame.lens, size)
+        if lens not in sieve.lenses:
+            what = (frame.where or str(frame.image)) if sieve.strict else frame.name
+            views = () if sieve.strict else (undistortion(*lens, what=what),)
+            sieve.lenses[lens] = views or perspective_views(*lens, what=what)
+        return sieve.lenses[lens]
     except ProjectError as error:
         if sieve.strict:
             raise
         raise _LeftOut(BAD_CAMERA, str(error)) from None
-
-
-def _resized(
-    frame: PosedFrame, views: tuple[Undistortion, ...], sieve: _Sieve
-) -> tuple[Undistortion, ...]:
-    """The ways to the views of a picture that has another size than its camera and its aspect."""
-    try:
-        header = None if frame.read else read_header(frame.image)
-    except ProjectError:
-        return views  # said where headers are
-    (w, h), source = views[0].source_size, views[0].source
-    if header is None or (size := (header.width, header.height)) == (w, h):
-        return views
-    if not same_aspect(size, (w, h)):
-        return views
-    sieve.scaled[f"pictures of {size[0]}x{size[1]} for cameras of {w}x{h}: intrinsics scaled"] += 1
-    lens = scaled_lens(LensParameters(source.model_name, tuple(source.params), (w, h)), size)
-    if lens not in sieve.resized:
-        sieve.resized[lens] = perspective_views(*lens, what=str(frame.image))
-    return sieve.resized[lens]
 
 
 def first_size(pictures: Iterable[Path]) -> tuple[int, int] | None:
@@ -389,21 +375,18 @@ class Photograph:
         )
 
 
-def header_findings(photographs: Sequence[Photograph]) -> list[Finding]:
-    """An error for each unreadable picture or wrong size, and a line a kind of conversion."""
-    findings: list[Finding] = []
-    headers: list[ImageHeader] = []
-    for path, expected in {item.frame.image: item.lens.source_size for item in photographs}.items():
+def size_findings(photographs: Sequence[Photograph], sieve: _Sieve) -> list[Finding]:
+    """An error for each unreadable picture or wrong size."""
+    files = {i.frame.image: i.lens.source_size for i in photographs if i.frame.read is None}
+    findings = []
+    for path, expected in files.items():
         try:
-            header = read_header(path)
-            check_size(
-                (header.width, header.height), expected, path=path, orientation=header.orientation
-            )
+            header = sieve.header(path)
+            size = header.width, header.height
+            check_size(size, expected, path=path, orientation=header.orientation)
         except ProjectError as error:
             findings.append(Finding("error", str(error)))
-            continue
-        headers.append(header)
-    return findings + conversion_findings(headers)
+    return findings
 
 
 def conversion_findings(headers: Sequence[ImageHeader]) -> list[Finding]:

@@ -104,7 +104,6 @@ def read_transforms(path: Path, *, images: Path | None = None, masks: Path | Non
     root = Path(path) if Path(path).is_dir() else Path(path).parent
     masks = None if masks is None else given_folder(masks, "masks")
     home = root if images is None else given_folder(images, "images")
-    cameras: dict[LensParameters, tuple[Undistortion, ...]] = {}
     frames, said = [], dict[str, list[str]]()
     named_files = [item.file if images is None else home / item.name for item in listed]
     files, renamed = find_renamed(home, named_files, where=[item.what for item in listed])
@@ -122,7 +121,7 @@ def read_transforms(path: Path, *, images: Path | None = None, masks: Path | Non
             PosedFrame(
                 name,
                 file,
-                _views(keys, file, cameras, what=what),
+                keys.lens(file, what=what),
                 _pose(keys, what),
                 root / depth if depth else None,
                 partial(read_depth, unit=unit),
@@ -280,7 +279,10 @@ def read_transforms_cameras(path: Path) -> Cameras:
         what = f"{where} ({name})"
         keys = frame_keys(entry, shared, what=what)
         pose = invert_rigid(rigid_transform(_pose(keys, what), what=what)[0])
-        for lens in _views(keys, file, cameras, what=what):
+        params = keys.lens(file, what=what)
+        if params not in cameras:
+            cameras[params] = perspective_views(*params, what=what)
+        for lens in cameras[params]:
             found.append((lens.name(name), lens.K, lens.pose(pose), *lens.size))
     found.sort(key=lambda camera: natural_key(camera[0]))
     seen, K, poses, width, height = zip(*found, strict=True)
@@ -388,20 +390,6 @@ def _pose(keys: FrameKeys, what: str) -> Float64:
         raise ProjectError(f"{what}: transform_matrix is no matrix; expected 4x4 numbers") from None
     pose = pose.reshape(4, 4) if pose.shape == (16,) else pose
     return pose * np.diag(OPENCV_FROM_OPENGL) if pose.shape[-1:] == (4,) else pose
-
-
-def _views(
-    keys: FrameKeys,
-    file: Path,
-    lenses: dict[LensParameters, tuple[Undistortion, ...]],
-    *,
-    what: str,
-) -> tuple[Undistortion, ...]:
-    """A frame's perspective views, the same for all frames of its lens; ``lenses`` is added to."""
-    params = keys.lens(file, what=what)
-    if params not in lenses:
-        lenses[params] = perspective_views(params.model, params.values, params.size, what=what)
-    return lenses[params]
 
 
 class FrameKeys(BaseModel):

@@ -55,7 +55,7 @@ def _read(root: Path, scene: str) -> Scene:
         PosedFrame(
             str(time),
             folder / VIDEO,
-            (lens,),
+            lens,
             pose_at(time, times, cam_from_world, same=SAME, longest_gap=LONGEST_GAP),
             depth if depth.is_file() else None,
             partial(read_rgb_depth, time=time),

@@ -98,7 +98,7 @@ def _read_mipnerf360(root: Path, scene: str) -> Scene:
         exact = pictures / image.name
         return exact if is_file(exact) else by_stem.get(Path(image.name).stem, exact)
 
-    return colmap_scene(folder, model, colmap_frames(model, picture_of, scaled=True))
+    return colmap_scene(folder, model, colmap_frames(model, picture_of))
 
 
 MIPNERF360 = Layout(
@@ -204,7 +204,7 @@ def _read_dl3dv(root: Path, scene: str) -> Scene:
             f"{folder}: neither {TRANSFORMS} nor a COLMAP model; complete the download"
         )
     model = model_in(folder)
-    frames = colmap_frames(model, lambda image: pictures / Path(image.name).name, scaled=True)
+    frames = colmap_frames(model, lambda image: pictures / Path(image.name).name)
     return colmap_scene(folder, model, frames)
 
 
@@ -240,7 +240,7 @@ def _read_eth3d(root: Path, scene: str) -> Scene:
             model = undistorted
     if model is None:
         raise ProjectError(f"{folder}: neither {UNDISTORTED} nor {ORIGINAL}; complete the download")
-    frames = colmap_frames(model, lambda image: home / image.name, scaled=True)
+    frames = colmap_frames(model, lambda image: home / image.name)
     findings = []
     if maps.is_dir() and original is None:
         line = f"depth is of the original pictures and needs {ORIGINAL}, which is absent"
@@ -323,7 +323,7 @@ def _read_dslr(folder: Path) -> Scene:
         keys = ("frames", "test_frames")
         lenses = {frame.name: frame.lens for frame in transforms_frames(cameras, home, lists=keys)}
     frames = []
-    for frame in colmap_frames(model, lambda image: home / Path(image.name).name, scaled=True):
+    for frame in colmap_frames(model, lambda image: home / Path(image.name).name):
         png = f"{Path(frame.name).stem}.png"
         if undistorted:
             # Poses stay those of COLMAP: a pinhole looks along the fisheye camera's own axes.
