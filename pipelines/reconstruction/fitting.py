@@ -80,7 +80,8 @@ SAY_EVERY = 5.0
 # Least tolerance of the blend with recorded depth. In targets far from all views Gaussians are
 # smeared and the memory is right; validation photographs are too near to other views to show it.
 WITH_DEPTH = 0.4
-# A warning tells of a fit of fewer steps for each photograph. With 50, 100 and 600 steps, 44
+# A fit that its clock ends after fewer steps for each photograph is not used; of other short ones
+# a warning tells. With 50, 100 and 600 steps, 44
 # photographs have 18.8, 21.1 and 29.1 dB in held-out pictures, and 27.3 without a fit.
 SHORT = 7.5
 # A fit whose validation photographs stopped gaining makes this share of its steps or more.
@@ -420,9 +421,16 @@ def fit_appearance(plan: Plan, console: Console, *, earlier: Fitted | None = Non
     enough = round(SHORT * len(plan.context))
     # Recorded depth keeps surfaces.
     if not _recorded(plan) and fitted.steps < enough:
-        console.warn(
+        few = (
             f"{fitted.steps} steps of a fit to {len(plan.context)} photographs; expected at least "
-            f"{enough}; pictures may be worse than without a fit; give more --refine seconds, or "
+            f"{enough}"
+        )
+        asked = plan.config.refine
+        if asked.init is None and fitted.steps != asked.steps:
+            console.warn(f"the fit is not used: {few}; give it more time by --refine")
+            return None
+        console.warn(
+            f"{few}; pictures may be worse than without a fit; give more --refine seconds, or "
             "--refine 0 for none"
         )
     return fitted

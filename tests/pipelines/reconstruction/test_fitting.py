@@ -207,6 +207,14 @@ def test_a_fit_too_short_for_its_photographs_is_told(bare, monkeypatch, capsys, 
     assert (f"expected at least {needed}" in capsys.readouterr().err) == told
 
 
+def test_a_fit_that_its_clock_ends_too_early_is_not_used(bare, monkeypatch, capsys):
+    monkeypatch.setattr(fitting, "validate_fit", lambda *args: None)
+    monkeypatch.setattr(fitting, "SWEPT_SIDE", 64)
+    plan = planned(bare, "refine.seconds=0.001", "context=first:3")
+    assert fit_appearance(plan, Console()) is None
+    assert "the fit is not used" in capsys.readouterr().err
+
+
 def test_pixels_with_swept_depth_make_up_for_few_sparse_points(tmp_path, monkeypatch):
     begun = []
 
