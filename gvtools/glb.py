@@ -172,3 +172,18 @@ def glb_numbers(tree: dict[str, Any], body: bytes, place: int) -> NDArray[np.flo
     if stored.dtype.kind == "f" or not tree["accessors"][place].get("normalized", False):
         return stored.astype(np.float32)
     return np.maximum(stored / np.float32(np.iinfo(stored.dtype).max), -1).astype(np.float32)
+
+
+def glb_colors(tree: dict[str, Any], body: bytes, place: int) -> NDArray[np.uint8]:
+    """(N, 3) colours of vertices: linear light, but bytes, in which most programs write sRGB."""
+    stored = glb_array(tree, body, place)[:, :3]
+    if stored.dtype == np.uint8:
+        return stored
+    return srgb_bytes(np.nan_to_num(glb_numbers(tree, body, place)[:, :3].astype(np.float64)))
+
+
+def srgb_bytes(linear: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """Linear light as bytes of sRGB."""
+    linear = np.clip(linear, 0, 1)
+    curved = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    return np.rint(255 * curved).astype(np.uint8)

@@ -15,10 +15,10 @@ from gvtools.errors import GvError, MemoryFileError, OptionError
 from gvtools.ranges import CLOUD_OUTLIERS, OF_CLOUDS, said_of, to_bytes, white_of
 from gvtools.scans.lidar import open_lidar
 from gvtools.scans.points import Chunk, Scan, ScanFile
-from gvtools.scans.tables import open_pcd, open_ply, open_splats
+from gvtools.scans.tables import open_glb, open_pcd, open_ply, open_splats
 
 GAUSSIANS = (".spz", ".sog", ".splat", ".ksplat")
-SUFFIXES = (".ply", ".las", ".laz", ".e57", ".pcd", *GAUSSIANS)
+SUFFIXES = (".ply", ".las", ".laz", ".e57", ".pcd", ".glb", *GAUSSIANS)
 # Points that are kept at once, 36 bytes each and as much again for work; more are thinned.
 MOST_POINTS = 8_000_000
 # Thinning begins with so many cells along the longest side.
@@ -47,6 +47,8 @@ def open_scan(path: Path, *, generated: bool = False) -> ScanFile:
             file = open_ply(path)
         elif suffix == ".pcd":
             file = open_pcd(path)
+        elif suffix == ".glb":
+            file = open_glb(path)
         elif suffix in GAUSSIANS:
             file = open_splats(path)
         else:

@@ -12,14 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.errors import MemoryFileError
+from gvtools.glb import drawn_nodes, glb_colors, glb_numbers, split_glb
 from gvtools.kernels import compiled
 from gvtools.ply import point_vertices, read_header
 from gvtools.ranges import color_names, intensity_names, packed_names
 from gvtools.scans.points import CHUNK, GENERATED, Chunk, ScanFile, Station
-from gvtools.splat_files import holds_splats, read_splats
+from gvtools.splat_files import glb_axes, holds_splats, read_splats
+from gvtools.untrusted import read_bytes
 
 # A number and what parts it from the next one; what one takes at most.
 LEAST_TEXT, MOST_TEXT = 2, 64
+# Bytes of a vertex of a GLB at least.
+LEAST_VERTEX = 6
 # Of rows that are read at once.
 CHUNK_BYTES = 1 << 26
 Columns = Mapping[str, NDArray[Any]]
@@ -148,6 +152,30 @@ def open_splats(path: Path) -> ScanFile:
     chunk = Chunk(splats.positions + splats.origin, colors)
     chunk = chunk.without(~(splats.logits > 0), "transparent Gaussians")
     return ScanFile(path, len(splats), (Station(path.stem),), iter([chunk]))
+
+
+def open_glb(path: Path) -> ScanFile:
+    """Points of a glTF, else its meshes' coloured vertices, or its Gaussians, in its own axes."""
+    if holds_splats(path):
+        return open_splats(path)
+    tree, body = split_glb(read_bytes(path))
+    _, back = glb_axes(tree)
+    chunks: dict[bool, list[Chunk]] = {True: [], False: []}
+    count = 0
+    for node, matrix in drawn_nodes(tree):
+        for part in tree["meshes"][node["mesh"]]["primitives"] if "mesh" in node else ():
+            places, of_points = part["attributes"], part.get("mode") == 0
+            local = glb_numbers(tree, body, places["POSITION"]).astype(np.float64)
+            colors = glb_colors(tree, body, places["COLOR_0"]) if "COLOR_0" in places else None
+            count += len(local)
+            if count * LEAST_VERTEX > len(body):
+                raise ValueError("nodes that draw a mesh several times")
+            if of_points or colors is not None:
+                world = local @ matrix[:3, :3].T + matrix[:3, 3]
+                chunks[of_points].append(Chunk(world @ back.T, colors))
+    found = chunks[True] or chunks[False]
+    stations = (Station(path.stem),)
+    return ScanFile(path, sum(len(chunk.positions) for chunk in found), stations, iter(found))
 
 
 def _chunk(columns: Columns, kinds: Mapping[str, np.dtype[Any]]) -> Chunk:

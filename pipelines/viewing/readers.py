@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import rigid_poses
 from gvtools.errors import MemoryFileError
-from gvtools.glb import GLB, glb_array, join_glb, split_glb
+from gvtools.glb import GLB, glb_array, join_glb, split_glb, srgb_bytes
 from gvtools.optional import require
 from gvtools.ply import read_header
 from gvtools.sandbox import ReaderError, read_apart
@@ -173,7 +173,7 @@ def _with_plain_colors(tree: dict[str, Any], body: bytes) -> bytes | None:
         kind = stored.dtype
         linear = np.nan_to_num(stored.astype(np.float64) / (65535 if kind.kind == "u" else 1))
         colors = np.full((len(linear), 4), 255, np.uint8)
-        colors[:, :3] = _srgb(linear[:, :3])
+        colors[:, :3] = srgb_bytes(linear[:, :3])
         accessor |= {"bufferView": len(tree["bufferViews"]), "byteOffset": 0, "type": "VEC4"}
         accessor |= {"componentType": 5121, "normalized": True}
         body = body.ljust(-(-len(body) // 4) * 4, b"\0")
@@ -199,16 +199,9 @@ def read_usd(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8], NDArra
         colors = [np.broadcast_to(part.get("colors", grey), part["positions"].shape)
                   for part in parts]  # fmt: skip
         positions = np.concatenate([part["positions"] for part in parts])
-        return positions, _srgb(np.concatenate(colors)), np.array(facts["up"])
+        return positions, srgb_bytes(np.concatenate(colors)), np.array(facts["up"])
     except (ReaderError, OSError, ValueError, KeyError):
         raise MemoryFileError(
             f"{path}: no USD with UsdGeom.Points, or one that is damaged or names other files; "
             "expected a file as gvtools export writes it; export it again"
         ) from None
-
-
-def _srgb(linear: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """Linear light as bytes of sRGB."""
-    linear = np.clip(linear, 0, 1)
-    curved = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-    return np.rint(255 * curved).astype(np.uint8)

@@ -6,6 +6,7 @@ from scan_files import FAR, surface, write_e57, write_las
 from scipy.spatial.transform import Rotation
 
 from gvtools.errors import GvError, MemoryFileError, OptionError
+from gvtools.glb import pack_glb
 from gvtools.scans.read import open_scan, read_scan
 from gvtools.scans.tables import unpack_lzf
 
@@ -410,6 +411,31 @@ def written(path, change=lambda text: text, *, rows=None):
         lines = [f"{line} {value}" for line, value in zip(lines, packed, strict=True)]
     path.write_bytes(change(head + "\n".join(lines) + "\n").encode())
     return path, positions, colors
+
+
+def test_glb_of_points_in_a_scene_of_other_things(tmp_path):
+    """Points before meshes, else coloured vertices; light is linear, but bytes are sRGB."""
+    trimesh = pytest.importorskip("trimesh")
+    rng = np.random.default_rng(0)
+    points, colors = rng.random((50, 3)), rng.integers(0, 256, (50, 4), dtype=np.uint8)
+    scene = trimesh.Scene(trimesh.creation.box())
+    moved = np.diag([2.0, 2.0, 2.0, 1.0])
+    moved[:3, 3] = 1, 2, 3
+    scene.add_geometry(trimesh.PointCloud(points, colors), transform=moved)
+    scene.export(tmp_path / "points.glb")
+    scan = read_scan(tmp_path / "points.glb")
+    np.testing.assert_allclose(scan.positions + scan.origin, 2 * points + [1, 2, 3], atol=1e-5)
+    np.testing.assert_array_equal(scan.colors, colors[:, :3])
+    mesh = trimesh.Trimesh(points, [[0, 1, 2]], vertex_colors=colors, process=False)
+    mesh.export(tmp_path / "mesh.glb")
+    assert len(read_scan(tmp_path / "mesh.glb")) >= 3
+    linear = np.full((1, 3), 0.2159, np.float32)
+    arrays = {"POSITION": np.zeros((1, 3), np.float32), "COLOR_0": linear}
+    (tmp_path / "one.glb").write_bytes(pack_glb(arrays, node={}, primitive={"mode": 0}))
+    assert read_scan(tmp_path / "one.glb").colors.tolist() == [[128] * 3]
+    trimesh.creation.box().export(tmp_path / "bare.glb")
+    with pytest.raises(MemoryFileError, match="no points in it"):
+        read_scan(tmp_path / "bare.glb")
 
 
 @pytest.mark.parametrize(
