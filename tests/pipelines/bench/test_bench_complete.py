@@ -2,21 +2,24 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import weakref
 
 import geoverse_models as micro
 import pytest
 import torch
+import torch.nn.functional as F
 from command_line import run_command
 
+from benchmarks.memory import CASES, peak, predicted_peak
 from gvtools.completers.geoverse import model as stages
 from gvtools.completers.geoverse.config import named
 from gvtools.completers.geoverse.flow import interval_bounds
 from gvtools.completers.geoverse.model import LEVEL0, LEVEL1
 from gvtools.errors import OptionError
 from gvtools.networks.compute import attend
-from pipelines.bench import side_by_side
-from pipelines.bench.complete import StageClock, TimedPass, module_bytes, parameters, total
-from pipelines.bench.options import CompleteOptions
+from pipelines.bench.complete import INSIDE, StageClock, TimedPass, module_bytes, parameters, total
+from pipelines.bench.memory import LiveBytes, StagePeaks, alone, card_line, fake_tensors
+from pipelines.bench.prediction import ASKED, CARDS, LEAST, Card, Counter, Kernel, Work, row_of
 from pipelines.bench.random_model import random_features, random_model, random_video, random_views
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -34,11 +37,6 @@ STAGES = [
     "between stages",
     "pass",
 ]
-
-
-@pytest.fixture(autouse=True)
-def no_pauses(monkeypatch):
-    monkeypatch.setattr(side_by_side, "SETTLE_SECONDS", 0.0)
 
 
 def run(*words: object) -> None:
@@ -185,25 +183,19 @@ def test_a_video_prior_that_is_not_run_has_a_stand_in(tmp_path):
         (("--size", "50"), "multiples of 12"),
         (("--size", "5y5"), "expected HxW or N"),
         (("--steps", 0), "steps"),
-        (("--repeat", 0), "repeat"),
         (("--points", 5000), "--points is of fuse and splat"),
         (("--video",), "tiny has no video prior"),
         (("--config", "tiny", "--weights", "x"), "both --config and --weights"),
+        (("--card", 24), "--card is of --memory"),
+        (("--memory", "--compile"), "expected one of --memory"),
+        (("--memory", "--card", 0), "more than 0"),
     ],
 )
 def test_options_that_do_not_fit(words, said):
     with pytest.raises(OptionError, match=said):
         run(*words)
-
-
-def test_other_benchmarks_know_no_model():
     with pytest.raises(OptionError, match="--compile, --steps given"):
         run_command("bench", "fuse", "--steps", 3, "--compile")
-
-
-def test_sizes():
-    assert CompleteOptions(size="504").size == (504, 504)
-    assert CompleteOptions(size="336x504").size == (336, 504)
 
 
 # Random models and views.
@@ -220,12 +212,188 @@ def test_nothing_of_a_random_model_is_zero_and_its_numbers_are_finite():
     assert parameters(model)["total"] == sum(p.numel() for p in model.parameters())
 
 
-def test_random_views_look_at_one_point():
-    batch = random_views((24, 36), context=2, targets=3)
-    point = torch.tensor([0.0, 0.0, 2.0, 1.0])
-    seen = (batch.K[0] @ (batch.cam_from_world[0] @ point)[:, :3, None])[..., 0]
-    torch.testing.assert_close(seen[:, 0] / seen[:, 2], torch.full((5,), 18.0))
-    torch.testing.assert_close(seen[:, 1] / seen[:, 2], torch.full((5,), 12.0))
-    rotation = batch.cam_from_world[0, :, :3, :3]
-    torch.testing.assert_close(rotation @ rotation.mT, torch.eye(3).expand(5, 3, 3))
-    assert batch.valid[:, :2].all() and 0.3 < batch.valid[:, 2:].float().mean() < 0.95
+# Predicted memory.
+
+
+def test_bytes_are_counted_once_and_forgotten_when_they_are_given_back():
+    with LiveBytes() as live:
+        a = torch.zeros(100)
+        assert live.live == 400
+        b = a.view(10, 10)[2:].t()
+        a.add_(1)
+        assert live.live == 400
+        c = a + b.sum()
+        assert live.live == 800 and live.peak == 804
+        del a
+        assert live.live == 800  # ``b`` still looks at it
+        del b
+        assert live.live == 400 and live.peak == 804
+        live.forget_peak()
+        assert live.peak == 400
+        del c
+    assert live.live == 0
+
+
+def test_weights_are_counted_elsewhere():
+    layer = torch.nn.Linear(10, 30)
+    x = torch.zeros(5, 10)
+    with LiveBytes([layer]) as live:
+        y = layer(x)
+        assert live.peak == 5 * 30 * 4
+        y.sum().backward()
+        del y
+        assert live.live == (10 * 30 + 30) * 4  # the gradients
+
+
+def test_nothing_is_allocated_for_what_is_predicted():
+    with fake_tensors(), LiveBytes() as live:
+        made = torch.zeros(2**40)
+        made = made * 2
+        assert live.live == 4 * 2**40
+        alive = weakref.ref(made)
+        del made
+        assert alive() is None and live.live == 0 and live.peak == 8 * 2**40
+
+
+def test_peaks_by_stage():
+    with LiveBytes() as live:
+        peaks = StagePeaks(live)
+        with peaks("hint encoding"):
+            kept = torch.zeros(100)
+        with peaks("decoding"):
+            torch.zeros(50).sum()
+            with peaks("RGB head"):
+                torch.zeros(200)
+    assert len(kept) == 100
+    assert peaks.rows == {"hint encoding": 400, "decoding": 1200, "decoding: RGB head": 1200}
+
+
+@pytest.mark.slow
+def test_what_is_predicted_is_what_is_counted_with_numbers():
+    found = {case: alone(predicted_peak, case, "tiny", 48) for case in CASES}
+    for case, before in found.items():
+        assert before == pytest.approx(alone(peak, case, "tiny", 48), rel=0.01)
+    assert all(found.values())
+
+
+def predicted(capsys, tmp_path, *words: object) -> tuple[str, dict]:
+    """What the command says, and its figures."""
+    run("--weights", micro.weights_folder(tmp_path / "weights"), "--size", 32, *words)
+    return capsys.readouterr().out, figures(
+        tmp_path, "--weights", tmp_path / "weights", "--size", 32, *words
+    )
+
+
+@pytest.mark.slow
+def test_the_tables_and_figures_of_memory(tmp_path, capsys):
+    words = ("--memory", "--steps", 1, "--targets", 1, "--precision", "float16", "--card", 24)
+    shown, found = predicted(capsys, tmp_path, *words)
+    for said in (
+        "micro, 2 + 1 views of 32x32, 1 + 1 steps, float16: peak memory of a pass, GB",
+        "a training step of one sample, float32",
+        "reflow",
+        "level-1 step",
+        "a card of 24 GB: a pass without the video prior fits (0.",
+    ):
+        assert said in shown
+    assert found["precision"] == "float16" and found["card_gb"] == 24
+    assert len(found["training"]) == 4
+    for row in found["training"]:
+        assert row["total_bytes"] >= row["lasting_bytes"] > row["weights_bytes"] > 0
+
+
+def test_what_fits_a_card():
+    figures = {
+        "inference": [{"model": "M", "total_bytes": 3e9}, {"model": "M", "total_bytes": 7e9}],
+        "training": [
+            {"model": "M", "stage": "S", "recompute": False, "total_bytes": 30e9},
+            {"model": "M", "stage": "S", "recompute": True, "total_bytes": 9e9},
+        ],
+    }
+    assert card_line(figures, 8) == (
+        "a card of 8 GB: a pass M fits (7); training S M and with recompute does not fit (9)"
+    )
+
+
+# Predicted time.
+
+
+def only(work: Work) -> Kernel:
+    ((kernel, count),) = work.stages["between stages"].items()
+    assert count == 1
+    return kernel
+
+
+def test_a_product_reads_and_writes_every_number_once():
+    a, b = torch.rand(3, 4), torch.rand(4, 5)
+    with Work() as work:
+        a @ b
+    assert only(work) == Kernel("product", "float32", 2 * 3 * 4 * 5, 4 * (12 + 20 + 15))
+    with Work() as work:
+        a.bfloat16()
+    assert only(work) == Kernel("product", "half", 0, 4 * 12 + 2 * 12)
+    with Work() as work:
+        a.add_(b[:1, :1].expand(3, 4))
+    assert only(work) == Kernel("product", "float32", 0, 4 * (12 + 1 + 12))
+    with Work() as work:
+        a.view(2, 6)[1:].t()
+        torch.empty(100)
+    assert not work.stages
+
+
+def test_convolutions_and_attention_have_rates_of_their_own():
+    x, kernels = torch.rand(1, 3, 8, 8), torch.rand(5, 3, 3, 3)
+    with Work() as work:
+        F.conv2d(x, kernels)
+    kernel = only(work)
+    assert (kernel.work, kernel.kind) == ("convolution", "tf32")
+    assert kernel.flops == 2 * 5 * 36 * 27
+    q = torch.rand(1, 2, 16, 8, requires_grad=True)
+    with Work() as work:
+        F.scaled_dot_product_attention(q, q, q).sum().backward()
+    forward, backward = (
+        kernel for kernel in work.stages["between stages"] if kernel.work == "attention"
+    )
+    # Two products of (16, 8, 16) for each of two heads; five in the backward pass.
+    assert forward.flops == 2 * 2 * 2 * 16 * 16 * 8 and backward.flops == 2.5 * forward.flops
+    assert forward.heads == backward.heads == 8
+
+
+def test_a_kernel_takes_as_long_as_the_slower_of_its_two():
+    card = Card("C", bandwidth=1, half=100, tf32=50, float32=10)
+    assert Kernel("product", "half", 8 * 10**11, 10).seconds(card) == pytest.approx(0.01)
+    assert Kernel("product", "half", 10, 2 * 10**12).seconds(card) == pytest.approx(2)
+    assert Kernel("attention", "float32", 4 * 10**12, 0, 64).seconds(card) == pytest.approx(2)
+    small = Kernel("product", "half", 1, 1)
+    assert small.seconds(card) == LEAST
+    seconds = row_of("S", Counter({small: 1000}))["seconds"]
+    assert seconds == {one.name: pytest.approx(1000 * ASKED) for one in CARDS}
+
+
+def test_the_operations_of_a_pass_are_those_that_torch_counts():
+    model = micro.model()
+    views = random_views((32, 32), context=1, targets=2)
+    bounds = (1.0, 0.5, 0.0)
+    counted = TimedPass(model, views, bounds=bounds, cascade_bounds=(1.0, 0.0)).flops()
+    with Work() as work:
+        model.clock = work.clock
+        model.generate(views, bounds=bounds, cascade_bounds=(1.0, 0.0))
+    found = {stage: row_of(stage, kernels)["flops"] for stage, kernels in work.stages.items()}
+    assert found["level-1 step"] == counted["level-1 step 1"] + counted["level-1 step 2"]
+    assert found["cascade step"] == counted["cascade step 1"]
+    inside = [name for name in counted if name.startswith(INSIDE)]
+    assert len(inside) == 3
+    for name in ("hint encoding", *inside):
+        assert found[name] == counted[name] > 0, name
+
+
+@pytest.mark.slow
+def test_the_table_and_figures_of_predicted_time(tmp_path, capsys):
+    shown, found = predicted(capsys, tmp_path, "--predict", "--steps", 2)
+    assert "micro, 2 + 6 views of 32x32, 2 + 1 steps, bfloat16, not compiled" in shown
+    assert "RTX 3090" in shown
+    *stages, whole = found["results"]
+    assert whole["name"] == "pass"
+    for name in ("flops", "bytes", "kernels"):
+        assert whole[name] == sum(row[name] for row in stages) > 0
+    assert set(whole["seconds"]) == {card.name for card in CARDS}

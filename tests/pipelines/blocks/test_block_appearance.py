@@ -13,7 +13,6 @@ from gvtools.appearance.camera_corrections import Exposures
 from gvtools.appearance.gaussians import Gaussians
 from gvtools.appearance.splat.project_kernels import HARMONICS, LOG_SCALE, SH
 from gvtools.cameras import Cameras
-from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.store.local_frame import LocalFrame
 from gvtools.runs.folder import RunDirectory
 from gvtools.runs.poses import RunPoses
@@ -149,13 +148,6 @@ def error(folder: Path, fit: Fitted) -> float:
     ]))  # fmt: skip
 
 
-def test_the_views_that_help_are_those_that_a_merge_fits_to(fitted: Path) -> None:
-    blocks = [block for _, block in read_blocks(fitted / "blocks")]
-    found, context = across(fitted), load_run(fitted / "merged").context
-    assert found == [name for name in context if any(name in b.helpers for b in blocks)]
-    assert 0 < len(found) < len(context)
-
-
 def test_pictures_across_faces_come_nearer_to_the_photographs(fitted, tmp_path, monkeypatch):
     before = unfitted(fitted, tmp_path / "joined", monkeypatch)
     after = Fitted.load(fitted / "merged" / SAVED)
@@ -177,14 +169,6 @@ def test_the_blocks_exposures_stand_in_the_order_of_the_context(fitted: Path) ->
     cameras = open_project(fitted / "scan").subset(load_run(fitted / "merged").context).cameras
     given = frame.cam_from_local(cameras.cam_from_world)
     assert np.allclose(exposures.exposures.poses, given, atol=1e-9)
-
-
-def test_observed_content_is_still_the_unsplit_runs_to_the_bit(fitted: Path) -> None:
-    one, two = (SpatialMemory.load(fitted / name / "memory.npz") for name in ("whole", "merged"))
-    for memory in (one, two):
-        memory.forget(round=1)
-    for name in ("positions", "colors", "confidence", "spacing", "round", "view", "level"):
-        assert getattr(one.columns, name).tobytes() == getattr(two.columns, name).tobytes(), name
 
 
 def test_a_resumed_merge_has_the_same_bytes_and_fits_no_second_time(fitted, tmp_path, monkeypatch):

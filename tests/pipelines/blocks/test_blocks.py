@@ -11,13 +11,13 @@ import pytest
 from command_line import refused
 from tiny_scan import write_colmap_scan, write_scan
 
-from gvtools.errors import OptionError, ProjectError
+from gvtools.errors import OptionError
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.runs.run import load_run
 from gvtools.scenes.project import open_project
 from gvtools.settings import with_values
 from pipelines.blocks.merge import merge
-from pipelines.blocks.split import SceneBlock, cut_cells, read_blocks, split
+from pipelines.blocks.split import cut_cells, read_blocks, split
 from pipelines.cli import main
 from pipelines.console import Console
 from pipelines.reconstruction import run
@@ -114,17 +114,9 @@ def test_generated_content_is_that_of_the_blocks_and_stays_out_of_free_space(wal
     assert not free.any()
 
 
-@pytest.mark.parametrize("command", ["evaluate", "check", "render", "export"])
-def test_commands_read_the_merged_run(walk: Path, tmp_path: Path, command: str) -> None:
-    path = str(walk / "merged")
-    arguments = {
-        "evaluate": ["evaluate", path],
-        "check": ["check", str(walk / "blocks/0_0")],
-        "render": ["render", path, "--cameras", str(walk / "scan"), "--views", "first:1",
-                   "--out", str(tmp_path / "pictures")],
-        "export": ["export", path, "--format", "ply", "--out", str(tmp_path / "points.ply")],
-    }  # fmt: skip
-    assert main(arguments[command]) == 0
+def test_commands_read_the_merged_run_and_blocks(walk: Path) -> None:
+    assert main(["evaluate", str(walk / "merged")]) == 0
+    assert main(["check", str(walk / "blocks/0_0")]) == 0
 
 
 def test_a_block_is_read_like_the_project_and_survives_a_copy(walk: Path, tmp_path: Path) -> None:
@@ -186,7 +178,7 @@ def test_chunks_have_the_layout_of_hierarchical_3dgs(tmp_path: Path) -> None:
     assert not list((tmp_path / "out/chunks").glob("*/images"))
 
 
-@pytest.mark.parametrize("count", [1, 2, 3, 5, 8])
+@pytest.mark.parametrize("count", [1, 3, 8])
 def test_cells_fill_space_and_share_cameras_evenly(count: int) -> None:
     points = np.random.default_rng(count).normal(size=(40, 3)) * [5, 2, 1]
     cells = cut_cells(points, count)
@@ -218,14 +210,3 @@ def test_what_cannot_be_merged_is_refused_in_one_line(walk, tmp_path, capsys):
     (odd / "run.json").write_text(json.dumps(record))
     assert "differ in seed" in refused(capsys, "merge", odd, *runs[1:], "--out", out)
     assert not out.exists()
-
-
-def test_a_damaged_manifest_is_named(walk: Path, tmp_path: Path) -> None:
-    place, block = next(read_blocks(walk / "blocks"))
-    shutil.copy(place / "block.json", tmp_path / "block.json")
-    assert SceneBlock.load(tmp_path).owners == block.owners
-    data = json.loads((place / "block.json").read_text())
-    del data["poses"][block.owners[0]]
-    (tmp_path / "block.json").write_text(json.dumps(data))
-    with pytest.raises(ProjectError, match="no pose of"):
-        SceneBlock.load(tmp_path)

@@ -184,22 +184,6 @@ def test_pictures_named_as_the_views_before_them_are_warned_of(small_run, tmp_pa
     assert f"warning: one off: {said}" in capsys.readouterr().err
 
 
-def test_pictures_of_another_shape_are_refused(small_run, tmp_path, capsys):
-    cropped = {name: rgb[:, :80] for name, rgb in truths(small_run).items()}
-    write_pictures(tmp_path / "cropped", cropped)
-    out = ("--against", small_run, "--out", tmp_path / "out")
-    message = refused(capsys, "judge", tmp_path / "cropped", *out)
-    assert "80x72 pixels; expected 96x72" in message
-
-
-def test_results_among_the_pictures_are_refused(small_run, tmp_path, capsys):
-    write_pictures(tmp_path / "some", noisy(small_run, 1))
-    for out in (tmp_path / "some", tmp_path / "some/judged"):
-        message = refused(capsys, "judge", tmp_path / "some", "--against", small_run, "--out", out)
-        assert "lies in the pictures" in message
-    assert not (tmp_path / "some/judged").exists()
-
-
 def gsplat_renders(folder, pictures, order) -> None:
     """The canvases of gsplat's trainer: truth and render of each view, by number."""
     for number, row in enumerate(order):
@@ -279,6 +263,14 @@ def test_what_cannot_be_judged_is_refused(small_run, small_scan, tmp_path, capsy
     assert "expected --context" in message
     message = refused(capsys, "judge", small_run, "--against", small_run, "--targets", "all", *out)
     assert "is a run, whose views are its own" in message
+    pictures = truths(small_run)
+    write_pictures(tmp_path / "some", pictures)
+    inside = ("--against", small_run, "--out", tmp_path / "some/judged")
+    assert "lies in the pictures" in refused(capsys, "judge", tmp_path / "some", *inside)
+    assert not (tmp_path / "some/judged").exists()
+    write_pictures(tmp_path / "cropped", {name: rgb[:, :80] for name, rgb in pictures.items()})
+    message = refused(capsys, "judge", tmp_path / "cropped", "--against", small_run, *out)
+    assert "80x72 pixels; expected 96x72" in message
     shutil.copytree(small_run, tmp_path / "begun")
     for folder in (tmp_path / "begun").glob("round_00[12]"):
         shutil.rmtree(folder)
