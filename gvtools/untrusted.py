@@ -109,16 +109,15 @@ def regular(path: Path) -> Path:
     >>> regular(Path("/"))
     Traceback (most recent call last):
         ...
-    IsADirectoryError: [Errno 21] is a folder; expected a file: '/'
+    OSError: [Errno 22] is a folder; expected a file: '/'
     """
     try:
         mode = os.stat(path).st_mode
     except ValueError as error:  # a name with a null
         raise OSError(22, str(error), repr(str(path))) from None
-    if stat.S_ISDIR(mode):
-        raise IsADirectoryError(21, "is a folder; expected a file", str(path))
     if not stat.S_ISREG(mode):
-        raise OSError(22, "is a pipe or a device; expected a file", str(path))
+        what = "folder" if stat.S_ISDIR(mode) else "pipe or a device"
+        raise OSError(22, f"is a {what}; expected a file", str(path))
     return path
 
 

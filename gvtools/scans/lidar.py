@@ -181,15 +181,14 @@ def _e57_pose(path: Path, header: Any) -> NDArray[np.float64]:
         from scipy.spatial.transform import Rotation
 
         q = np.array([node["rotation"][axis].value() for axis in "wxyz"], np.float64)
-        if not abs(float(np.linalg.norm(q)) - 1) < UNIT:
-            raise MemoryFileError(
-                f"{path}: a scan's rotation is the quaternion {q.tolist()}; expected length 1"
-            )
-        pose[:3, :3] = Rotation.from_quat(np.roll(q, -1)).as_matrix()
+        unit = abs(float(np.linalg.norm(q)) - 1) < UNIT
+        pose[:3, :3] = Rotation.from_quat(np.roll(q, -1)).as_matrix() if unit else np.nan
     if node.isDefined("translation"):
         pose[:3, 3] = [node["translation"][axis].value() for axis in "xyz"]
     if not np.isfinite(pose).all():
-        raise MemoryFileError(f"{path}: a scan's position is {pose[:3, 3].tolist()}")
+        raise MemoryFileError(
+            f"{path}: a scan's pose {pose[:3].tolist()}; expected a unit quaternion and a place"
+        )
     return pose
 
 

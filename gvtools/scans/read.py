@@ -124,13 +124,10 @@ def _one_line(path: Path) -> Iterator[None]:
         yield
     except GvError:
         raise
-    except MemoryError:
-        raise MemoryFileError(
-            f"{path}: asks for more memory than there is; the file is damaged, or too large for "
-            "this machine; save it again"
-        ) from None
     except Exception as error:
         reason = getattr(error, "strerror", None) or "its parts contradict each other"
+        if isinstance(error, MemoryError):
+            reason = "asks for more memory than there is"
         raise MemoryFileError(
             f"{path}: cannot be read ({reason}); expected a whole {path.suffix.upper()[1:]} point "
             "cloud; the file is damaged, or of a kind that is not known; save it again"

@@ -127,32 +127,24 @@ def given_placement(text: str) -> Placement | None:
 
     >>> round(given_placement("2,0,0,5, 0,2,0,0, 0,0,2,0").scale, 6)
     2.0
-    >>> given_placement("1,0,0,5, 0,1,0,0, 0,0,-1,0")
-    Traceback (most recent call last):
-        ...
-    gvtools.errors.OptionError: scan.placement: a mirror or no similarity; expected scale x rotation
     """
     if text == ESTIMATE:
         return None
     if text == IDENTITY:
         return Placement(np.eye(4), "given")
     try:
-        numbers = [float(part) for part in text.split(",")]
+        rows = np.reshape([float(part) for part in text.split(",")], (-1, 4))
     except ValueError:
-        if not Path(text).is_file():
-            raise OptionError(f"scan.placement {text!r}; expected {FORMS}") from None
-        rows = load_matrix(Path(text), (3, 4), (4, 4))
-    else:
-        if len(numbers) not in (12, 16):
-            raise OptionError(f"scan.placement: {len(numbers)} numbers; expected {FORMS}")
-        rows = np.reshape(numbers, (-1, 4))
-    matrix = np.vstack([rows[:3], [0, 0, 0, 1]])
-    last = rows[3:].ravel()
+        rows = load_matrix(Path(text), (3, 4), (4, 4)) if Path(text).is_file() else np.zeros((0, 4))
+    whole = len(rows) == 3 or (len(rows) == 4 and np.array_equal(rows[3], [0, 0, 0, 1]))
+    matrix = np.vstack([rows[:3], [0, 0, 0, 1]]) if whole else np.zeros((4, 4))
     scale = np.cbrt(np.linalg.det(matrix[:3, :3])) if np.isfinite(matrix).all() else np.nan
     turn = matrix[:3, :3] / scale if scale > 0 else np.full((3, 3), np.nan)
-    whole = not len(last) or np.array_equal(last, [0, 0, 0, 1])
-    if not (whole and np.allclose(turn.T @ turn, np.eye(3), atol=ORTHONORMAL)):
-        raise OptionError("scan.placement: a mirror or no similarity; expected scale x rotation")
+    if not np.allclose(turn.T @ turn, np.eye(3), atol=ORTHONORMAL):
+        raise OptionError(
+            f"scan.placement {text!r}: no similarity; expected {FORMS}, of scale x rotation, no "
+            "mirror"
+        )
     return Placement(matrix, "given")
 
 

@@ -277,11 +277,9 @@ def _pcd_table(given: Mapping[str, list[str]], offset: int) -> ScanTable:
         shape = (label, KINDS[kind.upper()] + size)
         columns.append(shape if count == 1 else (*shape, (count,)))
     dtype = np.dtype(columns)
-    if not {"x", "y", "z"} <= set(names):
-        raise ValueError("no x, y, z")
-    several = [name for name in _used(names) if name in names and dtype[name].shape]
-    if several:
-        raise ValueError(f"{several[0]} of several numbers")
+    wrong = [name for name in _used(names) if name not in names or dtype[name].shape]
+    if wrong:
+        raise ValueError(f"{wrong[0]} is absent or has several numbers")
     whole = int(given["WIDTH"][0]) * int(given["HEIGHT"][0])
     count = int(given["POINTS"][0]) if "POINTS" in given else whole
     if count < 0 or count != whole:

@@ -226,10 +226,11 @@ def corner_origin(K: ArrayLike, *, what: str) -> Float64:
     matrix = np.array(K, np.float64)
     if matrix.shape == (4, 4):
         matrix = matrix[:3, :3]
-    if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
-        raise ProjectError(f"{what}: {np.asarray(K).tolist()}; expected a finite 3x3 matrix")
-    off = [matrix[0, 1], matrix[1, 0], matrix[2, 0], matrix[2, 1], matrix[2, 2] - 1]
-    if min(matrix[0, 0], matrix[1, 1]) <= 0 or np.abs(off).max() > 1e-6:
+    sound = matrix.shape == (3, 3) and np.isfinite(matrix).all() and min(np.diag(matrix)) > 0
+    if (
+        not sound
+        or np.abs(matrix - pinhole(matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist())).max() > 1e-6
+    ):
         raise ProjectError(
             f"{what}: {matrix.tolist()}; expected [fx 0 cx; 0 fy cy; 0 0 1] with fx, fy > 0"
         )

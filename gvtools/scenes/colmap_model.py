@@ -24,7 +24,7 @@ from gvtools.scenes.matching import named, natural
 from gvtools.scenes.photographs import rotation_findings
 from gvtools.scenes.scene import Finding, natural_key
 from gvtools.scenes.undistort import Undistortion, undistortion
-from gvtools.untrusted import number_key, read_bytes, read_text, regular
+from gvtools.untrusted import number_key, read_bytes, read_text, reading, regular
 
 if TYPE_CHECKING:
     import pycolmap
@@ -246,10 +246,8 @@ def _count(path: Path) -> int:
 def text_names(folder: Path) -> dict[int, str]:
     """The images' whole names in a text model, by id; pycolmap stops at the first blank."""
     path = folder / "images.txt"
-    try:
+    with reading(path):
         lines = read_text(path).splitlines()
-    except UnicodeDecodeError as error:
-        raise ProjectError(f"{path}: no text in UTF-8 ({error.reason})") from None
     # An image has two lines, the second of which may be empty; empty ones before it do not count.
     names, rest = {}, iter(lines)
     for line in rest:
@@ -508,13 +506,10 @@ def _parsed(files: ModelFiles) -> pycolmap.Reconstruction:
         else:
             reconstruction.read_text(files.folder)
         _ = [image.name for image in reconstruction.images.values()]  # decoded when asked for
-    except UnicodeDecodeError:
-        raise ProjectError(
-            f"{files.folder}: the name of an image is no UTF-8; the file is damaged or of another "
-            "encoding; export the model again"
-        ) from None
     except (ValueError, IndexError, KeyError, RuntimeError, OSError) as error:
-        lines = str(error).split("Check failed:")[-1].strip().splitlines() or ["no reason"]
+        unread = isinstance(error, UnicodeDecodeError)
+        text = "the name of an image is no UTF-8" if unread else str(error)
+        lines = text.split("Check failed:")[-1].strip().splitlines() or ["no reason"]
         reason = next((said for part, said in REASONS.items() if part in lines[0]), lines[0][:120])
         raise ProjectError(
             f"{files.folder}: the model's files are damaged or contradict each other ({reason}); "

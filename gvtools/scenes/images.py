@@ -212,14 +212,19 @@ def read_depth(
     infinity, more than ``maximum``, or, in 16-bit files, 65535.
     """
     raw = _load_depth(path)
+    return readings(_one_map(raw, str(path)), unit=unit, maximum=maximum)
+
+
+def _one_map(raw: NDArray[Any], where: str) -> NDArray[Any]:
+    """(H, W) numbers of an array that may have a further axis of length 1."""
     if raw.ndim == 3 and 1 in (raw.shape[0], raw.shape[2]):
         raw = raw[..., 0] if raw.shape[2] == 1 else raw[0]
     if raw.ndim != 2 or raw.dtype.kind not in "uif":
         raise ProjectError(
-            f"{path}: depth of shape {raw.shape} and type {raw.dtype}; expected (height, width) "
+            f"{where}: depth of shape {raw.shape} and type {raw.dtype}; expected (height, width) "
             "numbers"
         )
-    return readings(raw, unit=unit, maximum=maximum)
+    return raw
 
 
 def readings(
@@ -238,12 +243,16 @@ def readings(
 
 def _load_depth_image(path: Path) -> NDArray[Any]:
     with _picture(path) as image:
-        if not image.mode.startswith("I") and image.mode != "F":
-            raise ProjectError(
-                f"{path}: a depth map with 8 bits a channel ({image.mode}); expected 16-bit grey; "
-                "export raw depth instead of a preview"
-            )
+        _check_deep(path, image.mode)
         return np.asarray(image)
+
+
+def _check_deep(path: Path, mode: str) -> None:
+    if not mode.startswith("I") and mode != "F":
+        raise ProjectError(
+            f"{path}: a depth map with 8 bits a channel ({mode}); expected 16-bit grey; export raw "
+            "depth instead of a preview"
+        )
 
 
 def _load_array(path: Path) -> NDArray[Any]:
@@ -269,8 +278,7 @@ def stored_depth_size(path: Path) -> tuple[int, int] | None:
     if path.suffix.lower() in DEPTH_LOADERS:
         return None
     header = read_header(path)
-    if header.mode in ("L", "P", "RGB", "RGBA"):
-        raise ProjectError(f"{path}: 8-bit depth ({header.mode}); expected 16-bit grey")
+    _check_deep(path, header.mode)
     return header.width, header.height
 
 
@@ -361,10 +369,8 @@ def hdf5_file(path: Path) -> Iterator[h5py.File]:
 def read_dataset(path: Path, found: Any) -> NDArray[Any]:
     """A data set of h5py, of the HDF5 file at ``path``."""
     size = path.stat().st_size
-    if not hasattr(found, "nbytes"):
-        raise ValueError("a group; expected an array")
-    if found.nbytes > UNPACKED_RATIO * size + UNPACKED_BYTES:
-        raise ValueError(f"an array of shape {found.shape} in {size} bytes")
+    if getattr(found, "nbytes", np.inf) > UNPACKED_RATIO * size + UNPACKED_BYTES:
+        raise ValueError(f"{found!r} in {size} bytes; expected an array that they can hold")
     return np.asarray(found[()])
 
 
@@ -378,10 +384,7 @@ def hdf5_array(path: Path, key: str) -> NDArray[Any]:
 
 def hdf5_depth(path: Path, *, key: str) -> Depth:
     """(H, W) float32 z-depth in an array of an HDF5 file, 0 for none."""
-    depth = np.squeeze(hdf5_array(path, key))
-    if depth.ndim != 2:
-        raise ProjectError(f"{path}, {key}: shape {depth.shape}; expected (height, width)")
-    return readings(depth)
+    return readings(_one_map(hdf5_array(path, key), f"{path}, {key}"))
 
 
 def exr_depth(path: Path, *, channels: tuple[str, ...]) -> Depth:

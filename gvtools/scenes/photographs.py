@@ -166,10 +166,11 @@ def posed_scene(
                 where = f"{root}, frame {frame.name}"
                 named_file(home or root, path, where=where, follow_links=True)
         try:
-            pose = _rigid(frame, sieve, unposed=unposed)
-            views = _views(frame, sieve)
-        except _LeftOut as left:
-            reason, *detail = left.args
+            if left := _lacks(frame, sieve, unposed=unposed):
+                raise _LeftOut(*left)
+            pose, views = _rigid(frame, sieve), _views(frame, sieve)
+        except _LeftOut as error:
+            reason, *detail = error.args
             sieve.dropped.setdefault(reason, []).append(frame.name)
             sieve.details.setdefault(reason, detail)
             continue
@@ -240,17 +241,23 @@ def _opaque(picture: Path) -> NDArray[np.bool_]:
     return np.ones(1, np.bool_) if mask is None else mask
 
 
-def _rigid(frame: PosedFrame, sieve: _Sieve, *, unposed: str) -> Float64:
-    """(4, 4), the frame's pose as it maps in its layout."""
+def _lacks(frame: PosedFrame, sieve: _Sieve, *, unposed: str) -> tuple[str, ...]:
+    """The reason for which a frame without something is left out, and details; () for none."""
     if sieve.present(frame.image) is None:
-        raise _LeftOut(NO_PICTURE, *([f"expected {frame.image}"] if sieve.strict else []))
+        return (NO_PICTURE, f"expected {frame.image}") if sieve.strict else (NO_PICTURE,)
     if frame.pose is None or (np.isnan(frame.pose).any() and not sieve.strict):
-        raise _LeftOut(unposed)
+        return (unposed,)
     if np.isinf(frame.pose).any():
-        raise _LeftOut(LOST)
+        return (LOST,)
     if np.isnan(frame.pose).any():
-        raise _LeftOut(NAN_POSE, frame.where or frame.name)
+        return NAN_POSE, frame.where or frame.name
+    return () if frame.lens is not None else (NO_LENS,)
+
+
+def _rigid(frame: PosedFrame, sieve: _Sieve) -> Float64:
+    """(4, 4), the frame's pose as it maps in its layout."""
     try:
+        assert frame.pose is not None
         rigid, defect = rigid_transform(frame.pose, what=frame.where or frame.name)
     except GvError as error:
         if sieve.strict:
@@ -262,8 +269,7 @@ def _rigid(frame: PosedFrame, sieve: _Sieve, *, unposed: str) -> Float64:
 
 def _views(frame: PosedFrame, sieve: _Sieve) -> tuple[Undistortion, ...]:
     """The frame's ways to pinhole cameras, several of a project's panorama or wide fisheye."""
-    if frame.lens is None:
-        raise _LeftOut(NO_LENS)
+    assert frame.lens is not None
     if isinstance(frame.lens, Undistortion):
         return (frame.lens,)
     size = frame.lens.size

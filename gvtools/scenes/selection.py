@@ -86,24 +86,18 @@ def _folders(names: Sequence[str]) -> dict[str, list[int]]:
     return folders
 
 
-def _counted(keyword: str, numbers: list[int], count: int, *, whole: str) -> set[int]:
-    if keyword == "every":
-        step, offset = numbers
-        if step < 1:
-            raise OptionError(f"selection {whole!r}: a step of 0; expected 1 or more")
-        return set(range(offset, count, step))
-    if keyword == "range":
-        start, end = numbers
-        if start > end or end >= count:
-            raise OptionError(
-                f"selection {whole!r}: from {start} to {end}; expected 0 <= A <= B <= {count - 1} "
-                f"for {count} views"
-            )
-        return set(range(start, end + 1))
-    number = numbers[0]
-    if number > count:
-        raise OptionError(f"selection {whole!r}: {number} views; there are {count}")
-    return set(range(number)) if keyword == "first" else set(range(count - number, count))
+def _counted(keyword: str, numbers: list[int], count: int, *, whole: str) -> Sequence[int]:
+    first, second = numbers[0], numbers[-1]
+    if keyword == "every" and first > 0:
+        return range(second, count, first)
+    if keyword == "range" and first <= second < count:
+        return range(first, second + 1)
+    if keyword in ("first", "last") and first <= count:
+        return range(first) if keyword == "first" else range(count - first, count)
+    raise OptionError(
+        f"selection {whole!r}: there are {count} views; expected steps of 1 or more, at most "
+        f"{count} views, and 0 <= A <= B <= {count - 1}"
+    )
 
 
 def _by_name(index: Mapping[str, list[int]], listed: Sequence[str], what: str) -> set[int]:

@@ -346,10 +346,8 @@ def load_frames(path: Path) -> dict[str, Any]:
     with reading(path, "expected a transforms.json"):
         data = read_json(path)
         frames = data.get("frames") if isinstance(data, dict) else None
-        if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
-            raise ValueError("no list 'frames'")
-        if not frames:
-            raise ValueError("no frames")
+        if not (isinstance(frames, list) and frames and all(isinstance(f, dict) for f in frames)):
+            raise ValueError("no list of frames")
         return data
 
 
@@ -382,12 +380,10 @@ def _names(files: Sequence[Path]) -> list[str]:
 
 def _pose(keys: FrameKeys, what: str) -> Float64:
     """world_from_cam with OpenCV axes, of any shape and as the file has it otherwise."""
-    if keys.transform_matrix is None:
-        raise ProjectError(f"{what}: no transform_matrix; expected a 4x4 pose")
-    try:
+    with reading(what, "expected a transform_matrix of 4x4 numbers"):
+        if keys.transform_matrix is None:
+            raise ValueError("no transform_matrix")
         pose = np.array(keys.transform_matrix, np.float64)
-    except (OverflowError, TypeError, ValueError):
-        raise ProjectError(f"{what}: transform_matrix is no matrix; expected 4x4 numbers") from None
     pose = pose.reshape(4, 4) if pose.shape == (16,) else pose
     return pose * np.diag(OPENCV_FROM_OPENGL) if pose.shape[-1:] == (4,) else pose
 
@@ -456,17 +452,12 @@ class FrameKeys(BaseModel):
                 f"{', '.join(name for name in (*PERSPECTIVE, *FISHEYE, PANORAMA) if name)}; "
                 "render perspective views first"
             )
-        others = self.model_extra or {}
-        for key, value in ((key, others[key]) for key in FURTHER if others.get(key)):
+        others = {"k4": self.k4, **(self.model_extra or {})}
+        for key, value in ((key, others[key]) for key in ("k4", *FURTHER) if others.get(key)):
             raise ProjectError(
-                f"{what}: {key} = {value} is of a camera model that is not read; expected k1, k2, "
-                "k3, p1, p2 at most; undistort the pictures first, or calibrate without it"
-            )
-        if self.k4:
-            raise ProjectError(
-                f"{what}: k4 = {self.k4} of a perspective camera; expected k1, k2, k3, p1, p2 at "
-                "most (tools disagree on what a fourth one means); set camera_model to "
-                "OPENCV_FISHEYE if it is one, or calibrate without k4"
+                f"{what}: {key} = {value} of a perspective camera; expected k1, k2, k3, p1, p2 at "
+                "most (tools disagree on what others mean); set camera_model to OPENCV_FISHEYE if "
+                "it is one, or undistort the pictures first"
             )
         shared = (*shared, self.k1, self.k2, self.p1, self.p2)
         if self.k3:

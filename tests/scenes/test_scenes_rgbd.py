@@ -177,7 +177,7 @@ def test_depth_maximum_unit_and_eight_bit_depth(tmp_path):
     assert not scene.views[0].load().depth.any()  # 20 m everywhere
     with pytest.raises(ProjectError, match="8 bits"):
         scene.views[1].load()
-    assert "8-bit depth" in messages(scene)
+    assert "depth map with 8 bits" in messages(scene)
 
 
 def test_registration_through_options_and_sidecar(tmp_path):

@@ -136,11 +136,6 @@ def rgb_camera(path: Path) -> tuple[AriaLens, Float64]:
     if camera is None:
         raise ProjectError(f"{path}: no calibration of {RGB_LABEL}; copy the recording again")
     values = [float(value) for value in camera.get_projection_params()]
-    if len(values) != 15:
-        raise ProjectError(
-            f"{path}: {camera.get_model_name()} with {len(values)} parameters; expected Aria's "
-            "FISHEYE624 with 15"
-        )
     width, height = (int(side) for side in camera.get_image_size())
     radius = camera.get_valid_radius()
     lens = aria_lens(values, (width, height), np.inf if radius is None else float(radius))

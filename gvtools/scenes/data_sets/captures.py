@@ -154,12 +154,11 @@ class SensFile:
                 color_code, depth_code, *sizes = _unpack(file, "<iiIIII")
                 shift, count = _unpack(file, "<fQ")
                 frames = _sens_index(file, count, path.stat().st_size)
-            if not shift > 0:
-                raise ValueError(f"{shift:g} depth steps a metre; expected a positive number")
-            if color_code not in (PNG, JPEG) or depth_code not in (ZLIB_USHORT, RAW_USHORT):
+            known = color_code in (PNG, JPEG) and depth_code in (ZLIB_USHORT, RAW_USHORT)
+            if not (known and shift > 0):
                 raise ValueError(
-                    f"colour of compression {color_code} and depth of {depth_code}; expected PNG "
-                    "or JPEG, and zlib or none"
+                    f"colour and depth of compression {color_code} and {depth_code}, {shift:g} "
+                    "steps a metre; expected PNG or JPEG, zlib or none, more than 0"
                 )
         color_size, depth_size = (sizes[0], sizes[1]), (sizes[2], sizes[3])
         return SensFile(

@@ -165,11 +165,10 @@ def scenes_of(name: str, root: Path) -> tuple[str, ...]:
     """The scenes of a data set that a folder holds."""
     spec = load_spec(name)
     layout = layout_of(spec)
-    if not Path(root).is_dir():
-        raise ProjectError(f"{root}: no such folder; expected {layout.holds}")
-    found = layout.scenes(Path(root))
+    found = layout.scenes(Path(root)) if Path(root).is_dir() else ()
     if not found:
-        raise ProjectError(f"{root}: no scene of {spec.name}; expected {layout.holds}")
+        what = f"no scene of {spec.name}" if Path(root).is_dir() else "no such folder"
+        raise ProjectError(f"{root}: {what}; expected {layout.holds}")
     return found
 
 

@@ -126,16 +126,16 @@ def turned_pinhole(cam_from_uv: Float64, size: tuple[int, int]) -> TurnedPinhole
     Rays have x right, y up, z backward; u and v are from -1 to 1 across the picture.
     """
     width, height = size
-    finite = np.isfinite(cam_from_uv).all() and min(size) >= 1
-    if not finite or np.linalg.matrix_rank(cam_from_uv) < 3:
-        raise ProjectError(f"{PARAMETERS}: a projection without inverse; copy the file again")
     uv_from_pixel = np.array([[2 / width, 0, -1], [0, -2 / height, 1], [0, 0, 1]])
     ray = np.diag([1.0, -1, -1]) @ np.asarray(cam_from_uv, np.float64) @ uv_from_pixel
     rotation, upper = np.linalg.qr(ray)
     sign = np.sign(np.diag(upper))
     rotation, upper = rotation * sign, upper * sign[:, None]
-    if np.linalg.det(rotation) < 0:
-        raise ProjectError(f"{PARAMETERS}: a mirrored projection {ray.tolist()}; copy it again")
+    if not np.linalg.det(rotation) > 0:
+        raise ProjectError(
+            f"{PARAMETERS}: the projection {ray.tolist()} is a mirror or has no "
+            "inverse; copy the file again"
+        )
     K = np.linalg.inv(upper / upper[2, 2])
     slope = float(K[0, 1] / K[1, 1])
     return TurnedPinhole(pinhole_lens(K, size), rotation, slope if abs(slope) > SKEW else 0.0)
@@ -209,9 +209,7 @@ def _parameters(root: Path, scene: str) -> dict[str, str]:
     paths = (folder / PARAMETERS for folder in (root, root.resolve().parent))
     path = next((path for path in paths if path.is_file()), None)
     rows = [] if path is None else csv_rows(path)
-    if rows and "scene_name" not in rows[0]:
-        raise ProjectError(f"{path}: no column scene_name; copy it again")
-    return next((row for row in rows if row["scene_name"] == scene), {})
+    return next((row for row in rows if row.get("scene_name") == scene), {})
 
 
 def _projection(parameters: dict[str, str]) -> tuple[Float64, tuple[int, int], list[Finding]]:

@@ -199,10 +199,6 @@ def _read_dl3dv(root: Path, scene: str) -> Scene:
     if file.is_file():
         frames = transforms_frames(file, pictures)
         return posed_scene(folder, frames, poses="world_from_cam", metric=False)
-    if find_model(folder) is None:
-        raise ProjectError(
-            f"{folder}: neither {TRANSFORMS} nor a COLMAP model; complete the download"
-        )
     model = model_in(folder)
     frames = colmap_frames(model, lambda image: pictures / Path(image.name).name)
     return colmap_scene(folder, model, frames)
