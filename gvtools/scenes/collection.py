@@ -24,6 +24,7 @@ class SceneCollection:
     # Changes when what is in it does, as far as that is known without opening scenes.
     digest: str = ""
     data_set: str = ""  # which one it is of, as ``load_spec`` takes it; "" for none
+    opened: bool = False  # whether its scenes are open already, so that reading one costs nothing
 
     def __post_init__(self) -> None:
         if not self.names:
@@ -48,21 +49,6 @@ class SceneCollection:
             self, names=chosen, counts=counts, digest=digest([self.digest, list(chosen)])
         )
 
-    @property
-    def opened(self) -> bool:
-        """Whether its scenes are open already, so that reading one costs nothing."""
-        return isinstance(self.read, _Opened)
-
-
-class _Opened:
-    """Reads scenes that are open already."""
-
-    def __init__(self, scenes: dict[str, Scene]) -> None:
-        self.scenes = scenes
-
-    def __call__(self, name: str) -> Scene:
-        return self.scenes[name]
-
 
 def of_scenes(scenes: Sequence[Scene], *, title: str = "") -> SceneCollection:
     """Scenes that are open already, as a collection; they are named after their folders."""
@@ -74,4 +60,5 @@ def of_scenes(scenes: Sequence[Scene], *, title: str = "") -> SceneCollection:
     title = title or next(iter(opened), "scenes")
     counts = tuple(sum(view.has_depth for view in scene) for scene in scenes)
     content = digest([[name, list(scene.names)] for name, scene in opened.items()])
-    return SceneCollection(title, tuple(opened), _Opened(opened), counts, content)
+    read = opened.__getitem__
+    return SceneCollection(title, tuple(opened), read, counts, content, opened=True)

@@ -72,25 +72,16 @@ def open_project(
     if alpha != "mask":
         scene = open_project(path, images=images, masks=masks, rgbd=rgbd, root=root, model=model)
         return _with_alpha(scene, alpha)
+    given = {"images": images, "masks": masks, "model's number": model, "RGB-D options": rgbd}
     if is_address(path):
-        if any(option is not None for option in (images, masks, rgbd, model)):
-            raise OptionError(
-                f"{path}: the data set's spec says how it is read; expected neither images, masks, "
-                "a model's number nor RGB-D options"
-            )
+        _refuse(path, "the data set's spec says how it is read", given)
         from gvtools.scenes.data_sets.catalogue import open_address
 
         return open_address(path, root)
-    if root is not None:
-        raise OptionError(
-            f"{path}: root {root} is given for a project that is none of a data set; expected "
-            f"{FORM}; leave one out"
-        )
+    _refuse(path, f"no scene of a data set, {FORM}", {"root": root})
     path = Path(path)
-    if not path.exists():
-        raise ProjectError(f"{path}: no such folder{_nearest(path)}")
     if not path.is_dir() and not path.is_file():
-        raise ProjectError(f"{path}: neither a folder nor a file; expected one of them")
+        raise ProjectError(f"{path}: no such folder{_nearest(path)}")
     if is_archive(path):
         try:
             scene = open_project(unpacked(path), images=images, masks=masks, rgbd=rgbd, model=model)
@@ -101,20 +92,15 @@ def open_project(
         kind = "a recording" if path.suffix.lower() == BAG else "a video"
         raise UnposedError(path, f"{kind} without cameras", _capture(path))
     folder = find_model(path, number=model) if path.is_dir() else None
-    if model is not None and folder is None:
-        raise OptionError(f"{path}: a file; a model's number is of a COLMAP workspace")
+    if folder is None:
+        _refuse(path, "no COLMAP workspace", {"model's number": model})
     told = folder is not None or is_transforms(path)
     phone = None if told else next((layout for layout in PHONES if layout.matches(path)), None)
     if phone is not None:
-        if any(option is not None for option in (images, masks, rgbd)):
-            raise OptionError(
-                f"{path}: an export of {phone.name} says how it is read; expected neither images, "
-                "masks nor RGB-D options"
-            )
+        _refuse(path, f"an export of {phone.name} says how it is read", given)
         return phone.read(path)
     if told or path.is_file():
-        if rgbd is not None:
-            raise OptionError(f"{path}: no posed RGB-D folder; expected no RGB-D options")
+        _refuse(path, "no posed RGB-D folder", {"RGB-D options": rgbd})
         if not told and path.suffix.lower() != ".json":
             raise ProjectError(
                 f"{path}: no project by its suffix; expected a folder, a .zip or a transforms.json "
@@ -131,13 +117,17 @@ def open_project(
         return replace(scene, findings=(*scene.findings, Finding("info", note)))
     for layout in LAYOUTS:
         if layout.matches(path):
-            if images is not None or masks is not None:
-                raise OptionError(
-                    f"{path}: a posed RGB-D folder holds its own pictures; expected neither images "
-                    "nor masks"
-                )
+            own = {"images": images, "masks": masks}
+            _refuse(path, "a posed RGB-D folder holds its own pictures", own)
             return layout.read(path, options=rgbd)
     raise _unknown(path)
+
+
+def _refuse(path: Path | str, why: str, options: Mapping[str, object]) -> None:
+    """Refuse options that are given for a project that takes none of them."""
+    names = [name for name, value in options.items() if value is not None]
+    if names:
+        raise OptionError(f"{path}: {why}; expected no {' and no '.join(names)}")
 
 
 def _with_alpha(scene: Scene, alpha: str) -> Scene:

@@ -299,31 +299,23 @@ def open_shards(folder: Path) -> SceneCollection:
     names = tuple(scene.name for scene in index.scenes)
     counts = tuple(scene.with_depth for scene in index.scenes)
     digest = hashlib.sha256(read_bytes(folder / INDEX)).hexdigest()[:16]
-    read = ShardScenes(folder, index)
+    read = partial(_read_scene, folder=folder, index=index)
     return SceneCollection(index.title, names, read, counts, digest, index.data_set)
 
 
-class ShardScenes:
-    """Called with a scene's name, opens that scene of a folder of shards."""
-
-    def __init__(self, folder: Path, index: ShardsIndex) -> None:
-        self.folder, self.index = folder, index
-        self._numbers = {scene.name: number for number, scene in enumerate(index.scenes)}
-
-    def __call__(self, name: str) -> Scene:
-        """The scene of a name."""
-        scenes, views = list[SceneRecord](), list[View]()
-        with reading(self.folder / INDEX, AGAIN):
-            for number in self.index.scenes[self._numbers[name]].shards:
-                listed = self.index.shards[number]
-                tar = named_file(self.folder, listed.file, where=str(self.folder / INDEX))
-                _check_size(tar, listed)
-                shard = read_shard_index(tar.with_suffix(".json"), listed.index_sha256)
-                scenes.append(next(scene for scene in shard.scenes if scene.name == name))
-                own = scenes[-1].number
-                views += [_view(tar, view) for view in shard.views if view.scene == own]
-            kind, metric = scenes[-1].kind, scenes[-1].metric
-        return Scene(self.folder / name, kind, tuple(views), metric=metric)
+def _read_scene(name: str, *, folder: Path, index: ShardsIndex) -> Scene:
+    scenes, views = list[SceneRecord](), list[View]()
+    with reading(folder / INDEX, AGAIN):
+        for number in next(scene for scene in index.scenes if scene.name == name).shards:
+            listed = index.shards[number]
+            tar = named_file(folder, listed.file, where=str(folder / INDEX))
+            _check_size(tar, listed)
+            shard = read_shard_index(tar.with_suffix(".json"), listed.index_sha256)
+            scenes.append(next(scene for scene in shard.scenes if scene.name == name))
+            own = scenes[-1].number
+            views += [_view(tar, view) for view in shard.views if view.scene == own]
+        kind, metric = scenes[-1].kind, scenes[-1].metric
+    return Scene(folder / name, kind, tuple(views), metric=metric)
 
 
 def verify(folder: Path, *, progress: Callable[[str], None] = lambda text: None) -> list[str]:

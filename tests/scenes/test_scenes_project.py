@@ -84,7 +84,7 @@ def test_options_of_another_kind(tmp_path):
     sevenscenes(tmp_path / "scan")
     with pytest.raises(OptionError, match="no RGB-D options"):
         open_project(tmp_path / "colmap", rgbd=RgbdOptions())
-    with pytest.raises(OptionError, match="neither images nor masks"):
+    with pytest.raises(OptionError, match="expected no images"):
         open_project(tmp_path / "scan", images=tmp_path)
 
 
