@@ -20,7 +20,6 @@ from gvtools.untrusted import (
     parse_json,
     parse_yaml,
     read_text,
-    regular,
 )
 
 
@@ -94,13 +93,6 @@ def test_what_is_no_file_is_not_waited_for(tmp_path, kind):
     with pytest.raises(OSError):
         open_picture(path)
     assert not is_file(path)
-
-
-def test_names_that_no_file_has_are_absent(tmp_path):
-    for name in ("a" * 5000, "a\0b", "\ud800", "d/" * 3000 + "x"):
-        assert not is_file(tmp_path / name)
-        with pytest.raises((OSError, ValueError)):
-            regular(tmp_path / name)
 
 
 @pytest.mark.filterwarnings("ignore:Image size")

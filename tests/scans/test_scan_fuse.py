@@ -64,20 +64,6 @@ def test_photographs_win_where_they_saw_the_surface_and_scans_fill_the_rest():
     np.testing.assert_allclose(shown.depth[0][valid], 2, atol=1e-3)
 
 
-def test_what_a_scanner_saw_refuses_generated_points_as_what_a_camera_saw_does():
-    memory = fused(photographed=False)
-    report = memory.fuse(points(wall(0.02), source=camera(name="b")), round=1, generated=True)
-    assert report.rejected_observed == report.points
-
-
-@pytest.mark.parametrize("backend", ["cpu", "torch", "nearest"])
-def test_back_ends_say_what_is_scanned(backend):
-    from gvtools.memory.splat.api import SplatOptions
-
-    shown = fused(photographed=False).project(camera(), options=SplatOptions(backend=backend))
-    np.testing.assert_array_equal(shown.scanned, shown.valid)
-
-
 def test_a_scanned_thing_in_front_of_what_photographs_saw_is_let_through():
     memory = SpatialMemory(0.02)
     fuse_scan(memory, scan_of(2 * wall(0.02, z=1.0, width=0.5), RED), placed())

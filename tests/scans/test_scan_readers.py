@@ -307,9 +307,7 @@ def write_channels(path, positions, colors, *, names=RED, text=False):
 @pytest.mark.parametrize(
     ("kind", "factor", "names"),
     [
-        ("u1", 1, RED),
         ("i1", 1, RED),  # bytes above 127 are negative
-        ("u2", 1, RED),
         ("u2", 16, RED),
         ("u2", 257, ("r", "g", "b")),
         ("i2", 128, RED),  # their half is white
@@ -354,20 +352,6 @@ def test_colours_in_one_number_or_grey_and_fractions_that_were_cut(tmp_path, suf
     assert np.array_equal(scan.colors, colors // 128 * 255) and "from 0 to 1" in scan.color_range
     path = write_channels(tmp_path / f"a{suffix}", positions, colors / 127.5 - 1, names=RED)
     assert "are below 0: cut off" in read_scan(path).color_range
-
-
-@pytest.mark.parametrize("factor", [16, 256])
-def test_las_with_colours_of_several_bits_and_an_outlier(tmp_path, factor):
-    laspy = pytest.importorskip("laspy")
-    positions, colors = surface(500)
-    path = write_las(tmp_path / "scan.las", positions, colors, bits=8)
-    las = laspy.read(path)
-    for name in RED:
-        las[name] = np.asarray(las[name]) * factor
-        las[name][3] = 65535
-    las.write(path)
-    shown = np.delete(read_scan(path).colors, 3, axis=0)
-    np.testing.assert_array_equal(shown, np.delete(colors, 3, axis=0))
 
 
 def test_gaussians_given_as_a_scan_are_their_opaque_centres(tmp_path):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scenes_workspace import PINHOLE, frame, ramp, save, transforms, workspace
+from scenes_workspace import ramp, save, workspace
 
 from gvtools.scenes.matching import find_renamed
 from gvtools.scenes.project import open_project
@@ -81,17 +81,3 @@ def test_models_pictures_and_masks(tmp_path, suffix):
     ):
         assert told(scene).count(line) == 1
     assert not scene.views[0].load().mask[:, :40].any()
-
-
-def test_frames_of_another_computer(tmp_path):
-    for name in ("a", "b"):
-        save(tmp_path / "images" / f"{name}.png", ramp())
-        save(tmp_path / "masks" / f"{name}.png", MASK)
-    names = "C:\\scene\\images\\a.JPG", "/data/images/b.png"
-    masks = "masks\\A.png", "./masks/b.PNG"
-    listed = [frame(name, i, mask_path=masks[i]) for i, name in enumerate(names)]
-    transforms(tmp_path, listed, **PINHOLE)
-    scene = open_project(tmp_path)
-    assert scene.names == ("a.png", "b.png")
-    assert all(not view.load().mask[:, :48].any() for view in scene)
-    assert told(scene).count("named otherwise") == 2

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from data_sets.miniature import Expected, compare
 from phone_exports import polycam, record3d, record3d_export, scanner_app, stray_scanner
-from PIL import Image
 
 from gvtools.errors import OptionError, ProjectError
 from gvtools.scenes.inspection import inspect
@@ -125,14 +124,6 @@ def test_stray_gaps_and_a_cut_off_last_row(tmp_path: Path) -> None:
     assert "1 of 7 frames have no pose: dropped (000007)" in told(scene)
     assert "1 of 6 depth maps have no confidence map" in told(scene)
     assert "rgb.mp4 has 8 frames for 7 poses" in told(scene)
-
-
-def test_stray_depth_of_early_versions_is_an_array(tmp_path: Path) -> None:
-    expected = stray_scanner(tmp_path)
-    for path in (tmp_path / "depth").iterdir():
-        np.save(path.with_suffix(".npy"), np.asarray(Image.open(path)))
-        path.unlink()
-    compare(open_project(tmp_path), expected)
 
 
 def test_stray_without_rows_or_a_video(tmp_path: Path) -> None:

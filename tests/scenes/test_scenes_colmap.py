@@ -122,22 +122,6 @@ def test_mask_and_depth_go_through_the_mapping_of_the_image(tmp_path, model):
     assert "3 of 4 frames have no mask" in messages
 
 
-def test_depth_maps_of_another_size_are_taken_at_the_same_aspect_alone(tmp_path):
-    reconstruction = workspace(tmp_path, "PINHOLE")
-    name, other = sorted(image.name for image in reconstruction.images.values())[:2]
-    small = np.arange(HEIGHT * WIDTH / 9, dtype=np.float32).reshape(HEIGHT // 3, WIDTH // 3) + 1
-    write_depth_map(tmp_path / "stereo/depth_maps" / f"{name}.geometric.bin", small)
-    write_depth_map(tmp_path / "stereo/depth_maps" / f"{other}.geometric.bin", np.ones((30, 30)))
-    scene = read_colmap(tmp_path)
-    np.testing.assert_array_equal(
-        scene[name].load().depth, np.repeat(np.repeat(small, 3, axis=0), 3, axis=1)
-    )
-    assert any("32x24 for pictures of 96x72" in finding.message for finding in scene.findings)
-    assert [f.level for f in scene.findings if "30x30" in f.message] == ["error"]
-    with pytest.raises(ProjectError, match="30x30 for a picture of 96x72"):
-        scene[other].load()
-
-
 def test_masks_and_images_may_be_given(tmp_path):
     reconstruction = workspace(tmp_path / "project", "PINHOLE")
     name = next(iter(reconstruction.images.values())).name

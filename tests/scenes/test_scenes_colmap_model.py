@@ -248,16 +248,6 @@ def test_pycolmap_reads_back_what_was_written(tmp_path):
     assert model.compute_mean_reprojection_error() < 1e-9
 
 
-def test_same_input_gives_same_bytes_and_no_leftovers(tmp_path):
-    written = cameras()
-    for name in ("a", "b"):
-        write_colmap(tmp_path / name, written, **tracks(written))
-    files = sorted(path.name for path in (tmp_path / "a").iterdir())
-    assert files == ["cameras.bin", "frames.bin", "images.bin", "points3D.bin", "rigs.bin"]
-    for name in files:
-        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
-
-
 def test_full_disk_leaves_the_earlier_model(tmp_path, monkeypatch):
     import pycolmap
 

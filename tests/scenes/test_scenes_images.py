@@ -119,17 +119,16 @@ def test_nearest_resize_is_pillows():
         np.testing.assert_array_equal(resize_nearest(array, *size), np.asarray(peer))
 
 
-@pytest.mark.parametrize("bits", [8, 10, 12, 14, 16])
-@pytest.mark.parametrize("channels", [1, 3, 4])
-@pytest.mark.parametrize("suffix", ["png", "tif", "ppm"])
+@pytest.mark.parametrize("bits", [8, 12, 16])
+@pytest.mark.parametrize(
+    ("channels", "suffix"), [(1, "png"), (3, "png"), (4, "png"), (3, "tif"), (1, "tif"), (3, "ppm")]
+)
 def test_a_projects_pictures_of_16_bits_a_channel_have_one_range(tmp_path, bits, channels, suffix):
     import cv2
     from scenes_workspace import PINHOLE, frame, transforms
 
     from gvtools.scenes.transforms import read_transforms
 
-    if suffix == "ppm" and channels != 3:
-        pytest.skip("PPM has three channels")
     red = np.where(np.arange(96 * 72).reshape(72, 96) % 7 < 6, ramp()[..., 0], 255)
     whole = red.astype(np.uint16) << (bits - 8)
     (tmp_path / "images").mkdir()

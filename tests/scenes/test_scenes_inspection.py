@@ -92,14 +92,6 @@ def test_depth_that_a_run_computes_is_told(tmp_path):
         choose_source(replace(scene, views=bare[:1]), scene.names[:1], "auto")
 
 
-def test_pictures_of_one_colour_are_warned_of(tmp_path):
-    workspace(tmp_path)
-    for path in (tmp_path / "images").rglob("*.png"):
-        save(path, np.zeros((72, 96, 3), np.uint8))
-    found = [finding.message for finding in inspect(read_colmap(tmp_path)).findings]
-    assert any(line.startswith("4 of 4 pictures show one colour alone") for line in found)
-
-
 def test_intrinsics_that_no_camera_has_and_poses_that_points_contradict_are_warned_of(tmp_path):
     reconstruction = workspace(tmp_path)
     for image in reconstruction.images.values():

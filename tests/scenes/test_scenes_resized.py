@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
-from walls import camera_at, photograph
 
 from gvtools.cameras import Cameras
 from gvtools.errors import OptionError
 from gvtools.scenes.resized import reduced, resized, seen_by
 from gvtools.scenes.scene import Frame, Scene, SparsePoints, View
-
-pytest_plugins = ("wall_fixtures",)
 
 
 def scene(width: int = 90, height: int = 60) -> Scene:
@@ -86,47 +81,23 @@ def test_points_that_held_out_views_saw_are_left_out():
     assert seen_by(whole.subset(["a"]), ["a"]).points is None
 
 
-@pytest.fixture
-def walls(textures) -> Scene:
-    picture = photograph(camera_at((0, 0, 0), scale=1.6, name="a.png"), textures)
-    small = camera_at((0.1, 0, 0), name="b.png").resized(80, 60)
-    mask = np.ones(picture.rgb.shape[:2], bool)
-    mask[:, :100] = False
-    views = (
-        View("a.png", picture.camera, lambda: Frame(picture.rgb, picture.depth, mask), True),
-        View("b.png", small, lambda: Frame(np.zeros((60, 80, 3), np.uint8))),
-    )
-    xy = np.array([[200.0, 60.0], [40.0, 30.0]])
-    points = SparsePoints(
-        np.zeros((1, 3)), np.zeros((1, 3), np.uint8), np.zeros(1, np.float32),
-        np.array([0, 0], np.int32), np.array([0, 1], np.int32), xy,
-    )  # fmt: skip
-    return Scene(Path("scene"), "colmap", views, points)
-
-
-def test_cameras_pictures_depth_and_points_shrink_together(walls):
-    out = reduced(walls, 160)
-    first = out.views[0]
-    assert (first.camera.width[0], first.camera.height[0]) == (160, 120)
-    frame = first.load()
-    assert frame.rgb.shape == (120, 160, 3)
+def test_cameras_pictures_depth_and_points_shrink_together():
+    whole = scene(180, 120)
+    out = reduced(whole, 90)
+    first, frame = out.views[0], out.views[0].load()
+    assert (first.camera.width[0], first.camera.height[0]) == (90, 60)
+    assert frame.rgb.shape == (60, 90, 3)
     assert frame.depth is not None and frame.mask is not None
-    assert frame.depth.shape == frame.mask.shape == (120, 160)
-    assert out.points is not None
-    np.testing.assert_allclose(out.points.xy, [[100, 30], [40, 30]])
-    # Small pictures stay as they are.
-    assert out.views[1] is walls.views[1]
-    assert "1 pictures are reduced" in out.findings[-1].message
+    assert frame.depth.shape == frame.mask.shape == (60, 90)
+    np.testing.assert_allclose(points_of(out).xy, points_of(whole).xy / 2)
+    assert "2 pictures are reduced" in out.findings[-1].message
+    expected = whole.views[0].load().rgb.reshape(60, 2, 90, 2, 3).mean(axis=(1, 3))
+    assert np.abs(frame.rgb - expected).max() <= 1
 
 
-def test_colours_are_averages(walls):
-    frame, small = walls.views[0].load(), reduced(walls, 160).views[0].load()
-    expected = frame.rgb.reshape(120, 2, 160, 2, 3).mean(axis=(1, 3))
-    assert np.abs(small.rgb - expected).max() <= 1
-
-
-def test_nothing_to_reduce_is_the_scene_itself(walls):
-    assert reduced(walls, None) is walls
-    assert reduced(walls, 320) is walls
+def test_nothing_to_reduce_is_the_scene_itself():
+    whole = scene()
+    assert reduced(whole, None) is whole
+    assert reduced(whole, 90) is whole
     with pytest.raises(OptionError, match="at least 64"):
-        reduced(walls, 10)
+        reduced(whole, 10)

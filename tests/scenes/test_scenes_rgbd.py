@@ -13,7 +13,6 @@ from scipy.spatial.transform import Rotation
 
 from gvtools.errors import GvError, OptionError, ProjectError, ShapeError
 from gvtools.scenes.images import read_depth
-from gvtools.scenes.matching import associate
 from gvtools.scenes.project import open_project
 from gvtools.scenes.rgbd import PUBLISHED, REDWOOD, SCANNET, SEVENSCENES, TUM, RgbdOptions
 
@@ -250,15 +249,6 @@ def test_tum_association_scale_and_poses(tmp_path):
     )
 
 
-def test_tum_time_difference_is_an_option(tmp_path):
-    root = tum(tmp_path / "sequence", offset=0.015)
-    assert all(view.has_depth for view in TUM.read(root))
-    scene = TUM.read(root, options=RgbdOptions(max_time_difference=0.012))
-    assert not any(view.has_depth for view in scene)
-    with pytest.raises(ProjectError, match=r"4 of 4 frames have no pose within 0\.005 s"):
-        TUM.read(root, options=RgbdOptions(max_time_difference=0.005))
-
-
 def test_tum_intrinsics_by_file_by_name_or_by_default(tmp_path):
     named = TUM.read(tum(tmp_path / "rgbd_dataset_freiburg1_desk"))
     assert "published for freiburg1" in messages(named)
@@ -319,24 +309,6 @@ def test_tum_malformed_lists_name_the_line(tmp_path):
     (root / "groundtruth.txt").write_text(text.replace(" 0.998750260", " 2", 1))
     with pytest.raises(ProjectError, match=r"groundtruth\.txt:2: a quaternion of length"):
         TUM.read(root)
-
-
-def test_association_is_the_greedy_one_over_all_pairs():
-    rng = np.random.default_rng(4)
-    first, second = np.sort(rng.uniform(0, 3, 60)), np.sort(rng.uniform(0, 3, 70))
-    pairs = sorted(
-        (abs(a - b), i, j)
-        for i, a in enumerate(first)
-        for j, b in enumerate(second)
-        if abs(a - b) <= 0.02
-    )
-    expected, used = {}, set()
-    for _, i, j in pairs:
-        if i not in expected and j not in used:
-            expected[i] = j
-            used.add(j)
-    assert associate(first, second, 0.02) == expected
-    assert len(expected) > 20
 
 
 def test_tum_stamps_in_nanoseconds(tmp_path):
@@ -543,11 +515,3 @@ def test_scannet_moved_depth_camera_is_pointed_out(tmp_path):
     depth = scene.views[0].load().depth  # 180 * 0.1 / 2 m = 9 pixels
     assert not depth[:, :9].any()
     assert depth[10:, 10:].all()
-
-
-def test_scannet_with_every_frame_lost(tmp_path):
-    root = scannet(tmp_path)
-    for path in (root / "pose").iterdir():
-        np.savetxt(path, np.full((4, 4), -np.inf))
-    with pytest.raises(ProjectError, match=r"none of 4 frames can be read .* were lost"):
-        SCANNET.read(root)

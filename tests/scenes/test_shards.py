@@ -148,19 +148,6 @@ def test_damage_is_found_named_and_mended(whole, tmp_path):
     assert contents(out) == contents(whole)
 
 
-def test_shards_that_are_cut_off_or_absent_are_one_line(whole, tmp_path):
-    out = copied(whole, tmp_path / "shards")
-    tar = out / "shard-000000.tar"
-    size = tar.stat().st_size
-    tar.write_bytes(tar.read_bytes()[:-512])
-    with pytest.raises(ProjectError, match=f"{size - 512} bytes; index.json says {size}"):
-        open_shards(out).read("one")
-    tar.unlink()
-    with pytest.raises(ProjectError, match=r"no such file; index\.json lists it"):
-        open_shards(out).read("one")
-    assert len(verify(out)) == 1
-
-
 def test_what_cannot_be_read_is_left_out_and_listed(tmp_path):
     good = small_scene("good", ["millimetres", "broken", "millimetres"])
     index = write_shards(of_scenes([good, small_scene("bad", ["broken"] * 2)]), tmp_path)

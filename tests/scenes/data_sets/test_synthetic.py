@@ -126,15 +126,6 @@ def test_arrays_that_an_hdf5_file_lacks_drop_their_frames(written: Written) -> N
         written.read()
 
 
-@of("omniworld")
-def test_a_camera_file_of_another_split_is_refused(written: Written) -> None:
-    path = written.root / "b04f88d1f85a" / "camera" / "split_1.json"
-    path.rename(path.with_name("split_0.json"))
-    assert layout_named("omniworld").scenes(written.root) == ("b04f88d1f85a/split_0",)
-    with pytest.raises(ProjectError, match="of the split's frames in split_info"):
-        read_miniature("omniworld", written.root, "b04f88d1f85a/split_0")
-
-
 # Traps of each layout.
 
 
@@ -149,18 +140,6 @@ def test_tartanair_looks_along_x_of_a_north_east_down_frame(written: Written) ->
     np.testing.assert_allclose(xy[0, 0], [32 + 32 * 5 / 10, 24 - 32 * 2 / 10], atol=1e-9)
     # Turned by 90 degrees about down, it looks east.
     assert z[1, 0] == pytest.approx(7.0)
-
-
-@of("tartanair")
-def test_tartanair_is_found_where_its_archives_repeat_the_environment(written: Written) -> None:
-    env = written.root / "abandonedfactory"
-    env.rename(written.root / "moved")
-    env.mkdir()
-    (written.root / "moved").rename(env / "abandonedfactory")
-    name = f"abandonedfactory/{written.expected.scene}"
-    assert layout_named("tartanair").scenes(written.root) == (name,)
-    assert len(read_miniature("tartanair", written.root, name)) == 4
-    assert layout_named("tartanair").scenes(env) == (written.expected.scene,)
 
 
 @of("tartanair_v2")
@@ -292,19 +271,11 @@ def test_errors_of_array_files_say_what_is_there(tmp_path: Path) -> None:
         file["image_0"] = np.zeros(3)
     with pytest.raises(ProjectError, match="holds image_0; expected 'depth'"):
         hdf5_array(tmp_path / "a.h5", "depth")
-    with pytest.raises(ProjectError, match=r"no such file|unreadable"):
-        hdf5_array(tmp_path / "b.h5", "depth")
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    for name, kind in (("half", np.float16), ("float", np.float32)):
-        image = np.array([[1.5, np.inf], [2.0, 3.0]], kind)
-        OpenEXR.File(header, {"R": image}).write(str(tmp_path / f"{name}.exr"))
-        read = exr_depth(tmp_path / f"{name}.exr", channels=("Y", "R"))
-        np.testing.assert_array_equal(read, np.where(np.isfinite(image), image, 0))
-        assert read.dtype == np.float32
+    path = tmp_path / "a.exr"
+    for kind in (np.float16, np.float32):
+        OpenEXR.File(header, {"R": np.array([[1.5, np.inf]], kind)}).write(str(path))
+        read = exr_depth(path, channels=("Y", "R"))
+        assert (read.tolist(), read.dtype) == ([[1.5, 0]], np.float32)
     with pytest.raises(ProjectError, match="channels R; expected Y or Z"):
-        exr_depth(tmp_path / "half.exr", channels=("Y", "Z"))
-    (tmp_path / "half.exr").write_bytes(b"none")
-    with pytest.raises(ProjectError, match="unreadable"):
-        exr_depth(tmp_path / "half.exr", channels=("Y",))
-    with pytest.raises(ProjectError, match="no such file"):
-        exr_depth(tmp_path / "none.exr", channels=("Y",))
+        exr_depth(path, channels=("Y", "Z"))
