@@ -74,10 +74,7 @@ def reading(
     *,
     also: tuple[type[Exception], ...] = (),
 ) -> Iterator[None]:
-    """Refuses the file that is read inside, whatever its damage makes a parser raise.
-
-    ``also`` are errors of that parser alone.
-    """
+    """Refuses the file that is read inside, whatever its damage makes a parser raise."""
     stumbles: tuple[type[Exception], ...] = (*DAMAGED, *also)
     try:
         yield

@@ -33,10 +33,7 @@ FARTHEST = 1e15
 
 
 def open_scan(path: Path, *, generated: bool = False) -> ScanFile:
-    """The scan in a file, its header read and checked against the file's size.
-
-    ``generated`` keeps points of a LAS that a completer made.
-    """
+    """The scan in a file, its header read and checked against the file's size."""
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise OptionError(f"{path}: expected a scan that ends with {', '.join(SUFFIXES)}")

@@ -35,12 +35,7 @@ def write_colmap(
 
     Cameras become PINHOLE cameras (views of equal K and size share one), images get the ids
     1..V in the cameras' order and the cameras' names, points the ids 1..N.
-
-    Args:
-        folder: the model folder itself, usually ``workspace/sparse/0``; made when absent.
-        cameras: V cameras; K without skew, each with a name of its own.
-        points: (N, 3), with (N, 3) ``colors``; None is black.
-        point_index: (M,), for each track element its point, with ``view_index`` and (M, 2) ``xy``.
+    A track element is a ``point_index``, a ``view_index`` and its (M, 2) ``xy``.
     """
     if colors is None:
         colors = np.zeros(points.shape, np.uint8)

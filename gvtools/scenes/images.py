@@ -186,10 +186,7 @@ def _decode(image: Image.Image, path: Path | str, *, alpha: str = "mask") -> Fra
 
 
 def read_mask(path: Path) -> NDArray[np.bool_]:
-    """(H, W) bool mask at ``path``: black or transparent is ignored (False), all else used (True).
-
-    Of one colour, the picture tells nothing where its alpha does.
-    """
+    """(H, W) bool mask at ``path``: black or transparent is ignored, False, all else used."""
     with _picture(path) as image:
         # Where black is stored with loss, it is not quite black.
         least = OPAQUE_FROM if image.format in LOSSY else 1

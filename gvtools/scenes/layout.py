@@ -66,8 +66,5 @@ class Layout:
         return bool(self.scenes(root))
 
     def read(self, root: Path, scene: str = "", *, options: RgbdOptions | None = None) -> Scene:
-        """A scene; ProjectError where nothing of it can be read.
-
-        ``options`` are what a posed RGB-D folder does not tell by itself.
-        """
+        """A scene; ProjectError where nothing of it can be read."""
         return self.reader(Path(root), scene, **({} if options is None else {"options": options}))

@@ -46,10 +46,7 @@ def natural(names: Iterable[str]) -> tuple[str, ...]:
 
 
 def scenes_holding(root: Path, *patterns: str) -> tuple[str, ...]:
-    """Folders below ``root`` that hold something, as relative names in natural order.
-
-    "*/images" finds "0000", not "0000/images".
-    """
+    """Folders below ``root`` that hold something, as relative names in natural order."""
     found = (path.parent for pattern in patterns for path in root.glob(pattern))
     return natural(path.relative_to(root).as_posix() for path in found)
 

@@ -301,10 +301,7 @@ def _views(frame: PosedFrame, sieve: _Sieve) -> tuple[Undistortion, ...]:
 
 
 def first_size(pictures: Iterable[Path]) -> tuple[int, int] | None:
-    """Width and height of the first picture that can be read, pixels; None where none can.
-
-    For layouts that do not store the size which their intrinsics are of.
-    """
+    """Width and height of the first picture that can be read, pixels; None where none can."""
     for path in pictures:
         try:
             header = read_header(path)

@@ -72,10 +72,7 @@ def write_shards(
     options: ShardOptions | None = None,
     progress: Callable[[WrittenShard], None] = lambda done: None,
 ) -> ShardsIndex:
-    """Convert scenes, or go on with a conversion; what cannot be read is left out and listed.
-
-    ``progress`` is called after each shard.
-    """
+    """Convert scenes, or go on with a conversion; what cannot be read is left out and listed."""
     options = options or ShardOptions()
     make_folder(out)
     _settle_description(collection, out, options)

@@ -221,10 +221,7 @@ UNITS = (0.001, 0.0002)
 def encoded(
     view: View, frame: Frame, about: Mapping[str, Any]
 ) -> tuple[dict[str, bytes], float | None]:
-    """A view's files by the end of their names, and scene units of a stored one of depth pictures.
-
-    ``about`` is what else the camera's file tells.
-    """
+    """A view's files by the end of their names, and scene units of a stored step of depth."""
     lossy = any(path.suffix.lower() in LOSSY for path in view.files[:1])
     picture = Image.fromarray(frame.rgb)
     members = {"jpg": _saved(picture, "JPEG", **JPEG)} if lossy else {"png": _saved(picture)}
@@ -319,10 +316,7 @@ def _read_scene(name: str, *, folder: Path, index: ShardsIndex) -> Scene:
 
 
 def verify(folder: Path, *, progress: Callable[[str], None] = lambda text: None) -> list[str]:
-    """A line for each shard that is missing or does not fit its checksums.
-
-    ``progress`` is called with each shard's file name before it is read.
-    """
+    """A line for each shard that is missing or does not fit its checksums."""
     problems = []
     for listed in read_index(folder).shards:
         tar = named_file(folder, listed.file, where=str(folder / INDEX))

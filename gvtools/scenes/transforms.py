@@ -91,14 +91,8 @@ def read_transforms(path: Path, *, images: Path | None = None, masks: Path | Non
     times ``integer_depth_scale``) and masks (``mask_path``, black = ignore) go through the same
     mapping. Views are named by their path below the deepest folder they share; those of splits
     begin with ``train/``, ``test/`` or ``val/``.
-
-    Args:
-        path: the file, or the folder with a ``transforms.json`` or ``transforms_train.json``.
-        images: a folder to take the pictures from instead, by their path below the shared folder.
-        masks: a folder with ``NAME.png`` for the view NAME, where frames name no mask.
-
-    Returns:
-        The scene, in the file's world frame and scale.
+    ``masks`` is a folder with ``NAME.png`` for the view NAME, where frames name no mask, ``images``
+    one to take the pictures from instead, by their path below the shared folder.
     """
     listed, findings = _listed(Path(path))
     root = Path(path) if Path(path).is_dir() else Path(path).parent
@@ -299,11 +293,8 @@ def write_transforms(
 ) -> None:
     """Write cameras as a ``transforms.json`` that nerfstudio, instant-ngp and this project read.
 
-    Args:
-        cameras: V cameras; K without skew.
-        image_paths: V pictures, absolute or relative to the file's folder.
-        generated: names of the cameras whose pictures a completer made.
-        up: (3,) unit vector, world frame, which the file is to tell.
+    Pictures are absolute or relative to the file's folder; a completer made those of ``generated``
+    cameras. ``up`` is a unit vector in the world.
     """
     frames = []
     for i, image in enumerate(image_paths):

@@ -156,10 +156,7 @@ def _positions(lens: Undistortion) -> tuple[NDArray[Any], NDArray[Any]]:
 def undistortion(
     model: str, params: Sequence[float] | NDArray[np.float64], size: tuple[int, int], *, what: str
 ) -> Undistortion:
-    """The mapping of a camera of COLMAP's; pinholes without distortion are passed untouched.
-
-    ``what`` says where the camera was read, for messages.
-    """
+    """The mapping of a camera of COLMAP's; pinholes without distortion are passed untouched."""
     from gvtools.colmap import pycolmap
 
     camera = camera_of(model, params, size, what=what)

@@ -158,10 +158,7 @@ def read_rgb(path: Path, *, index: int) -> Frame:
 
 
 def read_rgb_depth(path: Path, *, time: int) -> Depth:
-    """The depth map of a picture of the colour camera: the nearest in time, nanoseconds.
-
-    Streams of ``depth_images.vrs`` name the recorded streams that they belong to.
-    """
+    """The depth map of a picture of the colour camera: the nearest in time, nanoseconds."""
     tools, provider = _tools(), _provider(path)
     for stream in provider.get_all_streams():
         if provider.get_image_configuration(stream).description == RGB_STREAM:

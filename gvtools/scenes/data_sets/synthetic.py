@@ -21,6 +21,7 @@ from gvtools.scenes.calibration import (
     json_file,
     number_table,
     pinhole_lens,
+    quaternion_pose,
     renderer_lens,
 )
 from gvtools.scenes.images import (
@@ -93,16 +94,10 @@ CAMERAS = tuple(f"{side}cam_{direction}" for side in "lr" for direction in DIREC
 
 def ned_poses(path: Path) -> Float64:
     """(N, 4, 4) world_from_cam of a TartanAir pose file: OpenCV cameras in a NED world."""
-    from scipy.spatial.transform import Rotation
-
+    camera = rigid_poses(NED_FROM_OPENCV)
     rows = number_table(path, 7)
-    usable = np.isfinite(rows).all(axis=1) & (np.abs(rows[:, 3:]).max(axis=1, initial=0) > 0)
-    if len(rows) and not usable.any():
-        raise ProjectError(f"{path}: no row is a pose; expected tx ty tz qx qy qz qw in each")
-    poses = np.full((len(rows), 4, 4), np.nan)
-    turns = Rotation.from_quat(rows[usable, 3:]).as_matrix()
-    poses[usable] = rigid_poses(turns @ NED_FROM_OPENCV, rows[usable, :3])
-    return poses
+    poses = [quaternion_pose(row[[6, 3, 4, 5]], row[:3]) @ camera for row in rows]
+    return np.reshape(poses, (-1, 4, 4))
 
 
 def packed_depth(path: Path) -> Depth:
