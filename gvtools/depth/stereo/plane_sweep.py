@@ -1,23 +1,39 @@
-"""Depth from photographs with known poses: the stages of multi-view stereo, view by view."""
+"""Depth from photographs with known poses: the stages of multi-view stereo, view by view.
+
+Of one view: a coarse sweep, then planes carried to finer levels.
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras, concatenate
 from gvtools.depth.options import StereoOptions
 from gvtools.depth.source import DepthMap
 from gvtools.depth.stereo import filtering
-from gvtools.depth.stereo.filtering import agreement, confidence_of
-from gvtools.depth.stereo.geometry import DepthRange, choose_sources, estimate_range
+from gvtools.depth.stereo.geometry import (
+    DepthRange,
+    Hypotheses,
+    best_plane,
+    choose_sources,
+    disparity_rate,
+    estimate_range,
+    parabola,
+    plane_hypotheses,
+    range_of_depths,
+)
 from gvtools.depth.stereo.matching import (
+    Level,
     Matcher,
     Pyramid,
     build_pyramid,
+    level_of,
     resample,
     resample_colors,
     textured,
@@ -25,19 +41,20 @@ from gvtools.depth.stereo.matching import (
 )
 from gvtools.depth.stereo.matching_cpu import CpuMatcher
 from gvtools.depth.stereo.matching_torch import TorchMatcher, residual_flow
-from gvtools.depth.stereo.single_view import (
-    CoarseDepth,
-    RawDepth,
-    coarse_depth,
-    enough_disparity,
-    fine_depth,
-    narrow_range,
-    only_turned,
-)
 from gvtools.errors import DegenerateError, OptionError
 from gvtools.poses.dense_adjustment import PoseEquations, adjust_cameras, pose_equations
 from gvtools.scenes.scene import Frame, Scene, View
 
+# A new plane must be better by this much; ties keep what came from the coarser level.
+GAIN = 0.004
+FIT_RADIUS = 3
+# Cost below which a first estimate tells the range of depths, and the share of pixels it needs.
+SURE, SURE_SHARE = 0.3, 0.1
+# Pixels by which the nearest depth must move in a source against infinity.
+LEAST_DISPARITY = 0.5
+# Below which a pixel is matched at all; by how much depth must match better than a turn alone; and
+# the share of the matched pixels that have to.
+MATCHED, BETTER, BETTER_SHARE = 0.3, 0.02, 0.05
 # Expected errors of poses that are adjusted: radians, and a share of the typical depth.
 ROTATION_ERROR, TRANSLATION_ERROR = 0.01, 0.005
 ALIGNMENT_ROUNDS = 3
@@ -85,14 +102,14 @@ class PlaneSweepStereo:
         raw = self.raw(view, frame)
         options = self.options
         others = [other for other in map(self._confirming, raw.sources) if other is not None]
-        compared = agreement(
+        compared = filtering.agreement(
             raw.inverse_depth, raw.camera,
             [(other.inverse_depth, other.camera) for other in others],
             tolerance=options.tolerance,
         )  # fmt: skip
         matched = (raw.cost <= options.cost) & raw.textured
         confirmed = matched & (compared.views >= options.views)
-        confidence = confidence_of(raw.cost, compared.views, compared.spread)
+        confidence = filtering.confidence_of(raw.cost, compared.views, compared.spread)
         inverse = compared.inverse_depth
         depth = torch.where(inverse > 0, 1 / inverse, torch.zeros_like(inverse)).cpu().numpy()
         guide = self._pyramid(view, frame).images[0].numpy()
@@ -117,8 +134,7 @@ class PlaneSweepStereo:
     ) -> NDArray[np.float32]:
         """(H, W) confirmed depth, cut back to outlines and continued where it matches."""
         options = self.options
-        nothing = np.float32(0)
-        known = np.where(confirmed, depth, nothing)
+        known = np.where(confirmed, depth, np.float32(0))
         known = filtering.remove_speckles(known, options.tolerance, options.speckle)
         if not (options.trim or options.regrow):
             return known
@@ -135,11 +151,7 @@ class PlaneSweepStereo:
         if view.name in self._raw:
             return self._raw[view.name]
         _ = self.cameras  # poses first
-        coarse, reference, sources, names = self._coarse(view, frame)
-        raw = fine_depth(
-            coarse, reference, sources, names=names,
-            options=self.options, matcher=self._matcher, device=self._device,
-        )  # fmt: skip
+        raw = self._fine(*self._coarse(view, frame))
         if view.name in self.views:
             self._raw[view.name] = raw
         return raw
@@ -181,46 +193,81 @@ class PlaneSweepStereo:
     def _measured(self, row: int, view: View) -> tuple[int, list[int], PoseEquations] | None:
         """What a view's pictures say about the poses: its row, its sources' rows, equations."""
         try:
-            coarse, reference, sources, names = self._coarse(view, None)
+            coarse, reference, sources = self._coarse(view)
         except DegenerateError:
             return None
-        cameras = concatenate([source.cameras[-1] for source in sources])
+        cameras = concatenate([source.cameras[-1] for source in sources.values()])
         flow = residual_flow(coarse.level, coarse.inverse_depth, noise=self.options.noise)
         found = pose_equations(
             cameras, reference.cameras[-1], coarse.inverse_depth.cpu().numpy(),
             motion=torch.stack([flow.dx, flow.dy], -1).cpu().numpy(),
             weight=flow.weight.cpu().numpy(),
         )  # fmt: skip
-        return None if found is None else (row, [self.views.index(n) for n in names], found)
+        return None if found is None else (row, [self.views.index(n) for n in sources], found)
 
     def _coarse(
-        self, view: View, frame: Frame | None
-    ) -> tuple[CoarseDepth, Pyramid, list[Pyramid], tuple[str, ...]]:
-        """The coarse estimate of a view, its pictures, and its sources' pictures and names."""
+        self, view: View, frame: Frame | None = None
+    ) -> tuple[CoarseDepth, Pyramid, dict[str, Pyramid]]:
+        """The coarse estimate of a view, its pictures, and its sources' pictures by name."""
         reference = self._pyramid(view, frame)
         if view.name not in self._ranges:
             self._ranges[view.name] = self._range(view, reference)
         depths = self._ranges[view.name]
-        names = self._sources(view, depths)
-        sources = [self._pyramid(self._scene[name]) for name in names]
-        coarse = coarse_depth(
-            reference, sources, depths,
-            options=self.options, matcher=self._matcher, device=self._device,
-        )  # fmt: skip
-        if depths.origin != "points":
-            self._refuse_turned(view, coarse)
-        return coarse, reference, sources, names
-
-    def _refuse_turned(self, view: View, coarse: CoarseDepth) -> None:
-        """Raise when a turn alone explains the pictures; sparse points vouch for positions."""
-        options = self.options
-        detailed = textured(coarse.level.reference, window=options.window, noise=options.noise)
-        if only_turned(coarse.level, coarse.cost, detailed, matcher=self._matcher):
+        sources = {name: self._pyramid(self._scene[name]) for name in self._sources(view, depths)}
+        coarse = self._sweep(reference, list(sources.values()), depths, options=self.options)
+        # Sparse points vouch for positions.
+        if depths.origin != "points" and only_turned(coarse, self.options, self._matcher):
             raise DegenerateError(
                 f"{self._scene.root}: the pictures beside {view.name} differ from it by a turn of "
                 "the camera alone, whatever their positions say; stereo needs two viewpoints; add "
                 "photographs taken a step aside"
             )
+        return coarse, reference, sources
+
+    def _sweep(
+        self, reference: Pyramid, sources: Sequence[Pyramid], depths: DepthRange, *,
+        options: StereoOptions,
+    ) -> CoarseDepth:  # fmt: skip
+        """Planes swept over the coarsest level, and their costs aggregated."""
+        index, device = len(reference.images) - 1, self._device
+        level = level_of(reference, sources, index, window=options.window, device=device)
+        cameras = concatenate(
+            [source.cameras[min(index, len(source.cameras) - 1)] for source in sources]
+        )
+        planes = plane_hypotheses(reference.cameras[index], cameras, depths, planes=options.planes)
+        volume = self._matcher.sweep(level, planes.inverse_depths.to(device))
+        total = self._matcher.aggregate(volume, level.reference)
+        inverse_depth, which = best_plane(total, planes)
+        cost = volume.gather(-1, which[..., None])[..., 0]
+        return CoarseDepth(level, planes, inverse_depth, cost)
+
+    def _fine(
+        self, coarse: CoarseDepth, reference: Pyramid, sources: dict[str, Pyramid]
+    ) -> RawDepth:
+        """A coarse estimate carried to the finest level, and adjusted on each.
+
+        Rounds of propagation double from a level to the coarser one, where they cost a quarter.
+        """
+        options, level, cost = self.options, coarse.level, coarse.cost
+        planes = fit_planes(coarse.inverse_depth, (1 - cost).clamp(min=0.01))
+        inverse, step = coarse.hypotheses.inverse_depths, coarse.hypotheses.step
+        bounds = (float(inverse[0]), float(inverse[-1]))
+        last = len(reference.images) - 1
+        for index in range(last, -1, -1):
+            if index < last:
+                level = level_of(
+                    reference, list(sources.values()), index, window=options.window,
+                    device=self._device,
+                )  # fmt: skip
+                planes = upsample(planes, *level.reference.shape)
+                step /= 2
+            planes, cost = refine_planes(
+                planes, level, self._matcher,
+                step=step, bounds=bounds, iterations=options.iterations * 2**index,
+            )  # fmt: skip
+        detailed = textured(level.reference, window=options.window, noise=options.noise)
+        camera = reference.cameras[0]
+        return RawDepth(planes[0].clamp(*bounds), cost, detailed, camera, tuple(sources))
 
     def _range(self, view: View, reference: Pyramid) -> DepthRange:
         """Where the view's depths lie, narrowed by a first sweep when there are no points."""
@@ -229,12 +276,13 @@ class PlaneSweepStereo:
             return depths
         names = self._sources(view, depths)
         small = [_halve(self._pyramid(self._scene[name])) for name in names]
-        coarse = coarse_depth(
-            _halve(reference), small, depths,
-            options=self.options.replaced(window=5, planes=None),
-            matcher=self._matcher, device=self._device,
-        )  # fmt: skip
-        return narrow_range(depths, coarse)
+        options = self.options.replaced(window=5, planes=None)
+        coarse = self._sweep(_halve(reference), small, depths, options=options)
+        sure = coarse.cost < SURE
+        if sure.float().mean() < SURE_SHARE:
+            return depths
+        found = (1 / coarse.inverse_depth[sure]).double().cpu().numpy()
+        return range_of_depths(found, origin="pictures")
 
     def _sources(self, view: View, depths: DepthRange) -> tuple[str, ...]:
         names = choose_sources(
@@ -242,8 +290,10 @@ class PlaneSweepStereo:
         )
         if names:
             # As large as the finest level, whose pixels are meant.
+            most = self.options.max_side
             camera, *others = (
-                self._finest(self._scene[name].camera) for name in (view.name, *names)
+                each.resized(*working_size(int(each.width[0]), int(each.height[0]), most))
+                for each in (self._scene[name].camera for name in (view.name, *names))
             )
             moved = enough_disparity(camera, concatenate(others), depths)
             names = tuple(name for name, far in zip(names, moved, strict=True) if far)
@@ -253,11 +303,6 @@ class PlaneSweepStereo:
                 "does from another place; leave it out or add photographs beside it"
             )
         return names
-
-    def _finest(self, camera: Cameras) -> Cameras:
-        """The camera of the finest level."""
-        width, height = int(camera.width[0]), int(camera.height[0])
-        return camera.resized(*working_size(width, height, self.options.max_side))
 
     def _known(self, view: View) -> Scene:
         """The scene of the views that may be looked at and the view itself."""
@@ -300,3 +345,152 @@ def _halve(pyramid: Pyramid) -> Pyramid:
     image, camera = pyramid.images[-1], pyramid.cameras[-1]
     width, height = max(8, round(image.shape[1] / 2)), max(8, round(image.shape[0] / 2))
     return Pyramid((resample(image, width, height),), (camera.resized(width, height),))
+
+
+def upsample(planes: torch.Tensor, height: int, width: int) -> torch.Tensor:
+    """The planes (3, h, w) of a coarser level, see Matcher.score, at the pixels of a finer one."""
+    device = planes.device
+    down, across = planes.shape[1] / height, planes.shape[2] / width
+    y = (torch.arange(height, device=device) + 0.5) * down
+    x = (torch.arange(width, device=device) + 0.5) * across
+    row = y.long().clamp(max=planes.shape[1] - 1)
+    column = x.long().clamp(max=planes.shape[2] - 1)
+    near = planes[:, row][:, :, column]
+    dy, dx = (y - row - 0.5)[:, None], (x - column - 0.5)[None]
+    return torch.stack([near[0] + near[1] * dx + near[2] * dy, near[1] * across, near[2] * down])
+
+
+def fit_planes(inverse_depth: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
+    """The plane that fits the inverse depths round each pixel best, by weighted least squares.
+
+    (3, H, W), see Matcher.score. Without enough weight in reach, the plane is parallel to the
+    image.
+    """
+    size = 2 * FIT_RADIUS + 1
+    offset = torch.arange(-FIT_RADIUS, FIT_RADIUS + 1, device=weight.device, dtype=weight.dtype)
+    one = torch.ones_like(offset)
+    # Differences to the centre's value: the sums stay exact when all inverse depths are alike.
+    base = inverse_depth.mean()
+    value = (inverse_depth - base) * weight
+
+    def total(image: torch.Tensor, down: torch.Tensor, across: torch.Tensor) -> torch.Tensor:
+        padded = F.pad(image[None, None], (FIT_RADIUS,) * 4)
+        summed = F.conv2d(padded, down.view(1, 1, size, 1))
+        return F.conv2d(summed, across.view(1, 1, 1, size))[0, 0]
+
+    n = total(weight, one, one).clamp(min=1e-6)
+    mx, my = total(weight, one, offset) / n, total(weight, offset, one) / n
+    mw = total(value, one, one) / n
+    xx = total(weight, one, offset**2) / n - mx * mx
+    yy = total(weight, offset**2, one) / n - my * my
+    xy = total(weight, offset, offset) / n - mx * my
+    xw = total(value, one, offset) / n - mx * mw
+    yw = total(value, offset, one) / n - my * mw
+    # A little ridge: where the weights lie on a line, the slope across it is 0.
+    xx, yy = xx + 0.05, yy + 0.05
+    determinant = xx * yy - xy * xy
+    a, b = (yy * xw - xy * yw) / determinant, (xx * yw - xy * xw) / determinant
+    some = n > 1.5
+    a, b = a * some, b * some
+    w = torch.where(some, mw + base - a * mx - b * my, inverse_depth)
+    return torch.stack([w, a, b])
+
+
+def refine_planes(
+    planes: torch.Tensor,
+    level: Level,
+    matcher: Matcher,
+    *,
+    step: float,
+    bounds: tuple[float, float],
+    iterations: int,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Propagate, adjust and refine planes (3, H, W) on one level; gives them and their costs.
+
+    All pixels take the same kind of proposal at once: a neighbour's plane, a shifted plane, the
+    plane fitted to the surroundings. What lowers the photometric cost is kept. Proposals follow
+    each other, so planes travel several pixels per round. Nothing is drawn at random. ``step``:
+    inverse depth that moves one pixel in the source that moves most.
+    """
+    planes = planes.clone()
+    planes[0].clamp_(*bounds)
+    cost = matcher.score(level, planes)
+
+    def offer(proposal: torch.Tensor) -> None:
+        nonlocal planes, cost
+        proposal[0].clamp_(*bounds)
+        price = matcher.score(level, proposal)
+        better = price < cost - GAIN
+        cost = torch.where(better, price, cost)
+        planes = torch.where(better, proposal, planes)
+
+    for i in range(iterations):
+        reach = 1 if i % 2 == 0 else 3
+        for dy, dx in ((0, reach), (reach, 0), (0, -reach), (-reach, 0)):
+            offer(_shift(planes, dy, dx))
+        offer(fit_planes(planes[0], (1 - cost).clamp(min=0.01)))
+        for change in (0.5, -0.5) if i % 2 == 0 else (0.25, -0.25):
+            offer(torch.stack([planes[0] + change * step, planes[1], planes[2]]))
+    # The lowest point of a parabola through three costs.
+    step *= 0.4
+    sides = [
+        matcher.score(level, torch.stack([planes[0] + side * step, planes[1], planes[2]]))
+        for side in (-1, 1)
+    ]
+    shift = parabola(sides[0], cost, sides[1])
+    return torch.stack([planes[0] + shift * step, planes[1], planes[2]]), cost
+
+
+def _shift(planes: torch.Tensor, dy: int, dx: int) -> torch.Tensor:
+    """Each pixel's neighbour's plane, continued to the pixel; the border keeps its own."""
+    moved = planes.roll((dy, dx), dims=(1, 2))
+    moved[0] += moved[1] * dx + moved[2] * dy
+    if dy:
+        edge = slice(0, dy) if dy > 0 else slice(dy, None)
+        moved[:, edge] = planes[:, edge]
+    if dx:
+        edge = slice(0, dx) if dx > 0 else slice(dx, None)
+        moved[:, :, edge] = planes[:, :, edge]
+    return moved
+
+
+@dataclass(frozen=True, eq=False)
+class CoarseDepth:
+    """What the coarsest level tells."""
+
+    level: Level  # its pictures
+    hypotheses: Hypotheses  # the planes that were tried
+    inverse_depth: torch.Tensor  # (H, W) float32, 1 / scene units
+    cost: torch.Tensor  # (H, W) float32 photometric cost there
+
+
+@dataclass(frozen=True, eq=False)
+class RawDepth:
+    """Depth of one view on the finest level; every pixel has some."""
+
+    inverse_depth: torch.Tensor  # (H, W) float32, 1 / scene units
+    cost: torch.Tensor  # (H, W) float32 photometric cost
+    textured: torch.Tensor  # (H, W) bool, where there is detail to match; see ``textured``
+    camera: Cameras  # of the finest level, a batch of one
+    sources: tuple[str, ...]  # names of the views that it was matched with
+
+
+def enough_disparity(reference: Cameras, sources: Cameras, depths: DepthRange) -> NDArray[np.bool_]:
+    """(S,) whether each source sees the nearest depth move at all, on the finest level."""
+    rate = disparity_rate(reference, sources, depths.near, far=np.inf)
+    return rate / depths.near >= LEAST_DISPARITY
+
+
+def only_turned(coarse: CoarseDepth, options: StereoOptions, matcher: Matcher) -> bool:
+    """Whether a turn of the camera explains the pictures as well as any depth does.
+
+    Infinite depth moves pixels by the turn alone. Where cameras moved next to nothing, it matches
+    every pixel at least as well as the depth that was found.
+    """
+    level, cost = coarse.level, coarse.cost
+    detailed = textured(level.reference, window=options.window, noise=options.noise)
+    turned = matcher.sweep(level, torch.zeros(1, device=cost.device))[..., 0]
+    matched = detailed & (torch.minimum(cost, turned) < MATCHED)
+    if not matched.any():
+        return False
+    return float((turned - cost > BETTER)[matched].float().mean()) < BETTER_SHARE

@@ -24,8 +24,7 @@ from gvtools.depth.stereo.filtering import (
 )
 from gvtools.depth.stereo.geometry import DepthRange, baselines
 from gvtools.depth.stereo.matching import CLEAR, detail_of, noise_of, textured
-from gvtools.depth.stereo.plane_sweep import PlaneSweepStereo
-from gvtools.depth.stereo.single_view import enough_disparity
+from gvtools.depth.stereo.plane_sweep import PlaneSweepStereo, enough_disparity
 from gvtools.errors import DegenerateError, OptionError, ProjectError
 from gvtools.scenes.scene import Frame, Scene, View
 

@@ -22,8 +22,7 @@ from gvtools.depth.stereo.geometry import (
 from gvtools.depth.stereo.matching import build_pyramid, level_of, window_taps, window_weights
 from gvtools.depth.stereo.matching_cpu import CpuMatcher
 from gvtools.depth.stereo.matching_torch import TorchMatcher, bilinear
-from gvtools.depth.stereo.plane_sweep import make_matcher
-from gvtools.depth.stereo.single_view import fit_planes, refine_planes, upsample
+from gvtools.depth.stereo.plane_sweep import fit_planes, make_matcher, refine_planes, upsample
 from gvtools.errors import OptionError
 
 OPTIONS = StereoOptions(sources=2, best=1)
