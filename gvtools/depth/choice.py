@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
-from gvtools.depth.colmap_patch_match import ColmapPatchMatch, has_patch_match
+import numpy as np
+from numpy.typing import NDArray
+
 from gvtools.depth.options import FoundationOptions, StereoOptions
-from gvtools.depth.source import DepthSource, MixedDepth, RecordedDepth
-from gvtools.errors import OptionError, ProjectError
-from gvtools.scenes.scene import Scene, View
+from gvtools.depth.source import DepthMap, DepthSource, MixedDepth, RecordedDepth
+from gvtools.errors import DegenerateError, OptionError, ProjectError
+from gvtools.scenes.colmap import depth_map_path
+from gvtools.scenes.colmap_writer import write_colmap
+from gvtools.scenes.images import read_depth
+from gvtools.scenes.scene import Frame, Scene, View
 from gvtools.settings import changes
 
 CHOICES = ("auto", "sensor", "colmap", "plane-sweep", "da3", "sensor-or-da3")
@@ -50,7 +57,15 @@ def choose_source(
     chosen = _chosen(
         scene, views, choice, stereo=stereo, foundation=foundation or FoundationOptions()
     )
-    return replace(chosen, ignored=_ignored(chosen.source, stereo))
+    given = {} if stereo is None else changes(StereoOptions(), stereo)
+    if not given:
+        return chosen
+    from gvtools.depth.stereo.plane_sweep import PlaneSweepStereo
+
+    source = chosen.source.computed if isinstance(chosen.source, MixedDepth) else chosen.source
+    if isinstance(source, PlaneSweepStereo):
+        return chosen
+    return replace(chosen, ignored=tuple(f"stereo.{name}={value}" for name, value in given.items()))
 
 
 def rough_source(scene: Scene, source: DepthSource) -> DepthSource:
@@ -98,7 +113,23 @@ def _chosen(
         source = _foundation(scene, views, foundation)
         return ChosenSource(source, f"asked for; weights of {foundation.weights}")
     if choice in ("sensor", "colmap"):
-        return _asked_recorded(scene, views, choice, recorded=recorded)
+        if (choice == "colmap") != (scene.kind == "colmap"):
+            raise OptionError(f"depth {choice!r}: {scene.root} is a {scene.kind} project; use auto")
+        if recorded:
+            what = "stereo maps" if choice == "colmap" else "it"
+            reason = f"asked for; {recorded} of {len(views)} views have {what}"
+            return ChosenSource(RecordedDepth(views), reason)
+        if choice == "colmap" and has_patch_match():
+            return ChosenSource(ColmapPatchMatch(scene, views), "asked for; computed now with CUDA")
+        advice = "add depth maps, or use auto"
+        if choice == "colmap":
+            advice = (
+                "pycolmap has no CUDA here; run COLMAP's patch_match_stereo on an undistorted "
+                "workspace (stereo/depth_maps is then read), or use plane-sweep"
+            )
+        raise ProjectError(
+            f"{scene.root}: none of the {len(views)} context views has depth; {advice}"
+        )
     if choice == "plane-sweep":
         return ChosenSource(_stereo(scene, views, stereo), "asked for")
     if recorded == len(views):
@@ -123,27 +154,6 @@ def _chosen(
     )
 
 
-def _asked_recorded(
-    scene: Scene, views: Sequence[str], choice: str, *, recorded: int
-) -> ChosenSource:
-    """Depth of a sensor or of COLMAP, which a project of the other kind does not have."""
-    if (choice == "colmap") != (scene.kind == "colmap"):
-        raise OptionError(f"depth {choice!r}: {scene.root} is a {scene.kind} project; use auto")
-    what = "stereo maps" if choice == "colmap" else "it"
-    if recorded:
-        reason = f"asked for; {recorded} of {len(views)} views have {what}"
-        return ChosenSource(RecordedDepth(views), reason)
-    if choice == "colmap" and has_patch_match():
-        return ChosenSource(ColmapPatchMatch(scene, views), "asked for; computed now with CUDA")
-    advice = "add depth maps, or use auto"
-    if choice == "colmap":
-        advice = (
-            "pycolmap has no CUDA here; run COLMAP's patch_match_stereo on an undistorted "
-            "workspace (stereo/depth_maps is then read), or use plane-sweep"
-        )
-    raise ProjectError(f"{scene.root}: none of the {len(views)} context views has depth; {advice}")
-
-
 def _stereo(scene: Scene, views: Sequence[str], options: StereoOptions | None) -> DepthSource:
     if len(views) < 2:
         raise ProjectError(
@@ -161,14 +171,96 @@ def _foundation(scene: Scene, views: Sequence[str], options: FoundationOptions) 
     return FoundationDepth(scene, views=views, options=options)
 
 
-def _ignored(source: DepthSource, options: StereoOptions | None) -> tuple[str, ...]:
-    """The options that differ from their defaults, where no plane sweep takes them."""
-    if options is None or options == StereoOptions():
-        return ()
-    from gvtools.depth.stereo.plane_sweep import PlaneSweepStereo
+# Source pictures of each, chosen by COLMAP from co-visibility.
+SOURCES = 20
 
-    computing = source.computed if isinstance(source, MixedDepth) else source
-    if isinstance(computing, PlaneSweepStereo):
-        return ()
-    given = changes(StereoOptions(), options)
-    return tuple(f"stereo.{name}={value}" for name, value in given.items())
+
+def has_patch_match() -> bool:
+    """Whether this pycolmap can run PatchMatch."""
+    from gvtools.colmap import pycolmap
+
+    return bool(pycolmap.has_cuda)
+
+
+class ColmapPatchMatch:
+    """COLMAP's PatchMatch stereo, where pycolmap was built with CUDA.
+
+    J. L. Schönberger et al., "Pixelwise view selection for unstructured multi-view stereo", ECCV
+    2016. The views' pictures, already undistorted, go to a temporary dense workspace; depth is
+    computed together when the first is asked for.
+    """
+
+    name = "colmap-patch-match"
+
+    def __init__(self, scene: Scene, views: Sequence[str]) -> None:
+        if scene.points is None:
+            raise ProjectError(
+                f"{scene.root}: COLMAP's PatchMatch needs sparse points, and there are none; "
+                "triangulate, or use plane-sweep"
+            )
+        self._scene, self.views = scene, tuple(views)
+        self._depth: dict[str, NDArray[np.float32]] | None = None
+
+    def covers(self, view: View) -> bool:
+        """The given views."""
+        return view.name in self.views
+
+    def depth(self, scene: Scene, view: View, frame: Frame) -> DepthMap:
+        """The view's geometric depth map, trusted as recorded ones are."""
+        if self._depth is None:
+            with tempfile.TemporaryDirectory() as folder:
+                self._depth = self._run(Path(folder))
+        if view.name not in self._depth:
+            raise DegenerateError(f"{scene.root}: PatchMatch gave no depth of view {view.name}")
+        found = Frame(frame.rgb, self._depth[view.name], frame.mask)
+        trusted = RecordedDepth().depth(scene, view, found)
+        return DepthMap(trusted.depth, trusted.confidence, self.name)
+
+    def _run(self, folder: Path) -> dict[str, NDArray[np.float32]]:
+        from PIL import Image
+
+        from gvtools.colmap import pycolmap
+
+        write_workspace(folder, self._scene, self.views)
+        for name in self.views:
+            path = folder / "images" / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            # Without loss, whatever the suffix says.
+            Image.fromarray(self._scene[name].load().rgb).save(path, format="PNG")
+        try:
+            pycolmap.patch_match_stereo(folder)
+        except (RuntimeError, ValueError) as error:
+            raise ProjectError(
+                f"{self._scene.root}: COLMAP's PatchMatch failed ({error}); use plane-sweep"
+            ) from None
+        out = {}
+        for name in self.views:
+            found = depth_map_path(folder / "stereo" / "depth_maps", name)
+            if found is not None:
+                out[name] = read_depth(found)
+        return out
+
+
+def write_workspace(folder: Path, scene: Scene, views: Sequence[str]) -> None:
+    """Sparse model and configuration of a dense workspace with the named views alone."""
+    points = scene.points
+    assert points is not None
+    row = {view.name: i for i, view in enumerate(scene.views)}
+    kept = np.full(len(scene.views), -1)
+    kept[[row[name] for name in views]] = np.arange(len(views))
+    inside = kept[points.view_index] >= 0
+    point, first = np.unique(points.point_index[inside], return_inverse=True)
+    write_colmap(
+        folder / "sparse",
+        scene.subset(views).cameras,
+        points=points.positions[point],
+        colors=points.colors[point],
+        point_index=first,
+        view_index=kept[points.view_index[inside]],
+        xy=points.xy[inside],
+    )
+    stereo = folder / "stereo"
+    for name in ("depth_maps", "normal_maps", "consistency_graphs"):
+        (stereo / name).mkdir(parents=True, exist_ok=True)
+    lines = [line for name in views for line in (name, f"__auto__, {SOURCES}")]
+    (stereo / "patch-match.cfg").write_text("\n".join(lines) + "\n", encoding="utf-8")

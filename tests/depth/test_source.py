@@ -12,8 +12,7 @@ from tiny_scan import write_scan
 
 from gvtools.cameras import Cameras
 from gvtools.depth import choice
-from gvtools.depth.choice import choose_source, rough_source
-from gvtools.depth.colmap_patch_match import ColmapPatchMatch
+from gvtools.depth.choice import ColmapPatchMatch, choose_source, rough_source
 from gvtools.depth.options import StereoOptions
 from gvtools.depth.source import (
     LEAST,

@@ -22,7 +22,7 @@ from scipy.sparse.csgraph import connected_components
 
 from gvtools.cameras import Cameras
 from gvtools.depth.stereo.geometry import relative_warps
-from gvtools.depth.stereo.matching_torch import pixel_centers
+from gvtools.depth.stereo.matching import pixel_centers
 from gvtools.kernels import compiled
 
 Float32 = NDArray[np.float32]

@@ -1,4 +1,4 @@
-"""The compiled kernels of stereo; gvtools.depth.stereo.matching_torch defines their results."""
+"""The compiled kernels of stereo; gvtools.depth.stereo.matching defines their results."""
 
 from __future__ import annotations
 

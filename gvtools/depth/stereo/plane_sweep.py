@@ -32,15 +32,16 @@ from gvtools.depth.stereo.matching import (
     Level,
     Matcher,
     Pyramid,
+    TorchMatcher,
     build_pyramid,
     level_of,
     resample,
     resample_colors,
+    residual_flow,
     textured,
     working_size,
 )
 from gvtools.depth.stereo.matching_cpu import CpuMatcher
-from gvtools.depth.stereo.matching_torch import TorchMatcher, residual_flow
 from gvtools.errors import DegenerateError, OptionError
 from gvtools.poses.dense_adjustment import PoseEquations, adjust_cameras, pose_equations
 from gvtools.scenes.scene import Frame, Scene, View

@@ -19,8 +19,7 @@ from gvtools.depth.stereo.geometry import (
     range_of_depths,
     seen_points,
 )
-from gvtools.depth.stereo.matching import build_pyramid, level_of
-from gvtools.depth.stereo.matching_torch import residual_flow
+from gvtools.depth.stereo.matching import build_pyramid, level_of, residual_flow
 from gvtools.errors import DegenerateError
 from gvtools.poses.dense_adjustment import adjust_cameras, pose_equations
 from gvtools.scenes.scene import Scene, SparsePoints

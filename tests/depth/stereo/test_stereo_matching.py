@@ -19,9 +19,15 @@ from gvtools.depth.stereo.geometry import (
     plane_hypotheses,
     relative_warps,
 )
-from gvtools.depth.stereo.matching import build_pyramid, level_of, window_taps, window_weights
+from gvtools.depth.stereo.matching import (
+    TorchMatcher,
+    bilinear,
+    build_pyramid,
+    level_of,
+    window_taps,
+    window_weights,
+)
 from gvtools.depth.stereo.matching_cpu import CpuMatcher
-from gvtools.depth.stereo.matching_torch import TorchMatcher, bilinear
 from gvtools.depth.stereo.plane_sweep import fit_planes, make_matcher, refine_planes, upsample
 from gvtools.errors import OptionError
 
