@@ -84,13 +84,6 @@ def test_listing_the_completers_imports_none_of_them():
     assert result.returncode == 0, result.stderr
 
 
-def test_texts_become_the_types_of_the_fields(painter):
-    made = create("painter", strength="0.25", rounds="3", soft="true", limit="none").settings
-    assert made == _PainterSettings(strength=0.25, rounds=3, soft=True, limit=None)
-    whole = create("painter", strength=1, limit="2").settings
-    assert (whole.strength, whole.limit) == (1.0, 2.0) and isinstance(whole.strength, float)
-
-
 @pytest.mark.parametrize(
     ("options", "words"),
     [

@@ -76,23 +76,6 @@ def test_holes_are_filled_as_the_plain_algorithm_fills_them(size, share):
         np.testing.assert_allclose(found[index].numpy(), expected, rtol=1e-10, atol=1e-12)
 
 
-@pytest.mark.parametrize("size", [(1, 1), (1, 6), (9, 14), (33, 20)])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-def test_known_pixels_and_constants_stay(size, dtype):
-    generator = torch.Generator().manual_seed(0)
-    values = torch.randn(1, 3, *size, generator=generator).to(dtype)
-    valid = torch.rand(1, 1, *size, generator=generator) < 0.2
-    valid[..., -1, -1] = True
-    found = push_pull(values, valid)
-    assert torch.equal(found[valid.expand_as(found)], values[valid.expand_as(found)])
-    assert found.dtype == dtype
-    low, high = values.min(), values.max()
-    assert bool(((found >= low - 1e-2) & (found <= high + 1e-2)).all())
-    constant = push_pull(torch.full_like(values, 0.7), valid)
-    torch.testing.assert_close(constant, torch.full_like(values, 0.7))
-    assert not push_pull(values, torch.zeros_like(valid)).any()
-
-
 def test_depth_is_filled_in_its_logarithm():
     depth = torch.zeros(3, 1, 4, 8)
     depth[0, :, :, :4], depth[0, :, :, 6:] = 1.0, 4.0

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import importlib.util
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,11 +11,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 from gvtools.completers.geoverse.completer import GeoVerseCompleter
-from gvtools.completers.geoverse.denoiser import Positions
-from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.completers.geoverse.rgb_head import RGBHead
-from gvtools.completers.geoverse.video_injection import ControlBranch, ControlConfig, video_keys
-from gvtools.errors import OptionError
 from gvtools.networks import compute
 from gvtools.networks.compute import (
     Recomputing,
@@ -67,20 +62,6 @@ def test_a_cpu_infers_in_float32_and_trains_in_what_is_faster(monkeypatch):
         compute.bfloat16_is_faster.cache_clear()
         assert training_type("auto", CPU) == wanted
     compute.bfloat16_is_faster.cache_clear()
-
-
-def test_the_probe_times_both_ways_and_leaves_nothing_changed():
-    torch.manual_seed(3)
-    before = torch.get_rng_state()
-    with torch.no_grad():
-        assert all(compute._least_seconds(dtype) > 0 for dtype in (torch.float32, *HALF[:1]))
-    assert torch.equal(torch.get_rng_state(), before)
-    assert torch.get_num_threads() == 1
-
-
-def test_training_in_float16_is_refused():
-    with pytest.raises(OptionError, match="precision 'float16'; expected 'auto', 'float32' or 'b"):
-        OptimizerOptions(precision="float16")
 
 
 @pytest.mark.parametrize(
@@ -201,10 +182,7 @@ def test_nothing_runs_twice_without_gradients():
     assert len(ran) == 1
 
 
-GRID = (24, 32)  # 768 tokens a view
 VIEWS = 4
-TOKENS = VIEWS * GRID[0] * GRID[1]
-SIZE = (GRID[0] * micro.PATCH, GRID[1] * micro.PATCH)
 
 
 class Largest(TorchDispatchMode):
@@ -217,41 +195,6 @@ class Largest(TorchDispatchMode):
         sizes = [leaf.numel() for leaf in tree_leaves(out) if isinstance(leaf, torch.Tensor)]
         self.count = max(self.count, *sizes, 0)
         return out
-
-
-def conditions() -> Any:
-    batch = micro.batch(targets=VIEWS - 2, size=SIZE)
-    model = GeoVerse(micro.config(injection="shared")).eval()
-    with torch.no_grad():
-        return model, model.prepare(batch, video=micro.video_features(1, VIEWS, grid=GRID))
-
-
-@pytest.mark.slow
-def test_the_denoiser_with_video_keys_and_with_the_control_branch():
-    model, prepared = conditions()
-    state = torch.randn(1, VIEWS, micro.CHANNELS, *GRID)
-    t = torch.tensor([0.5])
-    scores = micro.DENOISER.heads * TOKENS * TOKENS
-    branch = ControlBranch(
-        ControlConfig(micro.LAYERS), model.level1, video_channels=micro.VIDEO.channels
-    )
-    features = micro.video_features(1, VIEWS, grid=GRID)
-    positions = Positions(micro.DENOISER, prepared.level1.camera, GRID)
-    micro.awake(model.level1)
-    for recompute in (False, True):
-        model.level1.recompute = branch.recompute = recompute
-        with Largest() as largest:
-            known = prepared.level1
-            keys = video_keys(
-                model.shared, micro.DENOISER, known.camera, features=features, grid=GRID
-            )
-            adapted = branch.adapted(features.tensors, GRID)
-            residuals = branch(model.level1, state, t, known, adapted=adapted, positions=positions)
-            out = model.level1(
-                state, t, known, residuals=residuals, video=keys, positions=positions
-            )
-            out.square().sum().backward()
-        assert 0 < largest.count < scores / 4
 
 
 def test_the_encoder_and_the_rgb_head():
@@ -268,19 +211,6 @@ def test_the_encoder_and_the_rgb_head():
     with Largest() as largest:
         head(features, grid).sum().backward()
     assert 0 < largest.count < micro.CONFIG.rgb.heads * (grid[0] * grid[1]) ** 2 / 4
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(importlib.util.find_spec("diffusers") is None, reason="needs diffusers")
-def test_the_video_prior():
-    import tiny_wan as tiny
-
-    prior = tiny.prior()
-    images = torch.rand(1, VIEWS, 3, 768, 768)
-    tokens = VIEWS * 48 * 48
-    with Largest() as largest:
-        prior.features(images, torch.ones(1, VIEWS, 1, 768, 768), 2)
-    assert 0 < largest.count < 2 * tokens * tokens / 4
 
 
 # Where no fused kernel applies.
@@ -311,27 +241,6 @@ def test_chunks_of_queries_give_the_same_within_their_bound(monkeypatch, dtype):
     torch.testing.assert_close(again, gradients, rtol=near, atol=near)
 
 
-@pytest.mark.parametrize(
-    ("capability", "dtype", "fused"),
-    [
-        ((7, 5), torch.float16, True),
-        ((7, 5), torch.float32, True),
-        ((7, 5), torch.bfloat16, False),
-        ((8, 0), torch.bfloat16, True),
-        ((9, 0), torch.float64, False),
-    ],
-)
-def test_what_cards_have_fused_kernels_for(monkeypatch, capability, dtype, fused):
-    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: capability)
-
-    class Query:
-        device = torch.device("cuda")
-
-    query: Any = Query()
-    query.dtype = dtype
-    assert compute._is_fused(query) is fused
-
-
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
 
 
@@ -355,10 +264,3 @@ def test_it_is_the_softmax_of_the_products(size, dtype, device):
     assert out.dtype == dtype and out.shape == q.shape
     tolerance = 1e-6 if dtype == torch.float32 else 2e-2
     torch.testing.assert_close(out.double(), spelt_out(q, k, v), rtol=tolerance, atol=tolerance)
-
-
-def test_ten_thousand_tokens_need_no_matrix_of_scores():
-    # 16 heads of 10368 x 10368 scores would be 6.9 GB.
-    q = heads(1, 1, 10368, 8, dtype=torch.float32).expand(-1, 16, -1, -1)[:, :, :64]
-    k = heads(1, 1, 10368, 8, dtype=torch.float32).expand(-1, 16, -1, -1)
-    torch.testing.assert_close(attend(q, k, k).double(), spelt_out(q, k, k), rtol=1e-5, atol=1e-5)

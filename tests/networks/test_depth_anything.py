@@ -152,25 +152,6 @@ def test_homographies_are_opencvs():
     assert share > 1e-6
 
 
-def test_homographies_of_noisy_points_are_the_singular_vector():
-    rng = np.random.default_rng(6)
-    (x, y), (u, v) = rng.uniform(-1, 1, (2, 2, 40))
-    weight = rng.uniform(0.1, 3, 40)
-    zero, one, root = np.zeros(40), np.ones(40), np.sqrt(weight)
-    rows = np.concatenate(
-        [
-            (np.stack([-x, -y, -one, zero, zero, zero, x * u, y * u, u]) * root).T,
-            (np.stack([zero, zero, zero, -x, -y, -one, x * v, y * v, v]) * root).T,
-        ]
-    )
-    expected = np.linalg.svd(rows)[2][-1].reshape(3, 3)
-    arrays = (np.stack([x, y], 1), np.stack([u, v], 1), weight)
-    found, _ = ray_fits.fit_homography(*map(torch.from_numpy, arrays))
-    np.testing.assert_allclose(
-        found / found.norm() * np.sign(float(found[2, 2]) * expected[2, 2]), expected, atol=1e-9
-    )
-
-
 @pytest.mark.parametrize("upper", [True, False])
 def test_factors_multiply_to_the_matrix(upper):
     generator = torch.Generator().manual_seed(7)

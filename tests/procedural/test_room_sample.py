@@ -118,20 +118,6 @@ def test_targets_lead_away_from_what_the_context_sees(scene, frames, sample):
     assert seen[-1] < 0.4 * seen[0]
 
 
-def test_pictures_look_like_photographs(frames: list[Frame]) -> None:
-    values = np.stack([frame.rgb for frame in frames])
-    assert 70 < values.mean() < 170
-    assert values.std() > 30
-    assert (values == 255).all(-1).mean() < 0.02
-    assert (values == 0).all(-1).mean() < 0.02
-
-
-def test_another_seed_is_another_room() -> None:
-    one, other = furnished_room(1).geometry, furnished_room(2).geometry
-    assert np.abs(one.rooms - other.rooms).max() > 0.05
-    assert len(one.kind) != len(other.kind)
-
-
 @pytest.mark.parametrize("seed", range(6))
 def test_cameras_stand_clear_of_furniture(seed: int) -> None:
     geometry = furnished_room(seed).geometry

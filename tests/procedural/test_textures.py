@@ -10,15 +10,11 @@ from gvtools.procedural.textures import (
     LONGEST,
     PHOTOGRAPHS,
     SIDE,
-    color,
     level_starts,
-    noise,
-    pattern,
     photograph,
     photograph_names,
     picture,
     stack_levels,
-    texture,
 )
 
 
@@ -49,35 +45,12 @@ def test_photographs_of_installed_wheels_alone() -> None:
         photograph_names("test")
 
 
-def test_textures_follow_from_their_generator() -> None:
-    names = photograph_names("train")
-    first, again = (texture(np.random.default_rng([3, 1]), names) for _ in range(2))
-    other = texture(np.random.default_rng([3, 2]), names)
-    assert np.array_equal(first, again) and not np.array_equal(first, other)
-
-
 def test_pictures_are_neither_black_nor_blank() -> None:
     rng = np.random.default_rng(0)
     images = [picture(rng, photograph_names("train")) for _ in range(60)]
     assert all(image.shape == (SIDE, SIDE, 3) and image.dtype == np.uint8 for image in images)
     assert np.median([image.mean() for image in images]) > 60
     assert np.mean([image.std() > 8 for image in images]) > 0.9
-
-
-def test_patterns_are_varied() -> None:
-    rng = np.random.default_rng(0)
-    images = [pattern(rng, 64) for _ in range(80)]
-    assert all(image.shape == (64, 64, 3) and image.dtype == np.uint8 for image in images)
-    spread = np.array([image.std((0, 1)).max() for image in images])
-    # Plain paint is wanted as well as strong contrast.
-    assert (spread < 6).any() and (spread > 30).any()
-    colors = np.array([color(rng) for _ in range(500)])
-    assert colors.min() >= 0 and colors.max() <= 1 and (colors.std(0) > 0.15).all()
-
-
-def test_noise_fills_its_range() -> None:
-    field = noise(np.random.default_rng(1), 32, coarsest=4)
-    assert field.shape == (32, 32) and field.min() == 0 and field.max() == pytest.approx(1)
 
 
 def test_levels_are_block_means_in_linear_light() -> None:

@@ -171,15 +171,6 @@ def test_shards_give_the_samples_of_what_they_were_made_of(home):
         assert equal(direct.batch(part), sharded.batch(part))
 
 
-@pytest.mark.slow
-def test_two_workers_make_the_batches_and_counts_of_none(home):
-    entries = (str(home / "shards"), str(home / "kitchen"))
-    plain = [samples(*entries).batch(part) for part in PARTS]
-    assert len({note for batch in plain for note in batch.notes}) >= 2
-    with_workers = samples(*entries, more=("data.workers=2",)).batches(PARTS)
-    assert all(equal(made, batch) for made, batch in zip(with_workers, plain, strict=True))
-
-
 def test_a_damaged_file_costs_its_windows_alone_and_is_counted(home, tmp_path):
     folder = write_scan(tmp_path / "flawed", views=12)
     depth = folder / "frame-000006.depth.png"
@@ -440,15 +431,6 @@ def test_a_source_without_any_valid_sample_leaves_its_place_to_others():
     alone = mixture({"broken": 1, "unused": 0}, broken=never)
     with pytest.raises(DegenerateError, match=r"^sample 3: 10 draws .* of broken: broken 3 9$"):
         alone.sample(3)
-
-
-def test_other_errors_are_no_invalid_samples():
-    class Failing(Numbered):
-        def sample(self, index, attempt=0):
-            raise ProjectError("the disk is gone")
-
-    with pytest.raises(ProjectError, match="disk"):
-        Mixture((SampleSource("a", 1, Failing()),)).sample(0)
 
 
 def test_geometry_falls_back_and_every_fall_is_noted():

@@ -176,14 +176,6 @@ def test_a_batch_that_is_bad_in_one_process_is_skipped_by_both(start, tmp_path):
     same_record(tmp_path / "two" / "denoiser", tmp_path / "one" / "denoiser")
 
 
-def test_the_encoders_stage_is_shared_out_as_well(tmp_path):
-    more = sets("encoder.optimizer.steps=2", "encoder.statistics=1")
-    assert main(arguments("micro", "encoder", tmp_path / "one", *more, "--quiet")) == 0
-    train_on_two("micro", "encoder", tmp_path / "two", *more, *SHARDED)
-    same_record(tmp_path / "two" / "encoder", tmp_path / "one" / "encoder")
-    same_weights(tmp_path / "two" / "encoder", tmp_path / "one" / "encoder")
-
-
 def test_teacher_and_video_prior_are_shared_out_as_well(tmp_path):
     pytest.importorskip("diffusers", reason="the extra wan is not installed")
     import published_folder
@@ -223,15 +215,6 @@ def test_teacher_and_video_prior_are_shared_out_as_well(tmp_path):
         same_gradients(tmp_path / "two" / stage, tmp_path / "one" / stage, most)
         assert (tmp_path / "two" / stage / "weights" / "video" / "vae").is_dir()
         assert from_pretrained(tmp_path / "two" / stage / "weights").video is not None
-
-
-def test_layers_that_are_computed_again_are_put_together_again(start, tmp_path):
-    more = ["--init", str(start), "--sheets", "0", "--until", "1"]
-    more += ["--set", "denoiser.optimizer.batch=8", "--set", "denoiser.optimizer.accumulate=2"]
-    assert main(arguments("micro", "denoiser", tmp_path / "one", *more, "--quiet")) == 0
-    again = sets("denoiser.optimizer.recompute=true")
-    train_on_two("micro", "denoiser", tmp_path / "two", *more, *SHARDED, *again)
-    same_gradients(tmp_path / "two" / "denoiser", tmp_path / "one" / "denoiser", 1e-4)
 
 
 THREADS = Path("/proc/self/task")

@@ -1,11 +1,8 @@
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import shutil
-import subprocess
-import sys
 from itertools import pairwise
 from pathlib import Path
 
@@ -13,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from training_runs import ROOT, on_two, sets
+from training_runs import on_two, sets
 
 from gvtools.completers.geoverse import from_pretrained
 from gvtools.training import loop
@@ -133,16 +130,6 @@ def test_a_head_of_weight_0_stays_as_it_is(trained, tmp_path):
     assert set(read_log(tmp_path / "heads")[-1]).isdisjoint({"rgb", "depth"})
 
 
-@pytest.mark.slow
-def test_heads_lower_the_error_of_what_inference_composes(trained, tmp_path):
-    shutil.copytree(trained / "reflow", tmp_path / "reflow")
-    more = sets("heads.ray=0", "heads.optimizer.batch=8", "heads.optimizer.steps=30")
-    assert train(tmp_path, "heads", *more) == 0
-    records = read_log(tmp_path / "heads")
-    first, last = records[0], records[-1]
-    assert last["rgb"] < first["rgb"] and last["depth"] < first["depth"]
-
-
 def test_a_training_without_that_stage_says_so(tmp_path, capsys):
     out = str(tmp_path / "base")
     assert main(["train", "base", "--rooms", "--stage", "heads", "--out", out]) == 2
@@ -166,26 +153,6 @@ def test_a_later_stage_resumes_exactly_as_well(trained, tmp_path, before, stage)
     assert not (tmp_path / stage / "weights").exists()
     assert train(tmp_path, stage, *steps(stage, count), "--resume") == 0
     assert not moved(trained / stage, tmp_path / stage)
-
-
-@pytest.mark.slow
-def test_a_killed_training_goes_on_to_the_uninterrupted_one(tmp_path):
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-
-    def started(out: str, *more: str) -> subprocess.Popen[bytes]:
-        command = [sys.executable, "-m", "pipelines.cli", "train", "micro", "--stage", "encoder"]
-        command += ["--out", str(tmp_path / out), *SHORT, *steps("encoder", 24), *more]
-        return subprocess.Popen(command, cwd=ROOT, env=environment)
-
-    assert started("whole").wait() == 0
-    assert started("killed", "--until", "4").wait() == 0
-    begun = started("killed", "--resume")
-    with contextlib.suppress(subprocess.TimeoutExpired):
-        begun.wait(timeout=8)
-    begun.kill()
-    begun.wait()
-    assert started("killed", "--resume").wait() == 0
-    assert not moved(tmp_path / "whole" / "encoder", tmp_path / "killed" / "encoder")
 
 
 def test_finished_stages_are_left_as_they_are(trained, tmp_path, capsys):
