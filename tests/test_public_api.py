@@ -24,7 +24,7 @@ DOCTESTED = (
     "gvtools.appearance.splat.splat",
     "gvtools.splats",
     "gvtools.cameras",
-    "gvtools.capture.matching",
+    "gvtools.capture.mapping",
     "gvtools.completers.base",
     "gvtools.errors",
     "gvtools.evaluation.splits",

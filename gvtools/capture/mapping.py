@@ -1,5 +1,8 @@
 """Cameras from photographs: features, matching and mapping by pycolmap.
 
+Features are COLMAP's SIFT, or learned ones that LightGlue matches; where matching all pictures with
+all would take too long, pairs that look alike are.
+
 Global mapping (GLOMAP, Pan et al. 2024) solves for all cameras at once. It can end in a model whose
 parts have different scales, with every picture registered and small reprojection errors (the fox of
 instant-ngp: camera centres wrong by 35 % of their extent, reprojection errors of 0.5 pixels). The
@@ -11,22 +14,46 @@ is kept.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
 
-from gvtools.capture.matching import MappingTask, flat_pairs, match_pictures, only_turned, verified
 from gvtools.errors import ProjectError
-from gvtools.features import quiet_colmap
-from gvtools.poses.colmap import SEED, adjust, fix_cameras
+from gvtools.features import FeatureMatcher, Features, quiet_colmap, root_sift
+from gvtools.poses.colmap import SEED, adjust, extract_sift, fix_cameras, list_pairs, verification
+from gvtools.scenes.images import check_size, read_image, read_mask
 
 if TYPE_CHECKING:
     import pycolmap
 
+    from gvtools.capture.panoramas import FaceRig
+
+# Up to this many pictures, every pair is matched; fewer with LightGlue, which takes a second a pair
+# on a processor.
+EXHAUSTIVE, EXHAUSTIVE_LEARNED = 60, 30
+# A frame of a video is matched with this many after it, and with those 16, 32, 64 and 128 later.
+SEQUENTIAL_OVERLAP = 10
+# Learned features: the longer side that pictures are reduced to, pixels, that of the pictures
+# LightGlue's authors test with, and keypoints of a picture, of the highest score.
+LEARNED_SIDE, LEARNED_FEATURES = 1024, 1024
+# Lines about progress come after so many pictures or pairs.
+EVERY = 100
+# Partners that each picture gets where not all are matched with all; centres of the descriptor by
+# which they are found, features of a picture that it is made of, and rounds of k-means.
+NEAREST, WORDS, FEATURES, ROUNDS = 20, 32, 1000, 8
+# Focal lengths that are tried, in lengths of the longer side, and how far homographies may be from
+# rotations (Frobenius norm of R^T R - 1, the median of all pairs): 0.016 of a camera that turned,
+# 0.10 of one that moved by a quarter of the distance before something almost flat. Seen by a long
+# lens, a sideways walk is almost a rotation, too, but its miss is 1.4 of its motion (the norm of
+# R - 1), where a rotation's is noise: expected below SHARE, for motions above STILL at a focal
+# length of one side.
+FOCALS, TURNED, SHARE, STILL = np.geomspace(0.4, 20, 40), 0.04, 0.5, 0.01
 # If a smaller share of the verified matches became points of the global model, incremental mapping
 # is tried, too.
 ENOUGH = 0.9
@@ -44,7 +71,36 @@ LOST = 64.0
 # of a camera that only turned, 10 of a walk past something almost flat.
 STEEP = 5.0
 
+Say = Callable[[str], object]
 Pairs = Mapping[tuple[str, str], int]  # number of verified matches of pairs of pictures, by names
+
+
+@dataclass(frozen=True, eq=False)
+class MappingTask:
+    """Pictures whose cameras are to be found, and how."""
+
+    images: Path
+    # Names of the pictures that each camera took; they share its intrinsics.
+    cameras: Sequence[Sequence[str]]
+    work: Path  # a folder without files yet, for COLMAP's database and models
+    source: Path | None = None  # the user's folder for messages, if ``images`` holds copies
+    # The pictures follow a path in the order of their names, as frames of a video do; neighbours
+    # are then matched even if there are too many pictures to match all pairs.
+    in_order: bool = False
+    # Folder of masks as COLMAP has them, ``a.jpg.png`` for ``a.jpg``, black where no features are.
+    masks: Path | None = None
+    learned: FeatureMatcher | None = None  # finds and matches features; None takes COLMAP's SIFT
+    # Faces of panoramas, whose names ``cameras`` holds face by face; their intrinsics and relative
+    # rotations are fixed.
+    rigs: Sequence[FaceRig] = ()
+    # Initial parameters of OPENCV_FISHEYE as COLMAP writes them; "" for other lenses.
+    fisheye: str = ""
+    say: Say = lambda text: None
+
+    @property
+    def names(self) -> list[str]:
+        """Of all pictures."""
+        return [name for group in self.cameras for name in group]
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,3 +281,280 @@ def _settle(model: pycolmap.Reconstruction, *, refine: bool) -> None:
         adjust(model, options)
     pycolmap.ObservationManager(model).filter_all_points3D(LOST, 0.0)
     model.update_point_3d_errors()
+
+
+def match_pictures(task: MappingTask) -> tuple[Path, str]:
+    """Fill a database with features and verified matches; returns it, and how pairs were chosen."""
+    from gvtools.colmap import pycolmap
+
+    database, learned, rigs = task.work / "database.db", task.learned, task.rigs
+    given = {
+        rig.names(face)[0]: ("PINHOLE", face.target.params_to_string())
+        for rig in rigs
+        for face in rig.faces
+    }
+    if task.fisheye:
+        given = {group[0]: ("OPENCV_FISHEYE", task.fisheye) for group in task.cameras}
+    if learned is not None:
+        pycolmap.Database.open(database).close()
+    for group in task.cameras:
+        reader = pycolmap.ImageReaderOptions()
+        if group[0] in given:
+            reader.camera_model, reader.camera_params = given[group[0]]
+        if learned is None:
+            extract_sift(database, task.images, group, masks=task.masks, reader=reader)
+        else:
+            pycolmap.import_images(
+                database, task.images, pycolmap.CameraMode.SINGLE, image_names=list(group),
+                options=reader,
+            )  # fmt: skip
+    if rigs:
+        with pycolmap.Database.open(database) as opened:
+            pycolmap.apply_rig_config([rig.config() for rig in rigs], opened)
+    if learned is None:
+        return database, _match_sift(database, task)
+    features = learned_features(task.images, task.names, learned, masks=task.masks, say=task.say)
+    write_keypoints(database, features)
+    described = {name: found.descriptors for name, found in features.items()}
+    chosen, how = _choose_pairs(described, EXHAUSTIVE_LEARNED, in_order=task.in_order)
+    with pycolmap.Database.open(database) as opened:
+        stored = {image.name: image for image in opened.read_all_images()}
+        if rigs:
+            chosen = [(a, b) for a, b in chosen if stored[a].frame_id != stored[b].frame_id]
+        task.say(f"matching {len(chosen)} pairs")
+        for number, (first, second) in enumerate(chosen, start=1):
+            rows = learned.match(features[first], features[second]).astype(np.uint32)
+            opened.write_matches(stored[first].image_id, stored[second].image_id, rows)
+            if number % EVERY == 0:
+                task.say(f"{number} of {len(chosen)} pairs matched")
+    pycolmap.verify_matches(database, list_pairs(chosen, task.work), verification())
+    return database, how
+
+
+def _match_sift(database: Path, task: MappingTask) -> str:
+    """Match SIFT of pairs of pictures; returns in words how the pairs were chosen."""
+    from gvtools.colmap import pycolmap
+
+    options, count = pycolmap.FeatureMatchingOptions(), len(task.names)
+    options.skip_image_pairs_in_same_frame = bool(task.rigs)
+    if count <= EXHAUSTIVE:
+        task.say(f"matching all {count * (count - 1) // 2} pairs")
+        pycolmap.match_exhaustive(
+            database, matching_options=options, verification_options=verification()
+        )
+        return "all pairs"
+    pairs, how = _choose_pairs(sift_descriptors(database), EXHAUSTIVE, in_order=task.in_order)
+    task.say(f"matching {len(pairs)} pairs")
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.match_list_path = list_pairs(pairs, task.work)
+    pycolmap.match_image_pairs(
+        database, matching_options=options, pairing_options=pairing,
+        verification_options=verification(),
+    )  # fmt: skip
+    return how
+
+
+def _choose_pairs(
+    described: Mapping[str, NDArray[np.float32]], exhaustive: int, *, in_order: bool
+) -> tuple[list[tuple[str, str]], str]:
+    """The pairs of pictures to match, all of them up to ``exhaustive`` pictures, and why these."""
+    names = sorted(described)
+    if len(names) <= exhaustive:
+        return list(combinations(names, 2)), "all pairs"
+    pairs = set(similar_pairs(described))
+    how = f"each picture with the {len(pairs) * 2 // len(names)} most similar"
+    if in_order:
+        steps = {*range(1, SEQUENTIAL_OVERLAP + 1), *(2**k for k in range(4, 8))}
+        pairs |= {
+            (names[i], names[i + step])
+            for i in range(len(names))
+            for step in steps
+            if i + step < len(names)
+        }
+        how = f"neighbours in time, and {how}"
+    return sorted(pairs), how
+
+
+def similar_pairs(
+    described: Mapping[str, NDArray[np.float32]], *, nearest: int = NEAREST
+) -> list[tuple[str, str]]:
+    """Pairs of pictures whose features are alike, by a descriptor learnt from these pictures.
+
+    Each picture is described by VLAD (Jegou et al. 2010): the sum of its features' differences from
+    the nearest of WORDS centres, which k-means finds among all of them. Each gets ``nearest``
+    partners, and may be chosen by more; ``described`` holds (N, D) unit descriptors by name.
+    """
+    import cv2
+
+    # In the order of names, so that pairs are chosen alike every time.
+    names = sorted(name for name, rows in described.items() if len(rows))
+    if len(names) < 2:
+        return []
+    features = [
+        rows[np.linspace(0, len(rows) - 1, min(FEATURES, len(rows))).astype(int)]
+        for rows in (described[name] for name in names)
+    ]
+    rng = np.random.default_rng(0)
+    sample = np.concatenate([rows[rng.permutation(len(rows))[:200]] for rows in features])
+    stop = (cv2.TERM_CRITERIA_MAX_ITER, ROUNDS, 0.0)
+    cv2.setRNGSeed(0)
+    words = min(WORDS, len(sample))
+    labels = np.zeros((len(sample), 1), np.int32)
+    _, _, centres = cv2.kmeans(sample, words, labels, stop, 1, cv2.KMEANS_PP_CENTERS)
+    images = np.stack([_vlad(rows, np.asarray(centres, np.float32)) for rows in features])
+    alike = images @ images.T
+    np.fill_diagonal(alike, -np.inf)
+    pairs = set()
+    for row, values in enumerate(alike):
+        for column in np.argsort(-values)[: min(nearest, len(names) - 1)]:
+            pairs.add((min(row, int(column)), max(row, int(column))))
+    return sorted((names[a], names[b]) for a, b in pairs)
+
+
+def sift_descriptors(database: Path) -> dict[str, NDArray[np.float32]]:
+    """(N, 128) RootSIFT descriptors of each picture in COLMAP's database."""
+    from gvtools.colmap import pycolmap
+
+    described = {}
+    with pycolmap.Database.open(database) as opened:
+        for image in opened.read_all_images():
+            rows = np.asarray(opened.read_descriptors(image.image_id).data, np.float32)
+            rows = rows.reshape(-1, 128)
+            rows = rows[np.linspace(0, len(rows) - 1, min(FEATURES, len(rows))).astype(int)]
+            described[image.name] = root_sift(rows)
+    return described
+
+
+def _vlad(features: NDArray[np.float32], centres: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(W * D,) unit descriptor of (N, D) features by (W, D) centres."""
+    nearest = np.argmin((centres**2).sum(1) - 2 * features @ centres.T, axis=1)
+    sums = np.zeros_like(centres)
+    np.add.at(sums, nearest, features - centres[nearest])
+    sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-9)
+    flat = sums.ravel()
+    return flat / max(float(np.linalg.norm(flat)), 1e-9)
+
+
+def learned_features(
+    images: Path,
+    names: Sequence[str],
+    matcher: FeatureMatcher,
+    *,
+    masks: Path | None = None,
+    say: Say = lambda text: None,
+) -> dict[str, Features]:
+    """Features of pictures, in the pixels of the pictures as they are stored."""
+    found = {}
+    for number, name in enumerate(names, start=1):
+        features = _of_picture(read_image(images / name).rgb, matcher)
+        mask = None if masks is None else masks / f"{name}.png"
+        if mask is not None and mask.is_file():
+            usable = read_mask(mask)
+            check_size(usable.shape[::-1], (features.width, features.height), path=mask)
+            x, y = np.floor(features.xy).astype(int).T
+            features = features[usable[y, x]]
+        found[name] = features
+        if number % EVERY == 0:
+            say(f"features of {number} of {len(names)} pictures")
+    return found
+
+
+def _of_picture(rgb: np.ndarray, matcher: FeatureMatcher) -> Features:
+    height, width = rgb.shape[:2]
+    scale = min(1.0, LEARNED_SIDE / max(height, width))
+    small = (max(1, round(width * scale)), max(1, round(height * scale)))
+    if small != (width, height):
+        rgb = np.asarray(Image.fromarray(rgb).resize(small, Image.Resampling.LANCZOS))
+    features = matcher.extract(np.ascontiguousarray(rgb))
+    # Pixels' centres are at +0.5 in both pictures, so that positions scale.
+    xy = features.xy * (np.array([width, height]) / small)
+    # A learned position may lie half a pixel outside.
+    return Features(
+        np.clip(xy, 0.5, [width - 0.5, height - 0.5]), features.descriptors, width, height
+    )
+
+
+def write_keypoints(database: Path, features: Mapping[str, Features]) -> None:
+    """Write keypoints of all of the database's pictures, by their names."""
+    from gvtools.colmap import pycolmap
+
+    with pycolmap.Database.open(database) as opened:
+        for image in opened.read_all_images():
+            opened.write_keypoints(image.image_id, features[image.name].xy.astype(np.float32))
+
+
+def verified(database: Path) -> dict[tuple[str, str], int]:
+    """Pairs of pictures that overlap, with the number of their verified matches."""
+    from gvtools.colmap import pycolmap
+
+    with pycolmap.Database.open(database) as opened:
+        names = {image.image_id: image.name for image in opened.read_all_images()}
+        numbers, counts = opened.read_two_view_geometry_num_inliers()
+    found = {}
+    for number, count in zip(numbers, counts, strict=True):
+        if count > 0:
+            a, b = pycolmap.pair_id_to_image_pair(number)
+            found[names[a], names[b]] = int(count)
+    return found
+
+
+def flat_pairs(database: Path) -> list[tuple[NDArray[np.float64], tuple[int, int]]]:
+    """Homographies, and sizes of the pictures, where one explains every pair; else empty.
+
+    Two-view geometry then has no depth to go by: the scene is flat, or the camera only turned.
+    """
+    from gvtools.colmap import pycolmap
+
+    kinds = pycolmap.TwoViewGeometryConfiguration
+    flat = (kinds.PLANAR, kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC)
+    with pycolmap.Database.open(database) as opened:
+        numbers, geometries = opened.read_two_view_geometries()
+        sizes = {}
+        for image in opened.read_all_images():
+            camera = opened.read_camera(image.camera_id)
+            sizes[image.image_id] = (camera.width, camera.height)
+    found = []
+    for number, geometry in zip(numbers, geometries, strict=True):
+        if not len(geometry.inlier_matches):
+            continue
+        if geometry.config not in flat or geometry.H is None:
+            return []
+        found.append((geometry.H, sizes[pycolmap.pair_id_to_image_pair(number)[0]]))
+    return found
+
+
+def only_turned(pairs: Sequence[tuple[NDArray[np.float64], tuple[int, int]]]) -> bool:
+    """Whether homographies are those of a camera that turns on the spot, at some focal length.
+
+    Such a homography is K R K^-1 (R. Hartley and A. Zisserman, Multiple View Geometry, 8.4). Each
+    takes pixels to pixels, and comes with the size of the pictures.
+
+    >>> turned_by_2 = np.array([[0.999391, 0, 20.94], [0, 1, 0], [-5.8166e-5, 0, 0.999391]])
+    >>> K = np.array([[1.0, 0, 320], [0, 1, 240], [0, 0, 1]])
+    >>> only_turned([(K @ turned_by_2 @ np.linalg.inv(K), (640, 480))])
+    True
+    >>> only_turned([(np.array([[1.0, 0, 32], [0, 1, 0], [0, 0, 1]]), (640, 480))])  # sideways
+    False
+    """
+    found = []
+    for H, (width, height) in pairs:
+        centred = np.array([[1.0, 0, width / 2], [0, 1, height / 2], [0, 0, 1]])
+        moved = np.linalg.inv(centred) @ H @ centred
+        scale = np.cbrt(np.linalg.det(moved))
+        if scale:
+            side = max(width, height)
+            still = _from_rotation(moved / scale, side)[1] < STILL
+            tried = [_from_rotation(moved / scale, focal * side) for focal in FOCALS]
+            found.append([(miss, 0.0 if still else miss / motion) for miss, motion in tried])
+    if not found:
+        return False
+    misses, shares = np.median(found, axis=0).T
+    return bool(((misses < TURNED) & (shares < SHARE)).any())
+
+
+def _from_rotation(H: NDArray[np.float64], focal: float) -> tuple[float, float]:
+    """How far a homography is from a rotation, and how far from the identity (Frobenius norms)."""
+    K = np.diag([focal, focal, 1.0])
+    turn = np.linalg.inv(K) @ H @ K
+    miss = float(np.linalg.norm(turn.T @ turn - np.eye(3)))
+    return miss, max(float(np.linalg.norm(turn - np.eye(3))), 1e-9)

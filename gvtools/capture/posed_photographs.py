@@ -17,10 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras, Float64
-from gvtools.capture.mapping import shared_points
-from gvtools.capture.matching import Say
+from gvtools.capture.mapping import Say, shared_points
 from gvtools.capture.photographs import CapturedPhotograph, copy_upright, find_photographs
-from gvtools.capture.placement import place
 from gvtools.capture.predictions import Predictions, read_predictions
 from gvtools.capture.project import (
     IMAGES,
@@ -28,6 +26,7 @@ from gvtools.capture.project import (
     REPORT,
     CaptureReport,
     camera_rows,
+    place,
     replaced_folder,
 )
 from gvtools.errors import OptionError, ProjectError

@@ -2,28 +2,45 @@
 
 VGGT (``predictions.npz``, ``sparse``), Depth Anything 3 (``exports/npz``, ``mini_npz``, COLMAP),
 MapAnything (``predictions.npz``, ``sparse``), DUSt3R and MASt3R (poses, focal lengths, ``pts3d``),
-Pi3 (``predictions.npz``: points alone tell the focal lengths), CUT3R (files of each picture). For
-scenes of DUSt3R and MASt3R in .glb see ``drawn_cameras``.
+Pi3 (``predictions.npz``: points alone tell the focal lengths), CUT3R (files of each picture), and
+scenes of DUSt3R and MASt3R in .glb.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.cameras import Cameras, invert_rigid, rigid_transform
-from gvtools.capture.drawn_cameras import read_drawn_cameras
+from gvtools.cameras import (
+    Cameras,
+    Float64,
+    concatenate,
+    invert_rigid,
+    rigid_poses,
+    rigid_transform,
+)
 from gvtools.errors import MemoryFileError, ProjectError, ShapeError
+from gvtools.glb import drawn_nodes, glb_numbers, split_glb
 from gvtools.scenes.colmap_model import find_model, load_model
 from gvtools.scenes.images import read_image
 from gvtools.scenes.matching import named
 from gvtools.scenes.scene import Finding
-from gvtools.untrusted import archive, load_array, load_arrays, reading
+from gvtools.untrusted import (
+    PIXEL_BYTES,
+    PIXEL_RATIO,
+    archive,
+    load_array,
+    load_arrays,
+    open_picture,
+    read_bytes,
+    reading,
+)
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -40,6 +57,12 @@ PICTURES = ("images", "image", "imgs", "img_no_norm")
 EVERY = {*FROM_WORLD, *TO_WORLD, *INTRINSICS, *FOCALS, *DEPTH, *POINTS, *SURE, *PICTURES}
 # Points that are kept, of those no less certain than the median.
 MOST_POINTS = 50_000
+# A drawn camera's sides agree to this share: what is drawn is in float32.
+EXACT = 1e-3
+# Of a drawn point.
+LEAST_BYTES = 12
+# A point is one of a picture's pixels if its colour differs by no more [grey levels].
+SAME = 4
 EXPECTED = (
     "expected poses (extrinsics, extrinsic, camera_poses, cam2world) and intrinsics in .npz or "
     ".npy, or a COLMAP model, as VGGT, Depth Anything 3, MapAnything, DUSt3R, MASt3R, Pi3 or CUT3R "
@@ -61,8 +84,8 @@ class Predictions:
     pictures: NDArray[np.uint8] | None  # (V, h, w, 3) what the network saw
     stretched: bool  # how photographs became its pictures, where it shows none: else cut
     view: NDArray[np.int64]  # (M,) the camera of each point
-    xy: NDArray[np.float64]  # (M, 2) where that sees it [px of the network's picture]
-    points: NDArray[np.float64]  # (M,) z-depth in that camera, or (M, 3) in the world
+    xy: Float64  # (M, 2) where that sees it [px of the network's picture]
+    points: Float64  # (M,) z-depth in that camera, or (M, 3) in the world
     findings: tuple[Finding, ...] = ()
 
 
@@ -73,7 +96,7 @@ def read_predictions(path: Path) -> Predictions:
         return _from_colmap(model)
     with reading(f"--poses {path}", EXPECTED, also=(ShapeError, MemoryFileError)):
         if path.suffix.lower() == ".glb" and path.is_file():
-            cameras, pictures, seen = read_drawn_cameras(path, most=MOST_POINTS)
+            cameras, pictures, seen = _drawn_cameras(path)
             return Predictions(cameras, False, pictures, False, *seen)
         return _from_arrays(_fullest(path))
 
@@ -179,7 +202,7 @@ def _from_arrays(arrays: Arrays) -> Predictions:
     return Predictions(cameras, False, shown, stretched, *seen)
 
 
-def _focal_lengths(world: NDArray[Any], poses: NDArray[np.float64]) -> NDArray[np.float64]:
+def _focal_lengths(world: NDArray[Any], poses: Float64) -> Float64:
     """(V, 2) by which cameras with principal points in the middle see points at their pixels."""
     local = np.einsum("vij,vhwj->vhwi", poses[:, :3, :3], world) + poses[:, None, None, :3, 3]
     y, x = np.indices(world.shape[1:3]) + 0.5
@@ -193,7 +216,7 @@ def _focal_lengths(world: NDArray[Any], poses: NDArray[np.float64]) -> NDArray[n
 
 def sample_points(
     values: NDArray[Any] | None, sure: NDArray[Any] | None
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[NDArray[np.int64], Float64, Float64]:
     """Of the more certain pixels of depth or points: camera, place, and value."""
     if values is None:
         return np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0)
@@ -239,3 +262,81 @@ def _from_colmap(folder: Path) -> Predictions:
     with np.errstate(divide="ignore", invalid="ignore"):
         xy = np.einsum("mij,mj->mi", cameras.K[view], local / local[:, 2:])[:, :2]
     return Predictions(cameras, True, None, False, view, xy, points, loaded.findings)
+
+
+def _drawn_cameras(
+    path: Path,
+) -> tuple[Cameras, NDArray[np.uint8], tuple[NDArray[np.int64], Float64, Float64]]:
+    """V cameras, their (V, h, w, 3) pictures, and of MOST_POINTS points view, place and position.
+
+    The demos of DUSt3R and MASt3R draw each as a quad that shows the network's picture, and then a
+    pyramid from its corners to the optical centre. They tell pose and focal length; the principal
+    point is the middle of the picture. ValueError where none are drawn with their pictures.
+    """
+    tree, body = split_glb(read_bytes(path))
+    shapes: list[tuple[dict[str, Any], Float64]] = []
+    count = 0
+    for node, matrix in drawn_nodes(tree):
+        for part in tree["meshes"][node["mesh"]]["primitives"] if "mesh" in node else ():
+            local = glb_numbers(tree, body, part["attributes"]["POSITION"]).astype(np.float64)
+            shapes.append((part, local @ matrix[:3, :3].T + matrix[:3, 3]))
+            count += len(local)
+            if count * LEAST_BYTES > len(body):
+                raise ValueError("nodes that draw a mesh several times")
+    drawn, pixels = list[tuple[Cameras, NDArray[np.uint8]]](), 0
+    for quad, pyramid in pairwise(shapes):
+        if "TEXCOORD_0" in quad[0]["attributes"] and len(quad[1]) == 4:
+            drawn.append(_camera(quad, pyramid[1], tree=tree, body=body))
+            pixels += drawn[-1][1].size
+            if pixels > PIXEL_BYTES + PIXEL_RATIO * len(body):
+                raise ValueError(f"pictures of {pixels} bytes in {len(body)}")
+    if not drawn:
+        raise ValueError("a scene to look at, in which no cameras are drawn with their pictures")
+    cameras = concatenate([camera for camera, _ in drawn])
+    pictures = np.stack([picture for _, picture in drawn])
+    part, points = shapes[0]
+    step = max(1, -(-len(points) // MOST_POINTS))
+    colored = part["attributes"].get("COLOR_0")
+    colors = np.zeros((0, 3)) if colored is None else 255 * glb_numbers(tree, body, colored)[::step]
+    points = points[::step][: len(colors)]
+    view, xy = np.full(len(points), -1), np.zeros((len(points), 2))
+    for row, (camera, picture) in enumerate(drawn):
+        (place,), (z,) = camera.project(points)
+        # Whether pixels' centres are at 0 or at 0.5.
+        x, y = np.floor(place + 0.25).T
+        seen = (z > 0) & (view < 0) & (x >= 0) & (y >= 0)
+        seen &= (x < picture.shape[1]) & (y < picture.shape[0])
+        shown = picture[y[seen].astype(int), x[seen].astype(int)]
+        seen[seen] = np.abs(shown - colors[seen, :3]).max(axis=1) <= SAME
+        view[seen], xy[seen] = row, place[seen]
+    return cameras, pictures, (view[view >= 0], xy[view >= 0], points[view >= 0])
+
+
+def _camera(
+    quad: tuple[dict[str, Any], Float64], pyramid: Float64, *, tree: dict[str, Any], body: bytes
+) -> tuple[Cameras, NDArray[np.uint8]]:
+    """A drawn camera, and its picture."""
+    part, corners = quad
+    texture = tree["materials"][part["material"]]["pbrMetallicRoughness"]["baseColorTexture"]
+    image = tree["images"][tree["textures"][texture["index"]]["source"]]
+    view = tree["bufferViews"][image["bufferView"]]
+    start = view.get("byteOffset", 0)
+    with open_picture(body[start : start + view["byteLength"]]) as opened:
+        picture = np.asarray(opened.convert("RGB"))
+    height, width = picture.shape[:2]
+    # Texture coordinates go right and down, from 0 to 1.
+    uv = glb_numbers(tree, body, part["attributes"]["TEXCOORD_0"])
+    along, down, corner = np.linalg.lstsq(np.column_stack([uv, np.ones(4)]), corners, rcond=None)[0]
+    sides = np.linalg.norm([along, down], axis=1)
+    x, y = along / sides[0], down / sides[1]
+    ahead = np.cross(x, y)
+    middle = corner + (along + down) / 2
+    tip = pyramid[np.argmin((pyramid - middle) @ ahead)]
+    distance = (middle - tip) @ ahead
+    off = np.abs([x @ y, sides[0] / sides[1] * height / width - 1]).max()
+    if not (off < EXACT and np.linalg.norm(middle - tip - distance * ahead) < EXACT * sides[1]):
+        raise ValueError("a picture that no camera is drawn behind")
+    rotation = np.array([x, y, ahead])
+    pose = rigid_poses(rotation, -rotation @ tip)
+    focal = float(distance / sides[1] * height)
+    return Cameras.pinhole(width, height, focal=focal, cam_from_world=pose), picture

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gvtools.cameras import Cameras, Float64, rigid_poses
-from gvtools.capture.matching import Say
+from gvtools.capture.mapping import Say
 from gvtools.capture.project import REPORT, replaced_folder
 from gvtools.errors import ProjectError
 from gvtools.files import link_or_copy, write_json

@@ -207,7 +207,7 @@ def _matcher(features: str | None, weights: Sequence[Path] | None) -> LightGlueM
         return None
     import torch
 
-    from gvtools.capture.matching import LEARNED_FEATURES
+    from gvtools.capture.mapping import LEARNED_FEATURES
     from gvtools.features import LightGlueMatcher
 
     device = "cuda" if torch.cuda.is_available() else "cpu"

@@ -13,8 +13,7 @@ from command_line import refused
 from PIL import Image, ImageFilter
 from walls import walk
 
-from gvtools.capture.mapping import find_cameras
-from gvtools.capture.matching import MappingTask
+from gvtools.capture.mapping import MappingTask, find_cameras
 from gvtools.capture.photographs import complete_masks, copy_upright, find_photographs
 from gvtools.capture.project import capture_photographs
 from gvtools.errors import ProjectError

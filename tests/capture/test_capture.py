@@ -14,11 +14,9 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from gvtools.cameras import Cameras, invert_rigid
-from gvtools.capture.mapping import find_cameras
-from gvtools.capture.matching import MappingTask, sift_descriptors, similar_pairs
+from gvtools.capture.mapping import MappingTask, find_cameras, sift_descriptors, similar_pairs
 from gvtools.capture.photographs import copy_upright, find_photographs
-from gvtools.capture.placement import place
-from gvtools.capture.project import capture_photographs
+from gvtools.capture.project import capture_photographs, place
 from gvtools.errors import OptionError, ProjectError
 from gvtools.scenes.colmap_writer import build_reconstruction
 from gvtools.scenes.project import open_project

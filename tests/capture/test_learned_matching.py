@@ -12,9 +12,8 @@ from command_line import refused
 from PIL import Image
 from random_features import write_disk
 
-from gvtools.capture import matching
-from gvtools.capture.mapping import find_cameras
-from gvtools.capture.matching import MappingTask
+from gvtools.capture import mapping
+from gvtools.capture.mapping import MappingTask, find_cameras
 from gvtools.errors import CheckpointError, OptionError
 from gvtools.features import Features, LightGlueMatcher, SiftMatcher
 from gvtools.scenes.project import open_project
@@ -71,7 +70,7 @@ def test_keypoints_are_in_the_pictures_pixels(tmp_path: Path) -> None:
         def match(self, first: Features, second: Features) -> np.ndarray:
             return np.zeros((0, 2), np.int64)
 
-    side = 2 * matching.LEARNED_SIDE
+    side = 2 * mapping.LEARNED_SIDE
     pixels = np.zeros((side // 2, side, 3), np.uint8)
     pixels[200:202, 1000:1002] = 255
     Image.fromarray(pixels).save(tmp_path / "a.png")
@@ -79,16 +78,16 @@ def test_keypoints_are_in_the_pictures_pixels(tmp_path: Path) -> None:
     mask[:100] = 0
     (tmp_path / "masks").mkdir()
     Image.fromarray(mask).save(tmp_path / "masks/a.png.png")
-    whole = matching.learned_features(tmp_path, ["a.png"], Corner())["a.png"]
+    whole = mapping.learned_features(tmp_path, ["a.png"], Corner())["a.png"]
     assert (whole.width, whole.height) == (side, side // 2)
     assert np.allclose(whole.xy, [[1001, 201], [1, 1]])
-    masked = matching.learned_features(tmp_path, ["a.png"], Corner(), masks=tmp_path / "masks")
+    masked = mapping.learned_features(tmp_path, ["a.png"], Corner(), masks=tmp_path / "masks")
     assert np.allclose(masked["a.png"].xy, [[1001, 201]])
 
     database = tmp_path / "database.db"
     pycolmap.Database.open(database).close()
     pycolmap.import_images(database, tmp_path, image_names=["a.png"])
-    matching.write_keypoints(database, {"a.png": whole})
+    mapping.write_keypoints(database, {"a.png": whole})
     with pycolmap.Database.open(database) as opened:
         stored = opened.read_keypoints(opened.read_all_images()[0].image_id)
     assert np.allclose(np.asarray(stored)[:, :2], whole.xy)
