@@ -36,13 +36,6 @@ def reconstruct(*arguments: object) -> tuple[object, ...]:
     return ("reconstruct", *arguments, "--refine", "0", "--set", "refine.poses=false", *RUN)
 
 
-def test_version(capsys):
-    with pytest.raises(SystemExit) as stop:
-        main(["--version"])
-    assert stop.value.code == 0
-    assert capsys.readouterr().out.startswith("gvtools ")
-
-
 @pytest.mark.parametrize("command", list(COMMANDS))
 def test_every_help_starts_with_two_examples(command, capsys):
     with pytest.raises(SystemExit) as stop:

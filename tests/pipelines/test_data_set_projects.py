@@ -118,18 +118,6 @@ def test_a_run_is_resumed_and_evaluated(root, tmp_path, monkeypatch, capsys):
     assert load_run(out, project=moved).scenes[0].root == moved / "wall" / "seq-01"
 
 
-@pytest.mark.slow
-def test_a_run_is_refined_where_the_download_lies_now(root: Path, tmp_path: Path) -> None:
-    settings = {"voxel": 0.05, "refine.seconds": 0.0}
-    out = tmp_path / "run"
-    gvtools.reconstruct(ADDRESS, out, root=root, targets="interpolate:2", settings=settings)
-    moved = root.rename(tmp_path / "elsewhere")
-    words = ["--steps", "2", "--project", str(moved), "--quiet"]
-    assert main(["refine", str(out), *words]) == 0
-    run = load_run(out, project=moved)
-    assert run.complete and run.scenes[0].root == moved / "wall" / "seq-01"
-
-
 def test_targets_of_another_scene_of_the_download(root: Path, tmp_path: Path) -> None:
     run = gvtools.reconstruct(
         ADDRESS,

@@ -9,7 +9,7 @@ from PIL import Image, ImageSequence
 from tiny_scan import write_scan
 
 from pipelines.cli import main
-from pipelines.rendering import FilmRenderer, captioned, film_cameras, write_film
+from pipelines.rendering import FilmRenderer, film_cameras, write_film
 
 pytestmark = pytest.mark.usefixtures("unpainted")
 
@@ -82,13 +82,6 @@ def test_growth_draws_the_path_once_for_each_round(run: Path, tmp_path: Path) ->
     out = tmp_path / "growth.webp"
     assert main(["film", str(run), "--path", "interpolate:2", "--growth", "--out", str(out)]) == 0
     assert len(frames_of(out)) == 2 * len(_memory(run).rounds) > 2
-
-
-def test_a_caption_changes_the_corner_alone() -> None:
-    grey = np.full((96, 128, 3), 128, np.uint8)
-    drawn = captioned(grey, "round 1")
-    assert (drawn != grey).any()
-    assert (drawn[48:] == grey[48:]).all()
 
 
 @pytest.mark.parametrize(

@@ -62,20 +62,6 @@ def test_depth_unit_and_intrinsics_change_what_is_read(tmp_path):
     assert not depth_of(near).any()
 
 
-def test_registration_takes_the_matrix_of_a_file(tmp_path):
-    sevenscenes(tmp_path)
-    file = tmp_path / "moved.txt"
-    moved = np.eye(4)
-    moved[0, 3] = 0.2
-    np.savetxt(file, moved)
-    args = parsed("--depth-intrinsics", "90,90,47.5,35.5", "--color-from-depth", file)
-    depth = depth_of(args.open_scene(tmp_path))
-    plain = depth_of(parsed().open_scene(tmp_path))
-    # A wall at 2 m moves by 90 x 0.2 / 2 = 9 pixels: the left edge has none now.
-    assert not depth[:, :8].any()
-    np.testing.assert_allclose(depth[10:60, 12:90], plain[10:60, 3:81], rtol=1e-3)
-
-
 @pytest.mark.parametrize("text", ["1 2 3", "a b", "1 0 0 0\n0 1 0 0\n0 0 1 0"])
 def test_a_file_without_a_matrix(tmp_path, text):
     file = tmp_path / "moved.txt"

@@ -110,12 +110,6 @@ def test_the_list_is_readable(capsys: pytest.CaptureFixture[str], micro_file: Pa
     assert capsys.readouterr().out == ""
 
 
-def test_an_unknown_configuration_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    assert "'large'; expected base, gld, tiny or a config.json" in refused(
-        capsys, "weights", "list", "large"
-    )
-
-
 def test_a_folder_that_fits(capsys: pytest.CaptureFixture[str], own: Path, tmp_path: Path) -> None:
     assert weights("check", own) == 0
     text = capsys.readouterr().out

@@ -166,15 +166,6 @@ def test_pages_from_elsewhere_get_the_file_and_write_nothing(folder):
         assert not (folder / "paths").exists()
 
 
-def test_the_preview_leads_along_the_path(viewer):
-    client = with_keys(viewer)
-    viewer.path._frames.value = 6
-    viewer.path.preview(client)
-    expected = [viewer.frame.placement(one)[1] for one in viewer.path.cameras(6)]
-    np.testing.assert_allclose(client.seen, expected, atol=1e-12)
-    assert all(node.visible for node in viewer.path._nodes)
-
-
 def test_a_second_click_stops_the_preview(viewer):
     client = with_keys(viewer)
     plain = client.flush

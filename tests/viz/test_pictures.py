@@ -8,7 +8,6 @@ import pytest
 from matplotlib import colormaps
 from PIL import Image
 
-from gvtools.errors import ShapeError
 from viz.plots.canvas import SKY, rgb_of
 from viz.report.pictures import (
     ERROR_MAP,
@@ -65,11 +64,6 @@ def test_what_the_mask_leaves_out_is_grey():
     assert shown[0, 0, 0] > 200
 
 
-def test_pictures_of_two_sizes_are_refused():
-    with pytest.raises(ShapeError, match=r"\(4, 4, 3\).*\(4, 5, 3\)"):
-        error_map(np.zeros((4, 4, 3), np.uint8), np.zeros((4, 5, 3), np.uint8))
-
-
 def test_observed_generated_and_holes_have_a_colour_each():
     observed = np.array([[True, True, False, False]])
     supported = np.array([[True, True, True, False]])
@@ -97,10 +91,6 @@ def test_the_tiles_stand_in_order_and_hold_the_pictures():
     assert "#" + bytes(right.tolist()).hex() == SUPPORT["hole"]
     assert "50% observed" in tiles[2].alt
     assert "given" in tiles[0].alt
-
-
-def test_without_truth_and_context_no_empty_tiles():
-    assert [tile.label for tile in contact_row(pictures())] == ["hint", "validity", "completion"]
 
 
 COLOR = list(rgb_of(SKY))
@@ -149,14 +139,3 @@ def test_a_view_has_truth_pictures_and_error_maps_below_its_methods():
 def test_without_truth_there_are_no_error_maps():
     with_truth, without = (method_sheet([one]) for one in (view(), view(truth=None)))
     assert with_truth.shape[0] - without.shape[0] == HEIGHT + GAP
-
-
-def test_views_stand_below_each_other():
-    one, two = method_sheet([view()]), method_sheet([view(), view()])
-    assert two.shape[1] == one.shape[1]
-    assert one.shape[0] < two.shape[0] < 2 * one.shape[0]
-
-
-def test_no_view_is_refused():
-    with pytest.raises(ShapeError, match="no views"):
-        method_sheet([])

@@ -1,11 +1,9 @@
 from __future__ import annotations
 
-import io
 import json
 from types import SimpleNamespace
 from typing import Any
 
-import matplotlib
 import numpy as np
 import pytest
 from command_line import refused
@@ -138,13 +136,6 @@ def test_cameras_that_spread_in_no_plane_still_draw(centres):
     png(draw_trajectories(Trajectories(poses(centres), poses(centres))), dpi=40)
 
 
-def test_opposite_cameras_have_the_least_spread_as_up():
-    centres = np.array([[-2.0, 1, 0], [2, 1, 0], [0, -1, 0.01], [0, -1, 0]])
-    both = poses(centres)
-    both[::2, :3, :3] = np.diag([1, -1, -1])
-    assert abs(principal_axes(both, both)[2, 2]) == pytest.approx(1, abs=1e-3)
-
-
 def test_the_running_median_is_that_of_each_neighbourhood():
     values = RNG.normal(size=40)
     values[7] = np.nan
@@ -203,12 +194,6 @@ def test_a_front_over_time():
     assert axes.get_ylabel() == "PSNR, dB, whole pictures"
 
 
-def test_a_panel_that_is_not_there():
-    with pytest.raises(OptionError, match="stored, fates, coverage, time"):
-        draw_growth(rounds(), panels=["size"])
-    assert Image.open(io.BytesIO(png(draw_growth(rounds(), panels=["time"])))).size == (564, 408)
-
-
 @pytest.mark.parametrize("kind", ["growth", "coverage", "timing", "trajectories", "frames"])
 def test_each_figure_of_a_run_from_the_command_line(small_run, tmp_path, kind):
     assert main(["plot", kind, str(small_run), "--out", str(tmp_path / "f.png"), "--quiet"]) == 0
@@ -257,26 +242,6 @@ def test_the_bars_are_the_figures():
     np.testing.assert_allclose(before, [[1, 60], [2, 70]])
     np.testing.assert_allclose(after, [[1, 80], [2, 90]])
     assert sum(bar.get_height() for bar in times.patches) == pytest.approx(3 * 1.8)
-
-
-def test_a_picture_without_pyplot_state():
-    import matplotlib.pyplot as plt
-
-    before = plt.get_fignums(), matplotlib.get_backend()
-    buffer = io.BytesIO()
-    draw_growth(rounds(), title="room", panels=["time"]).savefig(buffer, format="png", dpi=50)
-    assert (plt.get_fignums(), matplotlib.get_backend()) == before
-    assert np.asarray(Image.open(buffer).convert("L")).std() > 20
-
-
-def test_one_round_without_anything_and_many_still_draw():
-    draw_growth(rounds(20), title="room").savefig(io.BytesIO(), format="png", dpi=40)
-    empty = rounds(1)
-    for key in ("voxels", "added", "merged", "observed", "generated"):
-        empty[0][key] = 0
-    empty[0]["seconds"] = {}
-    draw_growth(empty, title="room").savefig(io.BytesIO(), format="png", dpi=40)
-    assert "0 added" in growth_text(empty)
 
 
 def test_the_text_fits_and_tells_the_same():

@@ -158,13 +158,6 @@ def test_a_run_that_is_not_finished(own):
     assert "There is no metrics.json yet" in page.said
 
 
-def test_figures_of_another_state_are_left_out(own):
-    shutil.rmtree(own / "round_002")
-    report = collect(own)
-    assert report.measures.source is None
-    assert any("another state" in warning for warning in report.warnings)
-
-
 def test_a_project_that_is_gone(own, small_scan, capsys):
     record = json.loads((own / "run.json").read_text())
     record["project"] = str(own / "nowhere")

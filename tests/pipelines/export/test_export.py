@@ -69,16 +69,6 @@ def test_points_all_around_the_origin_are_thinned_to_few(limit):
     assert kept.edge < 12 and kept.group.max() == len(kept.rows) - 1
 
 
-def test_ply_is_what_plyfile_reads(memory, saved, tmp_path):
-    export_run(saved, "ply", tmp_path / "cloud.ply")
-    vertex = PlyData.read(tmp_path / "cloud.ply")["vertex"]
-    xyz = np.stack([vertex[axis] for axis in "xyz"], axis=1)
-    np.testing.assert_allclose(xyz, memory.positions, atol=1e-6)
-    assert vertex["generated"].sum() == memory.generated.sum()
-    export_run(saved, "ply", tmp_path / "cloud.ply", "--max-points", 200)
-    assert 0 < PlyData.read(tmp_path / "cloud.ply")["vertex"].count <= 200
-
-
 def test_an_earlier_round(memory, saved, tmp_path):
     export_run(saved, "ply", tmp_path / "cloud.ply", "--round", 1)
     vertex = PlyData.read(tmp_path / "cloud.ply")["vertex"]
@@ -113,25 +103,6 @@ def test_colmap_reads_the_model_back(scene, memory, saved, tmp_path):
     names = (tmp_path / "out/sparse/0/generated.txt").read_text().splitlines()[1:]
     assert [line.split("\t")[0] for line in names] == ["generated/view_4.png"]
     assert not (tmp_path / "out" / "images").exists()
-
-
-def test_each_track_element_is_an_observation_of_its_view(scene, memory, saved, tmp_path):
-    export_run(saved, "colmap", tmp_path / "out", "--max-points", 100_000)
-    model = pycolmap.Reconstruction(tmp_path / "out" / "sparse" / "0")
-    assert model.num_points3D() == memory.voxels
-    # The kept observation projects onto its own detection exactly.
-    own = 0
-    for point in list(model.points3D.values())[:200]:
-        errors = [
-            np.linalg.norm(
-                model.images[element.image_id].project_point(point.xyz)
-                - model.images[element.image_id].points2D[element.point2D_idx].xy
-            )
-            for element in point.track.elements
-        ]
-        assert len(errors) == len({element.image_id for element in point.track.elements})
-        own += bool(min(errors) < 1e-9)
-    assert own == 200
 
 
 def test_transforms_open_as_a_project(scene, memory, saved, tmp_path):

@@ -98,20 +98,6 @@ def test_generated_views_give_way_to_names_that_are_taken(scene, tmp_path):
     }
 
 
-def test_new_names_stand_in_transforms_too(scene, tmp_path):
-    memory = fused(scene, [0, 2])
-    add_view(memory, scene.views[3].camera, "view_0.png", number=2, generated=True)
-    memory.save(tmp_path / "memory.npz")
-    out = tmp_path / "out"
-    export_run(tmp_path / "memory.npz", "transforms", out)
-    frames = json.loads((out / "transforms.json").read_text())["frames"]
-    assert {frame["file_path"]: frame.get("generated", False) for frame in frames} == {
-        "images/view_0.png": False,
-        "images/view_2.png": False,
-        "images/generated/view_0.png": True,
-    }
-
-
 def test_track_elements_follow_the_renamed_views(scene, tmp_path):
     memory = fused(scene, [0, 2])
     other = scene.views[5]

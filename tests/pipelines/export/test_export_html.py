@@ -253,20 +253,6 @@ def test_a_click_flies_and_the_address_keeps_view_and_choices(fitted_run, tmp_pa
 
 
 @pytest.mark.slow
-def test_points_are_sorted_for_a_step_that_is_small_in_any_unit(bare_run, tmp_path):
-    out = tmp_path / "page.html"
-    export_run(bare_run.folder, "html", out)
-    with open_browser(width=300, height=150) as browser:
-        run = browser.driver.execute_script
-        browser.driver.get(out.as_uri())
-        reaches(browser, "shown")
-        still(browser)
-        run("view.position.x += 1e-4; show(view)")
-        still(browser)
-        assert run("return camera.position.distanceTo(spark.sortedCenter)") == 0
-
-
-@pytest.mark.slow
 def test_without_webgl_a_line_says_so(bare_run, tmp_path):
     out = tmp_path / "page.html"
     export_run(bare_run.folder, "html", out)

@@ -68,9 +68,6 @@ def test_pxr_reads_the_points(bare_run, tmp_path, suffix):
     assert sorted(tmp_path.iterdir()) == [out]
     stage = Usd.Stage.Open(str(out))
     assert UsdGeom.GetStageMetersPerUnit(stage) == 1 and stage.HasAuthoredMetadata("upAxis")
-    validation = pytest.importorskip("pxr.UsdValidation")
-    every = validation.ValidationRegistry().GetOrLoadAllValidators()
-    assert [e.GetMessage() for e in validation.ValidationContext(every).Validate(stage)] == []
     (cloud,) = (UsdGeom.Points(prim) for prim in stage.Traverse() if prim.IsA(UsdGeom.Points))
     world = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(cloud.GetPrim()))
     local = np.array(cloud.GetPointsAttr().Get(), np.float64)
@@ -311,21 +308,11 @@ def beside_another(nodes, meshes, scene):
     scene["nodes"].append(2)
 
 
-def taken_out(nodes, meshes, scene):
-    scene["nodes"] = [0]
-
-
-def without_extras(nodes, meshes, scene):
-    nodes[0]["extras"] = None
-
-
 def with_others_extras(nodes, meshes, scene):
     nodes[0]["extras"] = {"up": "y", "turn": 90}
 
 
-@pytest.mark.parametrize(
-    "change", [twice, beside_another, taken_out, without_extras, with_others_extras]
-)
+@pytest.mark.parametrize("change", [twice, beside_another, with_others_extras])
 def test_upright_splats_stay_right_where_another_program_saved_them(bare_run, tmp_path, change):
     plain, turned = tmp_path / "a.ply", tmp_path / "a.glb"
     for out in (plain, turned):
