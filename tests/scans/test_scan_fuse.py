@@ -87,14 +87,6 @@ def test_spacing_follows_the_density_around_each_point_and_dust_is_left_out():
     assert isolated[-2:].all() and isolated[:12_500].mean() < 1e-3
 
 
-def test_points_go_into_voxels_of_their_own_density():
-    memory = SpatialMemory(0.005)
-    fuse_scan(memory, scan_of(2 * wall(0.02), RED), placed())
-    # 0.02 apart in the world: the widest voxels of 0.005, 0.01, 0.02, ... within that.
-    assert np.median(memory.columns.spacing) == pytest.approx(0.019, rel=0.1)
-    assert set(memory.columns.level.tolist()) <= {1, 2}
-
-
 SEEN_FROM = np.array([2.0, 2.0, 1.5])
 
 

@@ -79,13 +79,6 @@ def test_frames_whose_picture_is_absent_or_damaged_are_left_out(export, pattern,
         view.load()
 
 
-def test_a_transforms_json_that_a_converter_left_is_read_first(tmp_path: Path) -> None:
-    polycam(tmp_path)
-    (tmp_path / "transforms.json").write_text("{}")
-    with pytest.raises(ProjectError, match=r"transforms\.json"):
-        open_project(tmp_path)
-
-
 # --- Stray Scanner ----------------------------------------------------------------------------
 
 
@@ -212,13 +205,6 @@ def rewritten(path: Path, *, without: str = "", **metadata: Any) -> Path:
         for name, data in held.items():
             new.writestr(name, data)
     return path
-
-
-def test_record3d_intrinsics_follow_pictures_of_another_size(tmp_path: Path) -> None:
-    expected = record3d(tmp_path / "scan.r3d")
-    lenses = (2 * expected.cameras.K[:, [0, 1, 0, 1], [0, 1, 2, 2]]).tolist()
-    path = rewritten(tmp_path / "scan.r3d", w=144, h=192, perFrameIntrinsicCoeffs=lenses)
-    compare(open_project(path), expected)
 
 
 @pytest.mark.parametrize(

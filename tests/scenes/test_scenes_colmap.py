@@ -147,12 +147,6 @@ def test_fisheye_without_coefficients_is_still_undistorted(tmp_path):
     assert reprojection_errors(scene).max() < 1e-3
 
 
-def test_pinhole_model_with_zero_coefficients_passes_untouched(tmp_path):
-    workspace(tmp_path, "OPENCV", camera_params=[90.0, 91, 48, 36, 0, 0, 0, 0])
-    scene = read_colmap(tmp_path)
-    np.testing.assert_array_equal(scene.views[0].load().rgb, ramp())
-
-
 def test_the_largest_model_is_read_and_any_other_can_be_chosen(tmp_path):
     small = workspace(tmp_path)
     (tmp_path / "sparse/0").rename(tmp_path / "sparse/1")
@@ -236,14 +230,3 @@ def test_tracks_that_name_pictures_taken_out(tmp_path, text, classic):
     said = [found.message for found in scene.findings if found.level == "warning"]
     assert any("40 track elements name images that the model does not hold" in s for s in said)
     assert len(scene.points.positions) == 40 and reprojection_errors(scene).max() < 1e-3
-
-
-@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
-def test_text_models_with_a_byte_order_mark(tmp_path, encoding):
-    workspace(tmp_path, text=True)
-    expected = read_colmap(tmp_path)
-    for file in (tmp_path / "sparse" / "0").iterdir():
-        file.write_text(file.read_text(), encoding=encoding)
-    scene = read_colmap(tmp_path)
-    assert scene.names == expected.names
-    assert not [found for found in scene.findings if found.level == "warning"]

@@ -116,12 +116,6 @@ def test_faces_of_a_fisheye_beyond_90_degrees():
         assert (face.depth(depth)[angle > math.radians(91)] == 0).all()
 
 
-def test_narrow_fisheyes_stay_one_view():
-    (lens,) = perspective_views("OPENCV_FISHEYE", [130.0, 130, 100, 100, 0, 0, 0, 0],
-                                FISHEYE_SIZE, what="test")  # fmt: skip
-    assert lens.name("a.png") == "a.png"
-
-
 @pytest.fixture
 def project(tmp_path):
     """Three panoramas, the second turned by 30 degrees about the vertical, with masks and depth."""

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from gvtools.cameras import Cameras, invert_rigid
 from gvtools.scenes.registration import register_depth
@@ -13,20 +14,9 @@ SIZE = (96, 128)
 
 
 def turned(degrees, translation):
-    angle = np.radians(degrees)
     matrix = np.eye(4)
-    rotation = np.array(
-        [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
-    )
-    tilt = np.array(
-        [
-            [np.cos(angle / 2), 0, np.sin(angle / 2)],
-            [0, 1, 0],
-            [-np.sin(angle / 2), 0, np.cos(angle / 2)],
-        ]
-    )
-    matrix[:3, :3] = tilt @ rotation
-    matrix[:3, 3] = translation
+    turns = Rotation.from_euler("YZ", [degrees / 2, degrees], degrees=True)
+    matrix[:3, :3], matrix[:3, 3] = turns.as_matrix(), translation
     return matrix
 
 

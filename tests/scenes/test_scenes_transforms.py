@@ -12,7 +12,6 @@ from scenes_workspace import (
     HEIGHT,
     PINHOLE,
     WIDTH,
-    depth_picture,
     frame,
     pose_matrix,
     ramp,
@@ -59,16 +58,6 @@ def test_blender_files_name_no_suffix_and_give_an_angle(tmp_path):
     assert "alpha channel: read as a mask" in messages(scene)
 
 
-def test_frames_have_intrinsics_of_their_own(tmp_path):
-    save(tmp_path / "a.png", ramp())
-    save(tmp_path / "b.png", ramp(48, 36))
-    frames = [frame("a.png"), frame("b.png", fl_x=45, fl_y=45, cx=24, cy=18, w=48, h=36)]
-    scene = read_transforms(transforms(tmp_path, frames, **PINHOLE))
-    assert scene.cameras.K[:, 0, 0].tolist() == [90, 45]
-    assert scene.cameras.width.tolist() == [96, 48]
-    assert scene.views[1].load().rgb.shape == (36, 48, 3)
-
-
 @pytest.mark.parametrize(
     ("keys", "model"),
     [
@@ -101,13 +90,6 @@ def test_masks_of_instant_ngp_are_not_passed_over(tmp_path):
     assert "dynamic_mask_NAME.png" in messages(
         read_transforms(transforms(tmp_path, [frame()], **PINHOLE))
     )
-
-
-def test_depth_is_millimetres_unless_said(tmp_path):
-    save(tmp_path / "images/a.png", ramp())
-    save(tmp_path / "a.depth.png", depth_picture(2.0))
-    scene = read_transforms(transforms(tmp_path, [frame(depth_file_path="a.depth.png")], **PINHOLE))
-    np.testing.assert_allclose(scene.views[0].load().depth[1:], 2, rtol=1e-6)
 
 
 def test_absent_frames_masks_and_depth_are_reported(tmp_path):

@@ -46,18 +46,6 @@ def test_points_outside_the_picture_are_kept_and_impossible_ones_are_nan():
     assert lens.points(np.zeros((0, 2))).shape == (0, 2)
 
 
-def test_what_lies_outside_gets_the_given_value():
-    lens = undistortion("PINHOLE", LENSES["PINHOLE"], SIZE, what="test")
-    assert lens.untouched
-    assert lens.inside is None
-    lens = undistortion("SIMPLE_RADIAL", LENSES["SIMPLE_RADIAL"], SIZE, what="test")
-    assert lens.inside is None  # the default options leave no blank pixel
-    lens.__dict__["_source_pixel"] = np.array([[0, -1], [5, -1]], np.int32)
-    values = np.arange(WIDTH * HEIGHT, dtype=np.float32).reshape(HEIGHT, WIDTH) + 1
-    np.testing.assert_array_equal(lens.nearest(values), [[1, 0], [6, 0]])
-    np.testing.assert_array_equal(lens.inside, [[True, False], [True, False]])
-
-
 @pytest.mark.parametrize(
     ("model", "params", "size", "told"),
     [

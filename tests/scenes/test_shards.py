@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import refused
 from shard_rooms import small_collection, small_scene
 
 from gvtools.errors import OptionError, ProjectError
@@ -176,8 +175,3 @@ def test_another_conversion_and_foreign_files_are_refused(whole, tmp_path):
     with pytest.raises(OptionError, match="more than 0"):
         ShardOptions(megabytes=0)
     assert contents(out) == contents(whole)
-
-
-def test_a_data_set_without_its_folder_is_told_what_to_give(tmp_path, capsys):
-    line = refused(capsys, "data", "shards", "7-Scenes", "--out", tmp_path / "out")
-    assert "by --root DIR" in line

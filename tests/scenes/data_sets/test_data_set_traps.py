@@ -26,7 +26,6 @@ from PIL import Image
 from gvtools.errors import OptionError, ProjectError
 from gvtools.scenes.data_sets.aria import aria_lens
 from gvtools.scenes.data_sets.hypersim import read_color, turned_pinhole
-from gvtools.scenes.data_sets.mvs import decomposed
 from gvtools.scenes.scene import Scene
 from gvtools.scenes.video import read_frame
 
@@ -133,22 +132,6 @@ def test_llff_does_not_guess_which_picture_a_row_is_of(tmp_path: Path) -> None:
     )
 
 
-def test_dl3dv_copies_of_another_size_scale_the_files_intrinsics(tmp_path: Path) -> None:
-    expected = mini_reconstructed.write_dl3dv_960p(tmp_path)
-    home = tmp_path / expected.scene
-    shutil.move(home / "images_4", home / "images_8")
-    for path in (home / "images_8").iterdir():
-        Image.open(path).resize((32, 24)).save(path)
-    scene = read("dl3dv", tmp_path, expected.scene)
-    np.testing.assert_allclose(
-        scene.cameras.K, expected.cameras.resized(32, 24).K, rtol=0, atol=1e-9
-    )
-    for path in (home / "images_8").iterdir():
-        Image.open(path).resize((32, 32)).save(path)  # a crop or a stretch: no camera fits
-    with pytest.raises(ProjectError, match="another aspect than their camera"):
-        read("dl3dv", tmp_path, expected.scene)
-
-
 # --- benchmarks of stereo ---------------------------------------------------------------------
 
 
@@ -163,16 +146,6 @@ def test_dtu_reads_one_light_and_prefers_the_fourth(tmp_path: Path) -> None:
     for path in folder.glob("*_3_*"):
         path.unlink()
     assert read("dtu", tmp_path, expected.scene).names[0] == "rect_001_0_r5000.png"
-
-
-def test_dtu_projection_matrices_of_any_factor_are_split() -> None:
-    rng = np.random.default_rng(3)
-    K = np.array([[2892.33, 0, 823.2], [0, 2883.18, 619.07], [0, 0, 1]])
-    pose = room_frames().cameras.cam_from_world[1]
-    for factor in (1.0, -3.0, 1e-3, *rng.normal(size=3)):
-        camera = decomposed(factor * K @ pose[:3])
-        np.testing.assert_allclose(camera.K, K, rtol=1e-9, atol=1e-7)
-        np.testing.assert_allclose(camera.cam_from_world, pose, atol=1e-9)
 
 
 def test_tanks_trajectory_without_intrinsics_is_refused(tmp_path: Path) -> None:
@@ -360,27 +333,6 @@ def test_scannetpp_masks_follow_the_undistortion(tmp_path: Path) -> None:
     x, y, _ = expected.cameras.K[0] @ ray
     assert not mask[int(y), int(x)]
     assert mask.mean() > 0.9
-
-
-def test_waymo_recorded_pixels_are_those_of_the_documentation(tmp_path: Path) -> None:
-    mini_waymo.write(tmp_path)
-    scene = read("waymo", tmp_path, f"training/{mini_waymo.SEGMENT}")
-    points = room_frames().points
-    for view in scene:
-        camera = 1 if view.name.startswith("front/") else 2
-        lens = view.load.__self__.lens  # type: ignore[attr-defined]
-        pose = view.camera.cam_from_world[0]
-        local = points @ pose[:3, :3].T + pose[:3, 3]
-        frame = mini_waymo.TIMES.index(int(view.name.partition("/")[2]))
-        front = scene[f"front/{mini_waymo.TIMES[frame]}"].camera.world_from_cam[0]
-        vehicle = (
-            front
-            @ np.linalg.inv(mini_waymo.FORWARD)
-            @ np.linalg.inv(mini_waymo.vehicle_from_cam(1))
-        )
-        ahead = local[:, 2] > 1
-        expected = mini_waymo.brown(points[ahead], camera, vehicle)
-        np.testing.assert_allclose(lens.source.img_from_cam(local[ahead]), expected, atol=1e-6)
 
 
 def test_waymo_takes_the_frames_pose_where_pictures_have_none(tmp_path: Path) -> None:
