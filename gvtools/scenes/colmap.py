@@ -48,7 +48,7 @@ def read_colmap(
     """
     root = Path(root)
     loaded = model_in(root, number=model, faces=True)
-    folder = loaded.files.folder
+    folder = loaded.folder
     homes = _homes(root, folder)
     if images is not None:
         image_folder = given_folder(images, "images")
@@ -228,7 +228,7 @@ def _observations(
     strange = int((ids[point_index] != keys).sum())
     if strange:
         raise ProjectError(
-            f"{model.files.folder}: {strange} detections of image {image.name} name points that "
+            f"{model.folder}: {strange} detections of image {image.name} name points that "
             "points3D does not hold; expected files of one model; export the model again"
         )
     places = np.stack(

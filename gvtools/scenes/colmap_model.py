@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -51,16 +51,6 @@ REASONS = {
     "line_stream ": "a line of points3D.txt is malformed",
     "Rig with ID": "an image, camera, rig or frame is named that is not there",
 }
-
-
-@dataclass(frozen=True)
-class ModelFiles:
-    """A model on disk."""
-
-    folder: Path  # where its files are
-    suffix: str  # ".bin" or ".txt"
-    # further models of the workspace that are not read, with their image counts
-    others: tuple[tuple[str, int], ...] = ()
 
 
 def has_model(folder: Path) -> bool:
@@ -111,8 +101,8 @@ def _numbered(folder: Path) -> dict[int, Path]:
     return {int(path.name): path for path in sorted(found, key=lambda path: int(path.name))}
 
 
-def model_files(folder: Path) -> ModelFiles:
-    """The files of the model in ``folder``, complete and with counts that they can hold."""
+def checked_suffix(folder: Path) -> str:
+    """Of the files of the model in ``folder``: complete, and with counts that they can hold."""
     suffix = _suffix(folder)
     rigged = [stem for stem in RIGGED if (folder / f"{stem}{suffix}").is_file()]
     if len(rigged) == 1:
@@ -132,7 +122,7 @@ def model_files(folder: Path) -> ModelFiles:
                 _check_records(folder / f"{stem}.bin")
     else:
         _check_points(folder / "points3D.txt")
-    return ModelFiles(folder, suffix, _siblings(folder))
+    return suffix
 
 
 def check_cameras(folder: Path, model: pycolmap.Reconstruction) -> None:
@@ -279,7 +269,7 @@ class RegisteredImage:
 class ColmapModel:
     """A model whose every record was found sound."""
 
-    files: ModelFiles  # where it was read
+    folder: Path  # where its files are
     images: tuple[RegisteredImage, ...]  # registered images, in natural order of their names
     # for each camera that a registered image uses, its ways to a pinhole camera
     views: dict[int, tuple[Undistortion, ...]]
@@ -297,23 +287,23 @@ def load_model(folder: Path, *, faces: bool = False) -> ColmapModel:
 
     With ``faces``, cameras that see too much for one pinhole camera become several views.
     """
-    files = model_files(folder)
-    findings = []
-    if files.others:
-        listed = ", ".join(f"{name} ({count} images)" for name, count in files.others)
+    suffix, findings = checked_suffix(folder), list[Finding]()
+    if others := _siblings(folder):
+        listed = ", ".join(f"{name} ({count} images)" for name, count in others)
         line = f"model {folder.name} is read; further models are not: {listed}"
         findings.append(Finding("warning", line))
-    reconstruction, mended = _read(files)
+    reconstruction, mended = _read(folder, suffix)
     findings += mended
-    findings += _contradicting_text(files, reconstruction)
-    lost, met = _without_lost(files, reconstruction)
+    findings += _contradicting_text(folder, reconstruction) if suffix == ".bin" else []
+    names = text_names(folder) if suffix == ".txt" else {}
+    lost, met = _without_lost(reconstruction, names)
     findings += met
     if reconstruction.num_reg_images() == 0:
         raise ProjectError(
             f"{folder}: no registered image among {reconstruction.num_images()}; expected at least "
             "one; solve the cameras again, or give another model folder"
         )
-    images, defects = _registered(files, reconstruction)
+    images, defects = _registered(folder, reconstruction, names)
     findings += rotation_findings(defects)
     count = reconstruction.num_images()
     if unposed := count - len(images) - lost:
@@ -330,12 +320,10 @@ def load_model(folder: Path, *, faces: bool = False) -> ColmapModel:
         what = f"{folder}, camera {key}"
         one = () if faces else (undistortion(*lens, what=what),)
         views[key] = one or perspective_views(*lens, what=what)
-    return ColmapModel(files, images, views, reconstruction, tuple(findings))
+    return ColmapModel(folder, images, views, reconstruction, tuple(findings))
 
 
-def _contradicting_text(
-    files: ModelFiles, reconstruction: pycolmap.Reconstruction
-) -> list[Finding]:
+def _contradicting_text(folder: Path, reconstruction: pycolmap.Reconstruction) -> list[Finding]:
     """A warning for each text file beside the binary model that says other cameras or poses."""
     records: dict[str, dict[int, list[Any]]] = {
         "cameras": {
@@ -350,8 +338,8 @@ def _contradicting_text(
     }  # fmt: skip
     findings = []
     for stem, own in records.items():
-        path = files.folder / f"{stem}.txt"
-        told = {} if files.suffix == ".txt" else _told(path)
+        path = folder / f"{stem}.txt"
+        told = _told(path)
         for key, (name, *values) in sorted(own.items() if told else ()):
             other, *those = told.get(key, ["none"])
             same = name == other and len(values) == len(those)
@@ -381,25 +369,25 @@ def _told(path: Path) -> dict[int, list[Any]]:
         return {}
 
 
-def _read(files: ModelFiles) -> tuple[pycolmap.Reconstruction, list[Finding]]:
+def _read(folder: Path, suffix: str) -> tuple[pycolmap.Reconstruction, list[Finding]]:
     """The model; where it is refused, without what names images that are not there."""
     try:
-        return _parsed(files), []
+        return _parsed(folder, suffix), []
     except ProjectError:
         with TemporaryDirectory() as work:
             try:
-                changed = _mend(files.folder, Path(work), files.suffix)
+                changed = _mend(folder, Path(work), suffix)
             except (struct.error, ValueError, IndexError, OSError):
                 changed = None
             if changed is None:
                 raise
-            reconstruction = _parsed(replace(files, folder=Path(work)))
+            reconstruction = _parsed(Path(work), suffix)
     line = f"{changed} track elements name images that the model does not hold: left out"
     return reconstruction, [Finding("warning", line)] if changed else []
 
 
 def _without_lost(
-    files: ModelFiles, reconstruction: pycolmap.Reconstruction
+    reconstruction: pycolmap.Reconstruction, names: Mapping[int, str]
 ) -> tuple[int, list[Finding]]:
     """Take points and poses out that hold no numbers; how many poses, and what is to be said."""
     findings = []
@@ -409,7 +397,6 @@ def _without_lost(
     if lost:
         line = f"{len(lost)} sparse points hold NaN or infinity: dropped"
         findings.append(Finding("warning", line))
-    names = text_names(files.folder) if files.suffix == ".txt" else {}
     dropped, frames = list[str](), set[int]()
     for key, image in reconstruction.images.items():
         pose = image.cam_from_world() if image.has_pose else None
@@ -495,16 +482,16 @@ def _without(data: bytes, stem: str, known: set[int]) -> tuple[bytes, int]:
     return struct.pack("<Q", len(records)) + b"".join(records), left_out
 
 
-def _parsed(files: ModelFiles) -> pycolmap.Reconstruction:
+def _parsed(folder: Path, suffix: str) -> pycolmap.Reconstruction:
     from gvtools.colmap import pycolmap
 
     reconstruction = pycolmap.Reconstruction()
     try:
-        if files.suffix == ".bin":
-            reconstruction.read_binary(files.folder)
-            check_cameras(files.folder, reconstruction)
+        if suffix == ".bin":
+            reconstruction.read_binary(folder)
+            check_cameras(folder, reconstruction)
         else:
-            reconstruction.read_text(files.folder)
+            reconstruction.read_text(folder)
         _ = [image.name for image in reconstruction.images.values()]  # decoded when asked for
     except (ValueError, IndexError, KeyError, RuntimeError, OSError) as error:
         unread = isinstance(error, UnicodeDecodeError)
@@ -512,17 +499,16 @@ def _parsed(files: ModelFiles) -> pycolmap.Reconstruction:
         lines = text.split("Check failed:")[-1].strip().splitlines() or ["no reason"]
         reason = next((said for part, said in REASONS.items() if part in lines[0]), lines[0][:120])
         raise ProjectError(
-            f"{files.folder}: the model's files are damaged or contradict each other ({reason}); "
+            f"{folder}: the model's files are damaged or contradict each other ({reason}); "
             "export the model again"
         ) from None
     return reconstruction
 
 
 def _registered(
-    files: ModelFiles, reconstruction: pycolmap.Reconstruction
+    folder: Path, reconstruction: pycolmap.Reconstruction, names: Mapping[int, str]
 ) -> tuple[tuple[RegisteredImage, ...], list[float]]:
     """The images with a pose, and how far each rotation was from orthonormal."""
-    names = text_names(files.folder) if files.suffix == ".txt" else {}
     images, defects = [], []
     for image in reconstruction.images.values():
         if not image.has_pose:
@@ -530,7 +516,7 @@ def _registered(
         name = names.get(image.image_id, image.name)
         matrix = np.array(image.cam_from_world().matrix())
         matrix[:, :3] = _rotation(image.cam_from_world().rotation.quat)
-        pose, defect = rigid_transform(matrix, what=f"{files.folder}, image {name}")
+        pose, defect = rigid_transform(matrix, what=f"{folder}, image {name}")
         defects.append(defect)
         images.append(RegisteredImage(image.image_id, name, image.camera_id, pose))
     return tuple(sorted(images, key=lambda image: natural_key(image.name))), defects

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from gvtools.cameras import Cameras
 from gvtools.errors import ProjectError
 from gvtools.files import full_disk
-from gvtools.scenes.colmap_model import CAMERAS, model_files
+from gvtools.scenes.colmap_model import CAMERAS, checked_suffix
 
 if TYPE_CHECKING:
     import pycolmap
@@ -49,7 +49,7 @@ def write_colmap(
         partial.mkdir(parents=True)
         model.write_binary(str(partial))
         # The writer does not notice a full disk; the walk over the records does.
-        model_files(partial)
+        checked_suffix(partial)
         # A kill in between leaves no model, rather than one of new and old files.
         (folder / CAMERAS).unlink(missing_ok=True)
         for file in sorted(partial.iterdir(), key=lambda file: (file.name == CAMERAS, file.name)):

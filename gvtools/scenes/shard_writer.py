@@ -13,13 +13,12 @@ import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from gvtools.errors import GvError, OptionError, ProjectError
 from gvtools.files import make_folder, replaced_when_written, write_text
 from gvtools.scenes.collection import SceneCollection
 from gvtools.scenes.resized import check_max_side, reduced
-from gvtools.scenes.scene import Scene, View
+from gvtools.scenes.scene import Scene
 from gvtools.scenes.shards import (
     INDEX,
     ListedScene,
@@ -195,19 +194,6 @@ def _remove_others(out: Path, count: int) -> None:
             path.unlink()
 
 
-@dataclass(frozen=True, eq=False)
-class _EncodedView:
-    """One view of a scene, as files."""
-
-    number: int  # of its scene
-    place: int  # of the view in its scene
-    name: str  # of the scene
-    scene: Scene
-    view: View
-    files: dict[str, bytes]  # by the end of their names
-    depth_unit: float | None
-
-
 class _Views:
     """All views of a collection in order, from any position on."""
 
@@ -217,8 +203,8 @@ class _Views:
         self.skipped: list[Skipped] = []  # what could not be read since the last shard
         self._opened: tuple[int, Scene] | None = None
 
-    def next(self) -> _EncodedView | None:
-        """The next view that can be read; None at the end."""
+    def next(self) -> tuple[SceneRecord, ViewRecord, dict[str, bytes]] | None:
+        """The next view that can be read, with its files; None at the end."""
         while self.position[0] < len(self.collection):
             number, place = self.position
             name = self.collection.names[number]
@@ -233,7 +219,14 @@ class _Views:
             except GvError as error:
                 self.skipped.append(Skipped(scene=name, view=view.name, reason=str(error)))
                 continue
-            return _EncodedView(number, place, name, scene, view, files, unit)
+            about = SceneRecord(number=number, name=name, kind=scene.kind, metric=scene.metric)
+            K, pose = view.camera.K[0].tolist(), view.camera.cam_from_world[0].tolist()
+            record = ViewRecord(
+                scene=number, view=place, name=view.name, width=int(view.camera.width[0]),
+                height=int(view.camera.height[0]), K=K, cam_from_world=pose, depth_unit=unit,
+                members={},
+            )  # fmt: skip
+            return about, record, files
         return None
 
     def _scene(self, number: int, name: str) -> Scene | None:
@@ -261,10 +254,9 @@ def _write_shard(views: _Views, tar: Path, *, limit: float) -> ShardRecord | Non
     with replaced_when_written(tar) as temporary:
         with tarfile.open(temporary, "w", format=tarfile.USTAR_FORMAT) as archive:
             while item is not None:
-                records.append(_added(archive, item))
-                about = {"kind": item.scene.kind, "metric": item.scene.metric}
-                scene = SceneRecord(number=item.number, name=item.name, **about)
-                scenes.setdefault(item.number, scene)
+                scene, view, files = item
+                records.append(_added(archive, view, files))
+                scenes.setdefault(scene.number, scene)
                 item = None if archive.offset >= limit else views.next()
         size, checksum = temporary.stat().st_size, sha256_of(temporary)
     record = ShardRecord(
@@ -282,29 +274,15 @@ def _write_shard(views: _Views, tar: Path, *, limit: float) -> ShardRecord | Non
     return record
 
 
-def _added(archive: tarfile.TarFile, item: _EncodedView) -> ViewRecord:
+def _added(archive: tarfile.TarFile, view: ViewRecord, files: dict[str, bytes]) -> ViewRecord:
     """Add a view's files; where each of them lies is part of the record."""
     places = {}
-    for ending, content in item.files.items():
+    for ending, content in files.items():
         # No date and no owner: equal views are equal bytes. Names of scenes and views may hold
         # signs that mean something in WebDataset's keys, so that keys are numbers.
-        info = tarfile.TarInfo(f"{item.number:06d}/{item.place:06d}.{ending}")
+        info = tarfile.TarInfo(f"{view.scene:06d}/{view.view:06d}.{ending}")
         info.size = len(content)
         archive.addfile(info, io.BytesIO(content))
         begin = archive.offset - -(-len(content) // _BLOCK) * _BLOCK
         places[ending] = (begin, len(content), zlib.crc32(content))
-    camera = item.view.camera
-    values: dict[str, Any] = {
-        "K": camera.K[0].tolist(),
-        "cam_from_world": camera.cam_from_world[0].tolist(),
-    }
-    return ViewRecord(
-        scene=item.number,
-        view=item.place,
-        name=item.view.name,
-        width=int(camera.width[0]),
-        height=int(camera.height[0]),
-        depth_unit=item.depth_unit,
-        members=places,
-        **values,
-    )
+    return view.model_copy(update={"members": places})
