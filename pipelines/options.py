@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar, Union
@@ -12,7 +12,7 @@ from typing import get_origin as origin_of
 
 from pydantic import ConfigDict
 
-from gvtools.errors import GvError
+from gvtools.errors import GvError, OptionError
 from gvtools.settings import Settings
 from gvtools.settings.base import Entry, entries
 from gvtools.settings.documentation import accepts, text_of
@@ -110,6 +110,21 @@ class Arguments(Settings):
     def run(self, console: Console) -> None:
         """Do what the command is for."""
         raise NotImplementedError
+
+    def refuse(self, names: Iterable[str], why: str) -> None:
+        """Refuse those of some options that were given, which the command cannot heed."""
+        for name in names:
+            if name in self.model_fields_set:
+                raise OptionError(f"{self.key(name)}: {why}; leave it out")
+
+
+def check_ending(path: Path, endings: Iterable[str], *, option: str = "--out") -> str:
+    """The end of a file's name in small letters; refused where it is none of ``endings``."""
+    ending = path.suffix.lower()
+    if ending not in endings:
+        expected = ", ".join(endings)
+        raise OptionError(f"{option} {path}: expected a name that ends with {expected}")
+    return ending
 
 
 def _flag(name: str) -> str:

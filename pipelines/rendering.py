@@ -37,6 +37,7 @@ from gvtools.runs.target_files import to_bytes, write_png
 from gvtools.scenes.scene import Frame
 from gvtools.scenes.transforms import read_camera_path
 from gvtools.trajectories import PATHS, named_path
+from pipelines.options import check_ending
 from pipelines.reconstruction.rounds import CachedProjection, Clock, complete_targets
 from pipelines.reconstruction.settings import RunSettings
 from pipelines.spherical_metadata import mark_mp4, write_panorama
@@ -388,10 +389,7 @@ def captioned(picture: Picture, text: str) -> Picture:
 
 def check_suffix(path: Path) -> None:
     """Refuse a file name that no film can be written to, before anything is drawn."""
-    suffix = path.suffix.lower()
-    if suffix not in SUFFIXES:
-        raise OptionError(f"--out {path}: expected a name that ends with {', '.join(SUFFIXES)}")
-    if suffix == ".mp4":
+    if check_ending(path, SUFFIXES) == ".mp4":
         purpose, instead = f"--out {path}: MP4", "or write a .gif or .webp"
         require("av", extra="film", purpose=purpose, instead=instead)
 

@@ -63,8 +63,7 @@ class BenchCommand(Arguments):
     def run(self, console: Console) -> None:
         given = self.settings
         if self.what == "complete":
-            if self.points is not None:
-                raise OptionError("bench complete: --points is of fuse and splat")
+            self.refuse(("points",), "of fuse and splat, not of complete")
             _run_complete(self, given, console)
             return
         if given:

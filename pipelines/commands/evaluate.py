@@ -110,9 +110,7 @@ def _folder(args: EvaluateCommand) -> Path:
                 "--protocol: needs one project, and --out for the run and its figures"
             )
         return args.out
-    given = [name for name in ("stride", "completer", "profile") if getattr(args, name) is not None]
-    if given or args.set:
-        raise OptionError(f"--{(given or ['set'])[0]}: belongs to --protocol; leave it out")
+    args.refuse(("stride", "completer", "profile", "set"), "belongs to --protocol")
     if args.out is not None:
         return args.out
     if len(args.runs) > 1:
@@ -189,11 +187,7 @@ def _reference(args: JudgeCommand, console: Console) -> JudgeReference:
     from pipelines.scoring.method_pictures import open_reference, reference_from_context
 
     if (args.against / RECORD).is_file():
-        given = [name for name in ("context", "targets") if getattr(args, name) is not None]
-        if given:
-            raise OptionError(
-                f"--{given[0]}: {args.against} is a run, whose views are its own; leave it out"
-            )
+        args.refuse(("context", "targets"), f"{args.against} is a run, whose views are its own")
         return open_reference(args.against, cameras=args.cameras)
     return reference_from_context(
         args.open_scene(args.against),
@@ -251,8 +245,8 @@ class TrajectoryCommand(RootArguments):
         from pipelines.inputs.trajectory_source import associate, open_trajectory
         from pipelines.scoring.measurement import pose_figures
 
-        if self.metric == "ate" and (self.delta != 1 or self.all_pairs):
-            raise OptionError("--delta, --all-pairs: belong to rpe; leave them out")
+        if self.metric == "ate":
+            self.refuse(("delta", "all_pairs"), "belongs to rpe")
         paths = (self.reference, self.estimate)
         refuse_root(self.root, paths)
         reference, estimate = (

@@ -55,15 +55,12 @@ class ExportCommand(Arguments, ExportOptions):
         splats = holds_splats(self.memory)
         converts = splats and self.out.suffix.lower() in FORMATS["splat"].suffixes
         form = FORMATS["splat"] if converts and self.format is None else self._form()
-        for name in (name for name in ExportOptions.model_fields if name in self.model_fields_set):
+        for name in ExportOptions.model_fields:
             if name not in form.options:
                 takers = ", ".join(each.name for each in FORMATS.values() if name in each.options)
-                raise OptionError(
-                    f"{self.key(name)}: --format {form.name} does not take it ({takers} do); leave "
-                    "it out"
-                )
-        if "spz_version" in self.model_fields_set and self.out.suffix.lower() != ".spz":
-            raise OptionError(f"--spz-version: --out {self.out} is no .spz; leave it out")
+                self.refuse((name,), f"--format {form.name} does not take it ({takers} do)")
+        if self.out.suffix.lower() != ".spz":
+            self.refuse(("spz_version",), f"--out {self.out} is no .spz")
         form.check_path(self.out, self.memory)
         if splats and form.name in ("splat", "spz", "html"):
             self._convert(console, form)
@@ -117,11 +114,7 @@ class ExportCommand(Arguments, ExportOptions):
         from gvtools.splat_files import read_splats
         from pipelines.export.splats import write_file
 
-        for name in ("max_points", "observed", "round"):
-            if name in self.model_fields_set:
-                raise OptionError(
-                    f"{self.key(name)}: {self.memory} is a file of splats; leave it out"
-                )
+        self.refuse(("max_points", "observed", "round"), f"{self.memory} is a file of splats")
         splats = read_splats(self.memory)
         splats = replace(splats, up=splats.up if self.up is None else self._told_up())
         if form.name == "html":

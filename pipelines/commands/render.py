@@ -226,8 +226,8 @@ class FilmCommand(LensArguments):
         )
 
         check_suffix(self.out)
-        if self.growth and self.round is not None:
-            raise OptionError("--growth shows every round; leave --round out")
+        if self.growth:
+            self.refuse(("round",), "--growth shows every one")
         panels = _panels(self)
         memory = load_memory(self.memory, up_to=self.round)
         if not len(memory):

@@ -322,8 +322,8 @@ class FleetCommand(Arguments):
         from pipelines.fleet.run import Ray, jobs_of, report, run_fleet, this_machine, write_slurm
         from pipelines.fleet.spec import is_url, read_list, tasks_of
 
-        if self.address is not None and self.engine != "ray":
-            raise OptionError(f"--address: belongs to --engine ray, not {self.engine}")
+        if self.engine != "ray":
+            self.refuse(("address",), f"belongs to --engine ray, not {self.engine}")
         root = self.out.rstrip("/") if is_url(self.out) else str(Path(self.out).absolute())
         tasks = tasks_of(read_list(self.scenes), root, folder=self.scenes.absolute().parent)
         if self.engine == "slurm" and not self.collect:

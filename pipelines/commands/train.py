@@ -94,9 +94,7 @@ def _checked(args: TrainCommand) -> RunSettings:
     from gvtools.settings import with_values
     from pipelines.reconstruction.settings import RunSettings
 
-    for name in STAGE_OPTIONS:
-        if name in args.model_fields_set:
-            raise OptionError(f"train tune does not look at {args.key(name)}; leave it out")
+    args.refuse(STAGE_OPTIONS, "train tune does not look at it")
     if {"minutes", "steps"} <= args.model_fields_set:
         raise OptionError("--minutes and --steps: expected one of them; leave the other out")
     given = {
@@ -194,9 +192,7 @@ class TrainCommand(TuneArguments):
         if self.config == NAME:
             run_tune(self, console)
             return
-        for name in TuneArguments.model_fields:
-            if name in self.model_fields_set:
-                raise OptionError(f"{self.key(name)} belongs to 'gvtools train tune'; leave it out")
+        self.refuse(TuneArguments.model_fields, "belongs to 'gvtools train tune'")
         config, folder = shipped_or_read(self.config)
         config = self._with_scenes(with_texts(config, self.set), console)
         stages: tuple[str, ...] = (self.stage,)

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
 
-from gvtools.errors import OptionError, ProjectError
-from pipelines.options import Arguments
+from gvtools.errors import ProjectError
+from pipelines.options import Arguments, check_ending
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -57,20 +57,13 @@ class ViewCommand(Arguments):
         from pipelines.viewing.serve import RECORDING, open_recording, read_round, serve
         from pipelines.viewing.source import ViewSource
 
-        if self.live and (self.open3d or self.screenshot):
-            raise OptionError(
-                "--live: the web page alone follows a run; leave the other option out"
-            )
-        if self.screenshot is not None and self.screenshot.suffix.lower() != ".png":
-            raise OptionError(
-                f"--screenshot {self.screenshot}: expected a name that ends with .png"
-            )
+        if self.live:
+            self.refuse(("open3d", "screenshot"), "the web page alone follows a run (--live)")
+        if self.screenshot is not None:
+            check_ending(self.screenshot, (".png",), option="--screenshot")
         if self.folder.suffix.lower() == RECORDING:
-            if self.screenshot is not None or self.open3d:
-                raise OptionError(
-                    f"{self.folder}: recordings open in rerun's own viewer; leave --screenshot and "
-                    "--open3d out"
-                )
+            why = f"{self.folder}, a recording, opens in rerun's own viewer"
+            self.refuse(("open3d", "screenshot"), why)
             open_recording(self.folder, host=self.host, port=self.port)
             return
         source, mode = ViewSource(self.folder, project=self.project), self.color
@@ -126,10 +119,7 @@ class ReportCommand(Arguments):
         from viz.report.page import report_html
 
         out = self.out or self.folder / PAGE
-        if out.suffix.lower() not in (".html", ".htm"):
-            raise OptionError(f"--out {out}: expected a name that ends with .html")
-        if out.is_dir():
-            raise OptionError(f"--out {out}: is a folder; expected a file's name")
+        check_ending(out, (".html", ".htm"))
         report = collect(self.folder, project=self.project, most=self.pictures)
         page = report_html(report)
         write_text(out, page)
@@ -139,7 +129,7 @@ class ReportCommand(Arguments):
         console.line(f"{out}: {len(page) / 2**20:.1f} MiB, {shown} targets with pictures")
 
 
-FORMATS = ("png", "svg", "pdf")
+FORMATS = (".png", ".svg", ".pdf")
 DPI = 150
 
 
@@ -166,14 +156,10 @@ class PlotCommand(Arguments):
     def run(self, console: Console) -> None:
         from gvtools.files import replaced_when_written
 
-        ending = self.out.suffix.lower().lstrip(".")
-        if ending not in FORMATS:
-            raise OptionError(
-                f"--out {self.out}: expected a name that ends with .png, .svg or .pdf"
-            )
+        ending = check_ending(self.out, FORMATS)
         figure = _figure(self.what, self.folder)
         with replaced_when_written(self.out) as temporary:
-            figure.savefig(temporary, format=ending, dpi=DPI)
+            figure.savefig(temporary, format=ending[1:], dpi=DPI)
         console.line(f"{self.what} of {self.folder} in {self.out}")
 
 
@@ -187,6 +173,8 @@ def _figure(what: str, folder: Path) -> Figure:
 
     run = load_run(folder)
     rounds = run.rounds
+    if not rounds:
+        raise ProjectError(f"{folder}: no round is done yet; expected one; wait, or add --resume")
     if what == "trajectories":
         from pipelines.report import open_sources, read_measures, report_poses
         from viz.plots.trajectories import draw_trajectories
@@ -195,7 +183,7 @@ def _figure(what: str, folder: Path) -> Figure:
         probe = read_measures(run).poses
         poses = report_poses(rounds, sources.scene, run.context, probe=probe).cameras
         if poses is None:
-            raise ProjectError(f"{folder}: no cameras to draw ({sources.problem or 'no rounds'})")
+            raise ProjectError(f"{folder}: no cameras to draw ({sources.problem or 'no targets'})")
         return draw_trajectories(poses, title=title)
     if what == "frames":
         from pipelines.report import frame_rows

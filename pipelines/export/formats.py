@@ -21,6 +21,7 @@ from pydantic import Field
 from gvtools.errors import OptionError
 from gvtools.optional import require
 from gvtools.settings import Settings
+from pipelines.options import check_ending
 
 # How files of SPZ begin, of version 4 and older, and what is read of a file to know its format.
 SPZ, HEAD_BYTES = (b"NGSP", b"\x1f\x8b"), 64
@@ -94,10 +95,7 @@ class ExportFormat:
                     "free place or an earlier export; give another --out"
                 )
             return
-        start = self.suffixes.get(path.suffix.lower())
-        if start is None:
-            expected = " or ".join(self.suffixes)
-            raise OptionError(f"--out {path}: expected a name that ends with {expected}")
+        start = self.suffixes[check_ending(path, self.suffixes)]
         if not path.is_file():
             return
         with path.open("rb") as file:

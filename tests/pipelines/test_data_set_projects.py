@@ -82,7 +82,7 @@ def test_commands_take_it(root: Path, tmp_path: Path, capsys: pytest.CaptureFixt
     line = refused(capsys, "train", "tune", "--scene", ADDRESS, "--out", tmp_path / "tuned")
     assert "is not said" in line
     line = refused(capsys, "train", "tiny", "--root", root, "--out", tmp_path / "trained")
-    assert "--root belongs to 'gvtools train tune'" in line
+    assert "--root: belongs to 'gvtools train tune'" in line
 
 
 @pytest.mark.slow

@@ -93,7 +93,7 @@ def test_growth_draws_the_path_once_for_each_round(run: Path, tmp_path: Path) ->
         (["--out", "f.gif", "--compare", "memory,colour"], "expected two or more of"),
         (["--out", "f.gif", "--fps", "0.001"], "at least 0.01"),
         (["--out", "f.gif", "--width", "4"], "--width 4"),
-        (["--out", "f.gif", "--growth", "--round", "0"], "leave --round out"),
+        (["--out", "f.gif", "--growth", "--round", "0"], "--growth shows every one"),
     ],
 )
 def test_wrong_options_are_refused_and_nothing_is_written(

@@ -250,7 +250,7 @@ def test_wrong_input_ends_in_one_line(tmp_path, capsys):
     assert "no times" in refused(capsys, "trajectory", "ate", a, b, "--associate", "time")
     assert "no names" in refused(capsys, "trajectory", "ate", a, b, "--associate", "name")
     assert "--layout" in refused(capsys, "trajectory", "ate", a, a, "--layout", "ros")
-    assert "belong to rpe" in refused(capsys, "trajectory", "ate", a, a, "--delta", "2")
+    assert "--delta: belongs to rpe" in refused(capsys, "trajectory", "ate", a, a, "--delta", "2")
     assert "expected 1 frame" in refused(capsys, "trajectory", "rpe", a, a, "--delta", "0")
 
 

@@ -10,14 +10,12 @@ import io
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from gvtools.errors import OptionError
-
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 Panel = Callable[["Axes"], None]
-Rounds = Sequence[Mapping[str, Any]]  # the lines of a run's ``rounds.jsonl``, in order
+Rounds = Sequence[Mapping[str, Any]]  # the lines of a run's ``rounds.jsonl``, in order; one or more
 
 # Okabe and Ito's palette, which the common forms of colour blindness tell apart.
 BLACK, ORANGE, SKY, GREEN, YELLOW, BLUE, RED, PINK = (
@@ -91,21 +89,6 @@ def figure_of(panels: Sequence[Panel], *, title: str | None = None, columns: int
     if title is not None:
         figure.suptitle(title, parse_math=False)
     return figure
-
-
-def select_panels(panels: Mapping[str, Panel], names: Sequence[str] | None) -> list[Panel]:
-    """The named panels, in the order of the names; all of them without names."""
-    names = tuple(panels) if names is None else tuple(names)
-    unknown = [name for name in names if name not in panels]
-    if unknown or not names:
-        raise OptionError(f"panels {', '.join(names)!r}; expected some of {', '.join(panels)}")
-    return [panels[name] for name in names]
-
-
-def check_rounds(rounds: Rounds) -> None:
-    """Refuse to draw nothing."""
-    if not rounds:
-        raise OptionError("growth: no rounds; expected the lines of a run's rounds.jsonl")
 
 
 def png(figure: Figure, *, dpi: int = 120) -> bytes:

@@ -124,8 +124,6 @@ def draw_losses(stages: Mapping[str, Records], *, title: str | None = None) -> F
     of a loss are zero or negative, it is linear below about a thirtieth of the largest value.
     Records of a stage's log have ``step`` and values by name.
     """
-    if not stages:
-        raise OptionError("losses: no stage; expected the logs of a training")
     for stage, records in stages.items():
         if not loss_names(records):
             raise OptionError(f"losses: stage {stage!r} has no record with a loss; expected one")

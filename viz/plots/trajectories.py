@@ -10,18 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.errors import OptionError
-from viz.plots.canvas import (
-    BLACK,
-    BLUE,
-    GREY,
-    LEGEND,
-    LINES,
-    ORANGE,
-    blank_figure,
-    figure_of,
-    select_panels,
-)
+from viz.plots.canvas import BLACK, BLUE, GREY, LEGEND, LINES, ORANGE, blank_figure, figure_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -66,14 +55,12 @@ def draw_trajectories(
     they cancel out, the direction in which the cameras spread least. The horizontal axis is the
     one along which they spread most.
     """
-    if not len(poses.context) + len(poses.requested):
-        raise OptionError("trajectories: no cameras; expected those of a run")
     axes = principal_axes(np.concatenate([poses.context, poses.requested]), poses.context)
     known = {
         "top": partial(_poses_panel, poses=poses, plane=axes[[0, 1]], names=("right", "forward")),
         "side": partial(_poses_panel, poses=poses, plane=axes[[0, 2]], names=("right", "up")),
     }
-    return figure_of(select_panels(known, panels), title=title)
+    return figure_of([known[name] for name in panels or known], title=title)
 
 
 def principal_axes(

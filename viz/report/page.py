@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gvtools.evaluation.tables import Ranked, Table, shown
-from viz.plots.canvas import Rounds, check_rounds, png
+from viz.plots.canvas import Rounds, png
 from viz.plots.curves import Point, draw_by_views
 from viz.plots.rounds import draw_growth, draw_quality, draw_timing, is_measured
 from viz.plots.trajectories import Trajectories, draw_trajectories
@@ -111,7 +111,6 @@ class BenchmarkPage:
 def report_html(report: RunReport) -> str:
     """The page of a run."""
     rounds, views = report.rounds, report.measures.views
-    check_rounds(rounds)
     growth = [
         _plot(draw_growth(rounds, panels=[panel]), alt)
         for panel, alt in (

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.errors import ShapeError
 from viz.plots.canvas import BLUE, GREEN, ORANGE, SKY, rgb_of
 
 if TYPE_CHECKING:
@@ -125,8 +124,6 @@ def error_map(picture: Rgb, truth: Rgb, *, mask: Mask | None = None) -> Rgb:
     """
     from matplotlib import colormaps
 
-    if picture.shape != truth.shape:
-        raise ShapeError(f"the picture is {picture.shape}; its truth is {truth.shape}")
     lut = (colormaps[ERROR_MAP](np.arange(256))[:, :3] * 255).round().astype(np.uint8)
     difference = np.abs(picture.astype(np.int16) - truth).sum(axis=2, dtype=np.int32)
     level = np.minimum(difference * (1 / (3 * WORST)), 255).astype(np.uint8)
@@ -181,8 +178,6 @@ def method_sheet(views: Sequence[JudgedView]) -> Rgb:
     """
     from PIL import Image, ImageDraw
 
-    if not views:
-        raise ShapeError("a contact sheet of no views; expected at least one")
     blocks = [_block(view) for view in views]
     width, height = max(b.width for b in blocks), sum(b.height for b in blocks)
     canvas = Image.new("RGB", (width, height + LETTERS * 2), BACKGROUND)

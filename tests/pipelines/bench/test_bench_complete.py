@@ -183,7 +183,7 @@ def test_a_video_prior_that_is_not_run_has_a_stand_in(tmp_path):
         (("--size", "50"), "multiples of 12"),
         (("--size", "5y5"), "expected HxW or N"),
         (("--steps", 0), "steps"),
-        (("--points", 5000), "--points is of fuse and splat"),
+        (("--points", 5000), "--points: of fuse and splat"),
         (("--video",), "tiny has no video prior"),
         (("--config", "tiny", "--weights", "x"), "both --config and --weights"),
         (("--card", 24), "--card is of --memory"),

@@ -224,7 +224,7 @@ def test_bad_input_is_one_line(scan, weights, tmp_path, capsys):
     assert "expected at least 4" in said(*scene, "--context", "first:3")
     assert "nothing to do" in said("--scene", scan, "--minutes", "0")
     assert "expected one of them" in said(*scene, "--minutes", "1")
-    assert "does not look at --resume" in said(*scene, "--resume")
+    assert "--resume: train tune does not look at it" in said(*scene, "--resume")
     untrained = write_micro_weights(tmp_path / "untrained", trained=False)
     assert "untrained" in said(*scene, "--init", untrained)
     (tmp_path / "out").mkdir(exist_ok=True)
