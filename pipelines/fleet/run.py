@@ -139,11 +139,8 @@ class Ray:
             console.line(f"Ray's dashboard: http://{context.dashboard_url}")
         else:
             console.line("Ray's dashboard is not installed; pip install 'ray[default]' brings it")
-        self._check(tasks, address, console)
-
-    def _check(self, tasks: Sequence[Task], address: str, console: Console) -> None:
-        """Warn of tasks that are too large for every node: they would wait for ever."""
-        nodes = [node["Resources"] for node in self._ray.nodes() if node["Alive"]]
+        # Tasks that are too large for every node would wait for ever.
+        nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
         for task in {task.stage: task for task in tasks}.values():
             asked = {"CPU": task.cpus, "GPU": task.gpus, "memory": task.memory_gb * 1e9}
             if any(all(node.get(k, 0) >= v for k, v in asked.items()) for node in nodes):

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import glob
-import os
 import re
 import shlex
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from pydantic import Field
 
-from gvtools.errors import OptionError, ProjectError
+from gvtools.errors import OptionError
 from gvtools.settings import Settings
-from gvtools.untrusted import parse_yaml, read_text
+from gvtools.untrusted import parse_yaml, read_text, reading
 
 # Characters of a list, about 30,000 scenes; more of YAML would take longer than 10 s to read.
 LONGEST = 2_000_000
@@ -104,13 +104,8 @@ def is_url(text: str) -> bool:
 
 def read_list(path: Path) -> FleetSpec:
     """The list of a file."""
-    try:
+    with reading(path, "expected a list of scenes and stages in YAML"):
         data: Any = parse_yaml(read_text(path), most=LONGEST)
-    except OSError as error:
-        raise ProjectError(f"{path}: cannot be read ({error.strerror})") from None
-    except ValueError as error:
-        reason = " ".join(str(error).split())
-        raise ProjectError(f"{path}: no YAML ({reason})") from None
     if not isinstance(data, dict) or not isinstance(data.get("scenes"), list):
         raise OptionError(f"{path}: expected the keys 'stages' and 'scenes', a list")
     entries = [{"project": item} if isinstance(item, str) else item for item in data["scenes"]]
@@ -124,10 +119,7 @@ def tasks_of(spec: FleetSpec, root: str, *, folder: Path) -> list[Task]:
     for entry in spec.scenes:
         for scene in _expanded(entry, folder):
             assert scene.name is not None
-            if not NAME.fullmatch(scene.name):
-                raise OptionError(
-                    f"scene {scene.name!r}; expected a name of letters, digits, '.', '_' and '-'"
-                )
+            _check_name("scene", scene.name)
             if scene.name in scenes:
                 raise OptionError(
                     f"scene {scene.name!r}: {scenes[scene.name].project} and {scene.project} have "
@@ -152,18 +144,22 @@ def tasks_of(spec: FleetSpec, root: str, *, folder: Path) -> list[Task]:
     ]  # fmt: skip
 
 
+def _check_name(kind: str, name: str) -> None:
+    if not NAME.fullmatch(name) or (kind == "stage" and name in WORDS):
+        raise OptionError(f"{kind} {name!r}; expected a name of letters, digits, '.', '_' and '-'")
+
+
 def _command(name: str, spec: FleetSpec) -> tuple[str, ...]:
     from pipelines.cli import COMMANDS
 
-    if not NAME.fullmatch(name) or name in WORDS:
-        raise OptionError(f"stage {name!r}; expected a name of letters, digits, '.', '_' and '-'")
+    _check_name("stage", name)
+    text, known = spec.stages[name].command, [word for word in COMMANDS if word != "fleet"]
     try:
-        words = shlex.split(spec.stages[name].command)
-    except ValueError as error:
-        raise OptionError(f"stages.{name}.command: {error}") from None
-    if not words or words[0] not in COMMANDS or words[0] == "fleet":
-        known = ", ".join(command for command in COMMANDS if command != "fleet")
-        raise OptionError(f"stages.{name}.command {' '.join(words)!r}; expected one of {known}")
+        words = shlex.split(text)
+    except ValueError:
+        words = []
+    if not words or words[0] not in known:
+        raise OptionError(f"stages.{name}.command {text!r}; expected one of {', '.join(known)}")
     names = list(spec.stages)
     known_words = (*WORDS, *names[: names.index(name)])
     for word in re.findall(r"\{([^{}]*)\}", " ".join(words)):
@@ -179,22 +175,14 @@ def _expanded(entry: SceneEntry, folder: Path) -> list[SceneEntry]:
     if is_url(entry.project):
         name = entry.name or entry.project.rstrip("/").rpartition("/")[2]
         return [entry.replaced(name=name)]
-    try:
+    found: list[str] = []
+    with suppress(OSError, RuntimeError, ValueError):  # what no file can have as its name
         path = str((folder / Path(entry.project).expanduser()).absolute())
-        os.stat(path)
-    except (OSError, RuntimeError, ValueError) as error:
-        # What is not there may be a pattern; what no file can have as its name is neither.
-        if not isinstance(error, FileNotFoundError):
-            raise OptionError(
-                f"scenes: {entry.project[:80]!r} ({error}); expected a path"
-            ) from None
-    if glob.has_magic(entry.project):
         found = sorted(place for place in glob.glob(path) if Path(place).is_dir())
-        if not found:
-            raise OptionError(f"scenes: no folder fits {entry.project!r}")
-        if entry.name is not None:
-            raise OptionError(f"scenes: {entry.project!r} is a pattern and can have no 'name'")
-        return [entry.replaced(project=place, name=Path(place).name) for place in found]
-    if not Path(path).exists():
-        raise OptionError(f"scenes: {path} is not there")
-    return [entry.replaced(project=path, name=entry.name or Path(path).name)]
+        found = [path] if Path(path).exists() else found
+    if not found or (len(found) > 1 and entry.name is not None):
+        raise OptionError(
+            f"scenes: {len(found)} folders fit {entry.project[:80]!r}; expected a path or a "
+            "pattern that is there, and a 'name' for one alone"
+        )
+    return [entry.replaced(project=place, name=entry.name or Path(place).name) for place in found]

@@ -9,12 +9,12 @@ from __future__ import annotations
 import json
 import os
 import platform
-import shutil
 import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from time import monotonic
 from typing import Any
@@ -71,7 +71,7 @@ def _attempt(task: Task) -> tuple[str, str, bool]:
         if (read_record(task.record(stage)) or {}).get("status") != DONE:
             return FAILED, f"stage {stage} is not done", False
     out = _folder(task, task.stage)
-    words = {stage: str(_input(task, stage)) for stage in task.before}
+    words = {stage: str(fetch(f"{task.root}/{task.scene}/{stage}")) for stage in task.before}
     words |= {"project": str(fetch(task.project)), "name": task.scene, "out": str(out)}
     arguments = [*task.command]
     for name, value in words.items():
@@ -131,10 +131,6 @@ def _folder(task: Task, stage: str) -> Path:
     return (cache_folder(place) if is_url(task.root) else Path(place)) / stage
 
 
-def _input(task: Task, stage: str) -> Path:
-    return fetch(f"{task.root}/{task.scene}/{stage}")
-
-
 def _figures(folder: Path) -> dict[str, float]:
     """Numbers that a command left as JSON: metrics.json, evaluation.json, results.json."""
     figures: dict[str, float] = {}
@@ -158,20 +154,13 @@ def fetch(place: str) -> Path:
         return Path(place)
     local = cache_folder(place)
     if not local.exists():
-        files, remote = _open(place)
-        part: Path | None = None
-        try:
+        with _reached(place, "fetched") as (files, remote):
             local.parent.mkdir(parents=True, exist_ok=True)
             # A folder of its own: several tasks on this machine may download the same URL.
-            part = Path(tempfile.mkdtemp(prefix=".part-", dir=local.parent))
-            _download(files, remote, part / local.name)
-            os.rename(part / local.name, local)
-        except (OSError, ValueError) as error:
-            if not local.exists():
-                raise ProjectError(f"{place}: cannot be fetched ({error})") from error
-        finally:
-            if part is not None:
-                shutil.rmtree(part, ignore_errors=True)
+            with tempfile.TemporaryDirectory(prefix=".part-", dir=local.parent) as part:
+                _download(files, remote, Path(part, local.name))
+                if not local.exists():
+                    os.rename(Path(part, local.name), local)
     return local
 
 
@@ -194,8 +183,7 @@ def upload(folder: Path, place: str) -> None:
     """Copy a finished folder to its URL; does nothing if ``place`` is a path."""
     if not is_url(place):
         return
-    files, remote = _open(place)
-    try:
+    with _reached(place, "written") as (files, remote):
         if files.exists(remote):
             # Left by an upload that was interrupted.
             files.rm(remote, recursive=True)
@@ -203,24 +191,18 @@ def upload(folder: Path, place: str) -> None:
             if path.is_file():
                 name = path.relative_to(folder).as_posix()
                 files.pipe_file(f"{remote}/{name}", path.read_bytes())
-    except OSError as error:
-        raise ProjectError(f"{place}: cannot be written ({error})") from error
 
 
 def read_record(place: str) -> Record | None:
     """A JSON object; None if the file is absent or damaged."""
-    try:
-        if is_url(place):
-            files, remote = _open(place)
+    record = None
+    if not is_url(place):
+        with suppress(OSError, ValueError):
+            record = json.loads(Path(place).read_bytes())
+    else:
+        with _reached(place, "read") as (files, remote), suppress(FileNotFoundError, ValueError):
             files.invalidate_cache()
-            text = files.cat_file(remote)
-        else:
-            text = Path(place).read_bytes()
-        record = json.loads(text)
-    except (FileNotFoundError, ValueError):
-        return None
-    except OSError as error:
-        raise ProjectError(f"{place}: cannot be read ({error})") from error
+            record = json.loads(files.cat_file(remote))
     return record if isinstance(record, dict) else None
 
 
@@ -229,14 +211,13 @@ def write_record(place: str, record: Record) -> None:
     if not is_url(place):
         write_json(Path(place), record)
         return
-    files, remote = _open(place)
-    try:
+    with _reached(place, "written") as (files, remote):
         files.pipe_file(remote, json.dumps(record, indent=1).encode())
-    except OSError as error:
-        raise ProjectError(f"{place}: cannot be written ({error})") from error
 
 
-def _open(place: str) -> tuple[Any, str]:
+@contextmanager
+def _reached(place: str, done: str) -> Iterator[tuple[Any, str]]:
+    """The file system of a URL, and the path there; what fails in the block names the URL."""
     fsspec = require("fsspec", extra="cluster", purpose=place)
     try:
         files, remote = fsspec.url_to_fs(place)
@@ -244,7 +225,10 @@ def _open(place: str) -> tuple[Any, str]:
         raise OptionError(
             f"{place}: {error}; pip install 'gvtools[cluster]' reads s3:// URLs"
         ) from None
-    return files, str(remote).rstrip("/")
+    try:
+        yield files, str(remote).rstrip("/")
+    except OSError as error:
+        raise ProjectError(f"{place}: cannot be {done} ({error})") from error
 
 
 def main(argv: list[str]) -> int:

@@ -107,7 +107,7 @@ def test_a_pattern_gives_the_folders_that_fit_stage_by_stage(scenes, tmp_path):
         (("retries: 1", "retry: 1"), "stages.first.retry"),
         (("{project}", "{second}"), "{second} stands for nothing"),
         (("weights list {project}", "rm -r {project}"), "expected one of demo, capture"),
-        (("scans/*", "nowhere/*"), "no folder fits 'nowhere/*'"),
+        (("scans/*", "nowhere/*"), "0 folders fit 'nowhere/*'"),
         (("[scans/*]", "[scans/a, {project: scans/b, name: a}]"), "have this name"),
         (("[scans/*]", "[{project: scans/a, name: ../a}]"), "expected a name of letters"),
         (("scenes:", "rooms:"), "expected the keys"),
