@@ -236,7 +236,7 @@ def training_step(sizes: Sizes) -> Figures:
     from gvtools.training.options import DenoiserStageOptions
     from gvtools.training.samples import Draws, TrainingBatch
     from gvtools.training.stages import DenoiserStage
-    from pipelines.bench.random_model import random_model, random_views
+    from pipelines.bench.complete import random_model, random_views
 
     config = named(sizes.config)
     if config.video is not None:

@@ -19,8 +19,8 @@ from gvtools.completers.geoverse.config import named
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.training.options import OptimizerOptions
 from gvtools.training.samples import TrainingBatch
+from pipelines.bench.complete import random_views
 from pipelines.bench.memory import alone, fake_tensors, pass_peaks, step_peaks
-from pipelines.bench.random_model import random_views
 
 CASES = ("pass", "denoiser", "denoiser, recompute")
 MB = 1e6

@@ -18,10 +18,9 @@ from gvtools.networks.compute import autocast
 from gvtools.training.options import shipped_or_read
 from gvtools.training.samples import Draws, TrainingBatch
 from gvtools.training.stages import DenoiserStage, ReflowStage
-from pipelines.bench.complete import BETWEEN
+from pipelines.bench.complete import BETWEEN, random_views
 from pipelines.bench.memory import CPU, alone, fake_tensors, model_without_numbers
 from pipelines.bench.prediction import CARDS, Kernel, Work, row_of
-from pipelines.bench.random_model import random_views
 
 KINDS = {"denoiser": DenoiserStage, "reflow": ReflowStage}
 COUNTS = (1, 8, 64)

@@ -7,27 +7,126 @@ import os
 import statistics
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
+from contextlib import contextmanager
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode, sdpa_flop_count
 
 from gvtools.completers.geoverse.conditioning import ViewBatch
 from gvtools.completers.geoverse.config import GeoVerseConfig
 from gvtools.completers.geoverse.flow import interval_bounds
 from gvtools.completers.geoverse.model import DECODE, DECODING, LEVEL0, LEVEL1, GeoVerse, no_clock
-from gvtools.completers.geoverse.video_prior import VideoFeatures
+from gvtools.completers.geoverse.video_prior import VideoFeatures, VideoPrior, VideoPriorConfig
+from gvtools.completers.geoverse.wan import dtype_of, empty_network
 from gvtools.completers.geoverse.weights import from_pretrained
 from gvtools.networks.compute import autocast
 from pipelines.bench.options import CompleteOptions
-from pipelines.bench.random_model import random_features, random_model, random_video, random_views
 from pipelines.machine import load_average, process_peak_bytes
 
 if TYPE_CHECKING:
     from pipelines.console import Console
+
+
+# Of random weights: small enough for the activations of deep networks to stay finite.
+DEVIATION = 0.02
+# Share of the targets' pixels that the projection knows, in blocks of an eighth of a side.
+KNOWN = 0.7
+BLOCKS = 8
+TOKEN = 16  # px of a video token's edge
+
+
+def random_model(
+    config: GeoVerseConfig, device: torch.device | str = "cpu", *, seed: int = 0
+) -> GeoVerse:
+    """A model in evaluation mode, without its video prior.
+
+    Nothing is left at zero, as a fresh denoiser's gates are: zeros take a GPU less power, and so
+    less time.
+    """
+    device = torch.device(device)
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        with device:
+            model = GeoVerse(config)
+        for parameter in model.parameters():
+            if not bool(parameter.any()):
+                nn.init.normal_(parameter, std=DEVIATION)
+    return model.eval()
+
+
+def random_video(config: VideoPriorConfig, device: torch.device | str = "cpu") -> VideoPrior:
+    """A video prior of the published network's sizes, truncated behind the last tap."""
+    # What diffusers takes by default is the published network.
+    sizes = {"num_layers": config.taps[-1] + 1, "vace_layers": list(config.taps)}
+    dtype = getattr(torch, config.dtype or "bfloat16")
+    transformer: Any = _filled(empty_network("transformer", sizes), device, dtype)
+    table = transformer.config
+    with torch.device(device):
+        # Computed, not stored.
+        transformer.rope = type(transformer.rope)(
+            table.attention_head_dim, table.patch_size, table.rope_max_seq_len
+        )
+    vae = _filled(empty_network("vae", {}), device, torch.float32)
+    return VideoPrior(transformer, vae, config=replace(config, prompt="zeros"))
+
+
+def random_features(config: GeoVerseConfig, batch: ViewBatch) -> VideoFeatures | None:
+    """What a video prior would give for the batch, on its device; None where there is none."""
+    if config.video is None:
+        return None
+    rows, columns = (side // TOKEN for side in config.video.size(*batch.size))
+    samples, views = batch.images.shape[:2]
+    shape = (samples, views, config.video.channels, rows, columns)
+    levels = tuple(torch.randn(shape, device=batch.images.device) for _ in config.video.taps)
+    return VideoFeatures(levels, tuple(range(views)))
+
+
+def _filled(network: nn.Module, device: torch.device | str, dtype: torch.dtype) -> nn.Module:
+    """A network of the meta device on another, with random weights."""
+
+    def random(name: str, like: Tensor) -> Tensor:
+        empty = torch.empty(like.shape, dtype=dtype_of(name, dtype), device=device)
+        return empty.normal_(std=DEVIATION)
+
+    state = {name: random(name, like) for name, like in network.state_dict().items()}
+    network.load_state_dict(state, assign=True)
+    return network
+
+
+def random_views(size: tuple[int, int], *, context: int, targets: int, seed: int = 0) -> ViewBatch:
+    """One sample of views on an arc about a point in front of them.
+
+    ``size``: (H, W), px.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    views, (height, width) = context + targets, size
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(1, views, *shape, generator=generator)
+
+    known = uniform(1, BLOCKS, BLOCKS) < KNOWN
+    known[:, :context] = True
+    rows, columns = (torch.arange(side) * BLOCKS // side for side in size)
+    valid = known[..., rows[:, None], columns]
+    turn = torch.linspace(-0.3, 0.3, views)
+    pose = torch.eye(4).repeat(1, views, 1, 1)
+    pose[0, :, 0, 0] = pose[0, :, 2, 2] = turn.cos()
+    pose[0, :, 0, 2], pose[0, :, 2, 0] = -turn.sin(), turn.sin()
+    # Turned about (0, 0, 2), which stays in the middle of every view.
+    pose[0, :, 0, 3], pose[0, :, 2, 3] = 2 * turn.sin(), 2 - 2 * turn.cos()
+    focal = float(max(size))
+    K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    return ViewBatch(
+        images=uniform(3, height, width) * valid,
+        depth=(1.5 + uniform(1, height, width)) * valid,
+        valid=valid,
+        cam_from_world=pose,
+        K=K.repeat(1, views, 1, 1),
+        context=context,
+    )
 
 
 # Before the name of a part of the decoding.
@@ -72,17 +171,6 @@ def total(rows: Mapping[str, float]) -> float:
     return sum(value for name, value in rows.items() if not name.startswith(INSIDE))
 
 
-def seconds(device: torch.device) -> Callable[[], float]:
-    """Wall time in s, after all that was asked of the device is done."""
-
-    def now() -> float:
-        if device.type == "cuda":
-            torch.cuda.synchronize(device)
-        return time.perf_counter()
-
-    return now
-
-
 # What ``peak_bytes`` is, by the device's type.
 PEAK = {
     "cuda": "what tensors held on the device, weights included",
@@ -90,31 +178,10 @@ PEAK = {
 }
 
 
-def forget_peak(device: torch.device) -> None:
-    """Before what ``peak_bytes`` is asked for."""
-    if device.type == "cuda":
-        torch.cuda.reset_peak_memory_stats(device)
-
-
-def peak_bytes(device: torch.device) -> int:
-    """See ``PEAK``."""
-    if device.type == "cuda":
-        return torch.cuda.max_memory_allocated(device)
-    return process_peak_bytes() or 0
-
-
 PASS = "pass"
 BETWEEN = "between stages"
 # torch counts attention on a GPU, not the kernel that it takes on a CPU.
 CPU_ATTENTION = torch.ops.aten._scaled_dot_product_flash_attention_for_cpu
-
-
-@dataclass(frozen=True)
-class Times:
-    """Seconds by row of the stage table, a whole pass under ``PASS``."""
-
-    median: dict[str, float]  # over the passes
-    least: dict[str, float]  # likewise
 
 
 class TimedPass:
@@ -130,23 +197,23 @@ class TimedPass:
         dtype: torch.dtype = torch.float32,
         video: VideoFeatures | None = None,
     ) -> None:
-        self.model, self.batch, self.video = model, batch, video
+        self.model, self.batch, self.video, self.dtype = model, batch, video, dtype
         self.bounds, self.cascade_bounds = tuple(bounds), tuple(cascade_bounds)
-        self.dtype = dtype
         self.device = batch.images.device
-        self.now = seconds(self.device)
         # How often the stages with numbered steps are stepped through.
         self.steps = {LEVEL1: len(self.bounds) - 1, LEVEL0: len(self.cascade_bounds) - 1}
 
-    def precision(self) -> AbstractContextManager[Any]:
-        """Autocast where products are rounded."""
-        return autocast(self.device, self.dtype)
+    def now(self) -> float:
+        """Wall time [s], after all that was asked of the device is done."""
+        if self.device.type == "cuda":
+            torch.cuda.synchronize(self.device)
+        return time.perf_counter()
 
     def run(self, clock: StageClock | None = None) -> float:
         """One pass; the seconds it took."""
         self.model.clock = clock or no_clock
         start = self.now()
-        with self.precision():
+        with autocast(self.device, self.dtype):
             self.model.generate(
                 self.batch, bounds=self.bounds, cascade_bounds=self.cascade_bounds, video=self.video
             )
@@ -164,8 +231,11 @@ class TimedPass:
             self.run(clock)
         return clock.rows(self.steps)
 
-    def times(self, repeat: int) -> Times:
-        """Passes with a clock; on a GPU, where the clock waits for the device, also without."""
+    def times(self, repeat: int) -> dict[str, list[float]]:
+        """Seconds by row of the stage table, of each pass; a whole pass under ``PASS``.
+
+        On a GPU, where a clock waits for the device, whole passes have none.
+        """
         found: dict[str, list[float]] = {}
         for _ in range(repeat):
             gc.collect()
@@ -176,10 +246,7 @@ class TimedPass:
             rows[PASS] = self.run() if self.device.type == "cuda" else whole
             for name, spent in rows.items():
                 found.setdefault(name, []).append(spent)
-        return Times(
-            {name: statistics.median(values) for name, values in found.items()},
-            {name: min(values) for name, values in found.items()},
-        )
+        return found
 
 
 def _attention_flops(q: torch.Size, k: torch.Size, v: torch.Size, *_: Any, **options: Any) -> int:
@@ -203,14 +270,17 @@ def complete_figures(options: CompleteOptions) -> dict[str, Any]:
     counts = timed.flops()
     if options.compile:
         model.compile_blocks()
-    forget_peak(options.place)
+    gpu = options.place.type == "cuda"
+    if gpu:
+        torch.cuda.reset_peak_memory_stats(options.place)
     first_pass = timed.run()
+    peak = torch.cuda.max_memory_allocated(options.place) if gpu else process_peak_bytes()
     return {
         **_conditions(options, config),
         "parameters": parameters(model),
         "first_pass_s": first_pass,
         "weights_bytes": module_bytes(model, *prior_networks(model)),
-        "peak_bytes": peak_bytes(options.place),
+        "peak_bytes": peak or 0,
         "peak": PEAK[options.place.type],
         "results": stage_rows(counts, timed.times(options.repeat)),
     }
@@ -249,19 +319,20 @@ def _model(options: CompleteOptions, config: GeoVerseConfig) -> GeoVerse:
     return model
 
 
-def stage_rows(counts: dict[str, float], times: Times) -> list[dict[str, Any]]:
+def stage_rows(counts: dict[str, float], times: dict[str, list[float]]) -> list[dict[str, Any]]:
     """The stage table, the whole pass last."""
-    counts = counts | {PASS: total(counts)}
-    stages = total({name: s for name, s in times.median.items() if name != PASS})
-    rows: list[dict[str, Any]] = []
-    for name in (*(name for name in counts if name != PASS), BETWEEN, PASS):
-        spent, work = times.median[name], counts.get(name)
+    median = {name: statistics.median(seconds) for name, seconds in times.items()}
+    whole = median.pop(PASS)
+    stages, rows = total(median), list[dict[str, Any]]()
+    for name in (*counts, BETWEEN, PASS):
+        spent = whole if name == PASS else median[name]
+        work = total(counts) if name == PASS else counts.get(name)
         rows.append(
             {
                 "name": name,
                 "within": DECODE if name.startswith(INSIDE) else None,
                 "ours_s": spent,
-                "ours_min_s": times.least[name],
+                "ours_min_s": min(times[name]),
                 "share": None if name == PASS else spent / stages,
                 "flops": work,
                 "tflop_per_s": work / spent / 1e12 if work else None,
@@ -318,17 +389,12 @@ def show(figures: dict[str, Any], console: Console) -> None:
     console.table(
         ("stage", "s", "min s", "share", "TFLOP", "TFLOP/s"),
         [
-            (
-                row["name"],
-                row["ours_s"],
-                row["ours_min_s"],
-                None if row["share"] is None else f"{row['share']:.1%}",
-                None if row["flops"] is None else row["flops"] / 1e12,
-                row["tflop_per_s"],
-            )
+            (row["name"], row["ours_s"], row["ours_min_s"],
+             None if row["share"] is None else f"{row['share']:.1%}",
+             None if row["flops"] is None else row["flops"] / 1e12, row["tflop_per_s"])
             for row in figures["results"]
         ],
-    )
+    )  # fmt: skip
     console.table(
         ("part", "million parameters"),
         [(name, count / 1e6) for name, count in figures["parameters"].items()],

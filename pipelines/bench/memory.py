@@ -38,9 +38,14 @@ from gvtools.training.loop import Trainer
 from gvtools.training.options import DenoiserStageOptions, OptimizerOptions, ReflowStageOptions
 from gvtools.training.samples import TrainingBatch
 from gvtools.training.stages import DenoiserStage, ReflowStage, Stage
-from pipelines.bench.complete import INSIDE, module_bytes, prior_networks
+from pipelines.bench.complete import (
+    INSIDE,
+    module_bytes,
+    prior_networks,
+    random_video,
+    random_views,
+)
 from pipelines.bench.options import CompleteOptions
-from pipelines.bench.random_model import random_video, random_views
 
 if TYPE_CHECKING:
     from pipelines.console import Console

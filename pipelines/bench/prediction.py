@@ -25,7 +25,7 @@ from gvtools.completers.geoverse.config import GeoVerseConfig
 from gvtools.completers.geoverse.flow import interval_bounds
 from gvtools.completers.geoverse.model import DECODING
 from gvtools.networks.compute import autocast
-from pipelines.bench.complete import BETWEEN, CPU_ATTENTION, INSIDE, PASS
+from pipelines.bench.complete import BETWEEN, CPU_ATTENTION, INSIDE, PASS, random_views
 from pipelines.bench.memory import (
     CPU,
     alone,
@@ -35,7 +35,6 @@ from pipelines.bench.memory import (
     run_without_numbers,
 )
 from pipelines.bench.options import CompleteOptions
-from pipelines.bench.random_model import random_views
 
 if TYPE_CHECKING:
     from pipelines.console import Console

@@ -6,7 +6,7 @@ import gc
 import statistics
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -28,27 +28,26 @@ class Comparison:
 
     name: str  # what was done
     peer: str  # what a user would otherwise call
-    ours_s: float  # median seconds
-    peer_s: float  # median seconds
-    ours_min_s: float  # shortest; on a machine that does other work, nearest to the true cost
-    peer_min_s: float  # shortest
-    repeats: int  # timed turns of each
+    ours: list[float]  # seconds of each turn
+    theirs: list[float]  # likewise
     note: str = ""  # what else was found, such as how far the results agree
 
-    @property
-    def ratio(self) -> float:
-        """Ours over the peer's, of the medians: below 1 is faster."""
-        return self.ours_s / self.peer_s
-
-    @property
-    def ratio_of_minima(self) -> float:
-        """Ours over the peer's, of the shortest times."""
-        return self.ours_min_s / self.peer_min_s
-
     def to_dict(self) -> dict[str, Any]:
-        """JSON-ready, with the ratios."""
-        ratios = {"ratio": self.ratio, "ratio_of_minima": self.ratio_of_minima}
-        return asdict(self) | ratios
+        """JSON-ready: medians, shortest times (nearest to the cost), ratios (below 1 is faster)."""
+        medians = [statistics.median(seconds) for seconds in (self.ours, self.theirs)]
+        shortest = [min(self.ours), min(self.theirs)]
+        return {
+            "name": self.name,
+            "peer": self.peer,
+            "ours_s": medians[0],
+            "peer_s": medians[1],
+            "ours_min_s": shortest[0],
+            "peer_min_s": shortest[1],
+            "repeats": len(self.ours),
+            "note": self.note,
+            "ratio": medians[0] / medians[1],
+            "ratio_of_minima": shortest[0] / shortest[1],
+        }
 
 
 def alternate(
@@ -72,22 +71,6 @@ def alternate(
             if turn >= warm_up:
                 kept.append(elapsed)
     return seconds
-
-
-def comparison(
-    name: str, peer: str, ours_s: list[float], *, peer_s: list[float], note: str = ""
-) -> Comparison:
-    """Medians and minima of two lists of seconds."""
-    return Comparison(
-        name,
-        peer,
-        statistics.median(ours_s),
-        statistics.median(peer_s),
-        min(ours_s),
-        min(peer_s),
-        len(ours_s),
-        note,
-    )
 
 
 WIDTH, HEIGHT = 640, 480
@@ -117,8 +100,7 @@ def compare_fusing(memory: SpatialMemory, frames: list[Frame], *, repeat: int) -
     lifted and, as its memory, one point for each of our voxels; the second integrates the frame
     into a TSDF of the same voxel edge, the blocks of all frames being there already.
 
-    ``frames``: ``repeat`` + 1 of rgb, depth and camera; the first is the warm-up. ``repeat``: timed
-    frames.
+    ``frames``: ``repeat`` + 1 of rgb, depth and camera; the first is the warm-up.
     """
     voxel, voxels = memory.voxel, memory.voxels
     number = memory.rounds[-1] + 1 if memory.rounds else 0
@@ -135,21 +117,16 @@ def compare_fusing(memory: SpatialMemory, frames: list[Frame], *, repeat: int) -
     for picture, (_, _, camera) in zip(pictures, frames, strict=True):
         volume.integrate(*picture, camera)
 
-    def ours(turn: int) -> None:
-        rgb, depth, camera = frames[turn]
-        memory.observe(rgb, depth, camera, round=number)
-
-    def concatenate(turn: int) -> None:
-        open3d_peers.concatenate(old, clouds[turn], voxel)
-
-    def integrate(turn: int) -> None:
-        volume.integrate(*pictures[turn], frames[turn][2])
-
-    seconds = alternate([ours, concatenate, integrate], repeat)
+    calls: list[Callable[[int], object]] = [
+        lambda turn: memory.observe(*frames[turn], round=number),
+        lambda turn: open3d_peers.concatenate(old, clouds[turn], voxel),
+        lambda turn: volume.integrate(*pictures[turn], frames[turn][2]),
+    ]
+    seconds = alternate(calls, repeat)
     name = f"fuse {frames[0][0].shape[1]}x{frames[0][0].shape[0]} into {voxels:,} voxels"
     return [
-        comparison(name, "Open3D concatenate + voxel_down_sample", seconds[0], peer_s=seconds[1]),
-        comparison(name, "Open3D VoxelBlockGrid integrate", seconds[0], peer_s=seconds[2]),
+        Comparison(name, "Open3D concatenate + voxel_down_sample", seconds[0], seconds[1]),
+        Comparison(name, "Open3D VoxelBlockGrid integrate", seconds[0], seconds[2]),
     ]
 
 
@@ -195,7 +172,7 @@ def compare_splatting(
         steady=True,
     )
     name = f"project {memory.voxels:,} voxels into {camera.width[0]}x{camera.height[0]}"
-    return comparison(name, "Open3D VoxelBlockGrid ray_cast", ours_s, peer_s=peer_s)
+    return Comparison(name, "Open3D VoxelBlockGrid ray_cast", ours_s, peer_s)
 
 
 def one_pixel_rows(count: int, *, repeat: int) -> list[Comparison]:
@@ -244,6 +221,6 @@ def compare_one_pixel(
     name = f"one pixel a point, {count:,} points into {camera.width[0]}x{camera.height[0]}"
     peer = "Open3D project_to_rgbd_image"
     return [
-        comparison(name, f"{peer}, same order", seconds[0], peer_s=seconds[1], note=note),
-        comparison(name, f"{peer}, random order", seconds[0], peer_s=seconds[2]),
+        Comparison(name, f"{peer}, same order", seconds[0], seconds[1], note),
+        Comparison(name, f"{peer}, random order", seconds[0], seconds[2]),
     ]

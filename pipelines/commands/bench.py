@@ -108,22 +108,17 @@ def report(
     rows: list[Comparison], console: Console, path: Path | None, **conditions: object
 ) -> None:
     """A table, or the JSON object with the rows under ``results``."""
+    results = [row.to_dict() for row in rows]
     if path is not None:
         import os
 
         from gvtools.files import write_json
 
-        data = {**conditions, "cpus": os.cpu_count(), "results": [row.to_dict() for row in rows]}
-        write_json(path, data)
+        write_json(path, {**conditions, "cpus": os.cpu_count(), "results": results})
         console.line(f"{len(rows)} comparisons written to {path}")
         return
-    console.table(
-        ("what", "peer", "ours_s", "peer_s", "ratio", "ratio_of_minima"),
-        [
-            (row.name, row.peer, row.ours_s, row.peer_s, row.ratio, row.ratio_of_minima)
-            for row in rows
-        ],
-    )
+    columns = ("name", "peer", "ours_s", "peer_s", "ratio", "ratio_of_minima")
+    console.table(("what", *columns[1:]), [[row[key] for key in columns] for row in results])
     for row in rows:
         if row.note:
             console.line(f"{row.name}, {row.peer}: {row.note}")

@@ -21,7 +21,7 @@ from pipelines.options import Arguments
 if TYPE_CHECKING:
     from gvtools.evaluation.trajectories import PoseErrors
     from pipelines.console import Console
-    from pipelines.scoring.method_pictures import JudgeReference
+    from pipelines.scoring.judging import JudgeReference
 
 
 class ProtocolArguments(Arguments):
@@ -152,8 +152,7 @@ class JudgeCommand(MeasurementArguments, SceneArguments):
 
     def run(self, console: Console) -> None:
         from gvtools.files import folder_for_results, write_json
-        from pipelines.scoring.judging import judge
-        from pipelines.scoring.method_pictures import method_names
+        from pipelines.scoring.judging import judge, method_names
 
         names = method_names(self.pictures, self.name)
         _check_apart(self.pictures, self.out)
@@ -184,7 +183,7 @@ def _check_apart(pictures: Sequence[Path], out: Path) -> None:
 
 def _reference(args: JudgeCommand, console: Console) -> JudgeReference:
     from gvtools.runs.layout import RECORD
-    from pipelines.scoring.method_pictures import open_reference, reference_from_context
+    from pipelines.scoring.judging import open_reference, reference_from_context
 
     if (args.against / RECORD).is_file():
         args.refuse(("context", "targets"), f"{args.against} is a run, whose views are its own")

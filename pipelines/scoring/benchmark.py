@@ -293,8 +293,8 @@ def _of_pictures(opened: _OpenCell) -> tuple[dict[str, Any], dict[str, np.ndarra
     of the context alone, which is kept in the cell's run.
     """
     from gvtools.runs.digests import versions
+    from pipelines.scoring.judging import open_method, reference_from_context
     from pipelines.scoring.measurement import Measurement
-    from pipelines.scoring.method_pictures import open_method, reference_from_context
 
     cell = opened.cell
     assert cell.method.pictures is not None

@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from posed_cuda import posed_cuda
 
 from gvtools.completers.geoverse.completer import GeoVerseCompleter
-from pipelines.bench.random_model import random_views
+from pipelines.bench.complete import random_views
 
 SAME = "Expected all tensors to be on the same device"
 

@@ -17,10 +17,20 @@ from gvtools.completers.geoverse.flow import interval_bounds
 from gvtools.completers.geoverse.model import LEVEL0, LEVEL1
 from gvtools.errors import OptionError
 from gvtools.networks.compute import attend
-from pipelines.bench.complete import INSIDE, StageClock, TimedPass, module_bytes, parameters, total
+from pipelines.bench.complete import (
+    INSIDE,
+    StageClock,
+    TimedPass,
+    module_bytes,
+    parameters,
+    random_features,
+    random_model,
+    random_video,
+    random_views,
+    total,
+)
 from pipelines.bench.memory import LiveBytes, StagePeaks, alone, card_line, fake_tensors
 from pipelines.bench.prediction import ASKED, CARDS, LEAST, Card, Counter, Kernel, Work, row_of
-from pipelines.bench.random_model import random_features, random_model, random_video, random_views
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -25,8 +25,7 @@ from gvtools.training.options import SHIPPED
 from pipelines.cli import main
 from pipelines.reconstruction import prepare
 from pipelines.tuning import tune as tuning
-from pipelines.tuning.hold_outs import split_context
-from pipelines.tuning.tune import generated_psnr
+from pipelines.tuning.tune import generated_psnr, split_context
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
