@@ -27,7 +27,7 @@ from gvtools import open_project
 from gvtools.appearance.appearance import Appearance
 from gvtools.appearance.fit import Fit
 from gvtools.appearance.gaussians import Gaussians
-from gvtools.poses.views import FitView
+from gvtools.poses.refinement import FitView
 from gvtools.scenes.resized import reduced
 
 REPEATS = 5

@@ -158,29 +158,26 @@ class Appearance:
         loaded = Gaussians.load(path)
         try:
             data = load_arrays(path)
-            counts = data["counts"]
-            if counts.ndim != 1 or counts.min(initial=0) < 0 or counts.sum() != len(loaded):
+            # Earlier versions knew no surfaces.
+            surface = data.setdefault("surface", np.zeros((0, 3), np.float32))
+            counts, count = data["counts"], len(data["poses"])
+            shapes = {
+                "counts": (len(counts),), "near": (), "blend": (2,), "poses": (count, 4, 4),
+                "log_gains": (count, 3), "depth": (), "surface": (len(surface), 3),
+            }  # fmt: skip
+            for name, shape in shapes.items():
+                array = data[name]
+                finite = array.dtype.kind in "fiu" and np.isfinite(array).all()
+                if array.shape != shape or not finite:
+                    raise ValueError(f"{name} of shape {array.shape}, or not finite")
+            if counts.min(initial=0) < 0 or counts.sum() != len(loaded):
                 raise ValueError(f"counts {counts} of {len(loaded)} Gaussians")
             first, *others = (
                 Gaussians(values, frame=loaded.frame)
                 for values in np.split(loaded.values, np.cumsum(counts)[:-1])
             )
-            # Earlier versions knew no surfaces.
-            surface = np.asarray(data.setdefault("surface", np.zeros((0, 3), np.float32)))
-            if surface.ndim != 2 or surface.shape[1] != 3:
-                raise ValueError(f"surface of shape {surface.shape}")
-            numbers = ("near", "blend", "poses", "log_gains", "depth", "surface")
-            for name in numbers:
-                if data[name].dtype.kind not in "fiu" or not np.isfinite(data[name]).all():
-                    raise ValueError(f"{name} holds no finite numbers")
-            if data["blend"].shape != (2,):
-                raise ValueError(f"blend of shape {data['blend'].shape}")
             blend = Blend(*data["blend"].tolist())
             exposures = Exposures(data["poses"], data["log_gains"], float(data["depth"]))
-            count = len(exposures.poses)
-            shapes = exposures.poses.shape, exposures.log_gains.shape
-            if shapes != ((count, 4, 4), (count, 3)):
-                raise ValueError(f"exposures of shapes {shapes}")
             return cls(
                 first, float(data["near"]), blend, others=tuple(others),
                 exposures=exposures if count else None,

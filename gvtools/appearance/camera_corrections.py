@@ -1,4 +1,4 @@
-"""Corrections of cameras that are fitted along: small motions of poses, and exposure."""
+"""Corrections of cameras that are fitted along: small motions of poses, and exposures."""
 
 from __future__ import annotations
 
@@ -9,7 +9,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from gvtools.appearance.gaussians import Gaussians
+from gvtools.cameras import Cameras
 from gvtools.poses.motions import mean_near, move_pose
+from gvtools.splats import LOG_SCALE, SH, harmonics
 
 # Each component of a pose's correction stays below this angle [rad] and share of the typical depth.
 MOST_TURN, MOST_SHIFT = 0.035, 0.03
@@ -19,6 +22,9 @@ TURN_RATE, SHIFT_RATE, GAIN_RATE, RATE_END = 1e-3, 1e-3, 6e-3, 0.02
 # A camera's exposure is predicted from the COUNT photographs nearest to it, weighted by
 # exp(-(distance / (SHIFT typical depths) + angle between viewing directions [rad] / TURN)).
 COUNT, SHIFT, TURN = 4, 0.2, 0.3
+# Weight of a change of harmonics of 1 beside errors of 1 in one camera. On `fox_colmap` 0.1 loses
+# 0.2 dB to pictures with each camera's exposure, 1 loses 0.3 dB, no change 1.4 dB.
+RIDGE = 0.1
 
 
 class CameraCorrections:
@@ -180,3 +186,35 @@ class Exposures:
             pose, self.poses, self.log_gains, depth=self.depth,
             but=() if but is None else (but,), count=COUNT, reach=(SHIFT, TURN),
         )  # fmt: skip
+
+
+def expose(gaussians: Gaussians, exposures: Exposures, cameras: Cameras) -> Gaussians:
+    """Gaussians whose colours are, in cameras that see them, as these cameras are exposed.
+
+    Photographs near each other are exposed alike, so most of it depends on the direction that a
+    Gaussian is seen from, and that is what spherical harmonics can hold.
+    Each Gaussian's harmonics change by the least squares solution over the ``cameras``, such as the
+    photographs', whose picture its centre lies in. ``exposures`` are in the Gaussians' frame.
+    """
+    values = gaussians.values
+    sh = values[:, SH:].reshape(len(values), -1, 3).astype(np.float64)
+    terms = sh.shape[1]
+    normal = np.tile(RIDGE * np.eye(terms), (len(values), 1, 1))
+    right = np.zeros_like(sh)
+    for camera in cameras:
+        pose = gaussians.frame.cam_from_local(camera.cam_from_world)[0]
+        points = values[:, :LOG_SCALE].astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
+        x, y, w = (points @ camera.K[0].T).T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            xy = np.stack([x / w, y / w], axis=1)
+        size = np.array([camera.width[0], camera.height[0]])
+        seen = np.flatnonzero((points[:, 2] > 0) & ((xy > 0) & (xy < size)).all(axis=1))
+        away = points[seen] @ pose[:3, :3]
+        basis = harmonics(away / np.linalg.norm(away, axis=1, keepdims=True), 2)
+        colors = np.maximum(0.5 + np.einsum("nh,nhc->nc", basis, sh[seen]), 0)
+        change = (exposures.at(pose) - 1) * colors
+        normal[seen] += basis[:, :, None] * basis[:, None]
+        right[seen] += basis[:, :, None] * change[:, None]
+    out = values.copy()
+    out[:, SH:] = (sh + np.linalg.solve(normal, right)).reshape(len(values), -1)
+    return Gaussians(out, frame=gaussians.frame)

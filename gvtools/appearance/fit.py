@@ -30,8 +30,14 @@ from gvtools.appearance.population import Population, Sample, pixel_width
 from gvtools.appearance.splat.project_kernels import LOG_SCALE, LOGIT, QUATERNION, SH, VALUES
 from gvtools.appearance.splat.splat import Lens, Splat
 from gvtools.kernels import in_threads
-from gvtools.poses.refinement import LEAST_BETTER, comparable, prediction_error
-from gvtools.poses.views import FitView, ReducedView, reduce_view
+from gvtools.poses.refinement import (
+    LEAST_BETTER,
+    FitView,
+    ReducedView,
+    comparable,
+    prediction_error,
+    reduce_view,
+)
 
 # The progress of a fit runs from 0 to 1: the share of its time, not of its steps, that is over.
 # Numbers below that name a part of the fit are progress.

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.kernels import FAST, compiled
-from gvtools.poses.views import ReducedView
+from gvtools.poses.refinement import ReducedView
 
 # SSIM (Wang et al. 2004): a Gaussian window of 11 pixels with standard deviation 1.5, zero outside
 # the picture, and its two constants for colours from 0 to 1.

@@ -12,7 +12,7 @@ from gvtools.appearance.gaussians import Gaussians
 from gvtools.appearance.splat.project_kernels import LOG_SCALE, LOGIT, QUATERNION, VALUES
 from gvtools.errors import DegenerateError
 from gvtools.memory.store.local_frame import LocalFrame
-from gvtools.poses.views import FitView
+from gvtools.poses.refinement import FitView
 
 # Points are thinned to fewer than twice as many: few Gaussians are fitted faster, and the fit adds
 # more where they are needed.

@@ -133,11 +133,16 @@ def capture_photographs(
         if masks is not None:
             findings += complete_masks(photographs, masks, out=work / "whole_masks")
             masks = work / "whole_masks"
-        with _telling(findings):
+        try:
             mapped = _map(
                 photographs, work, source=source, lens=lens_of(photographs, lens),
                 is_video=is_video, masks=masks, learned=learned, say=say,
             )  # fmt: skip
+        except ProjectError as error:
+            # What was met may explain it.
+            warnings = [finding.message for finding in findings if finding.level == "warning"]
+            also = f"; also: {'; '.join(warnings)}" if warnings else ""
+            raise ProjectError(f"{error}{also}") from error
         locations = {item.name: item.location for item in photographs if item.location}
         placement, met = place(mapped.model, locations=locations, distance=distance)
         findings += met
@@ -189,18 +194,6 @@ def _map(
     mapped = find_cameras(replace(task, cameras=faces, masks=masks, rigs=rigs))
     rename_faces(mapped.model, rigs, images=work / IMAGES, face_masks=face_masks)
     return replace(mapped, pairs=panorama_pairs(mapped.pairs))
-
-
-@contextmanager
-def _telling(findings: Sequence[Finding]) -> Iterator[None]:
-    """Append the warnings so far to an error raised inside, since they may explain it."""
-    try:
-        yield
-    except ProjectError as error:
-        warnings = [finding.message for finding in findings if finding.level == "warning"]
-        if not warnings:
-            raise
-        raise ProjectError(f"{error}; also: {'; '.join(warnings)}") from error
 
 
 @contextmanager

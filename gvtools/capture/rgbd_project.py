@@ -26,7 +26,6 @@ from gvtools.poses.recording import RecordingPoses, RgbdFrames, find_poses
 from gvtools.scenes.calibration import INTRINSICS
 from gvtools.scenes.images import UNREADABLE, read_depth
 from gvtools.scenes.matching import named
-from gvtools.scenes.photographs import PosedFrame
 from gvtools.scenes.rgbd import (
     SIDECAR,
     UNPOSED,
@@ -154,14 +153,22 @@ def _read(source: Path, options: RgbdOptions | None) -> tuple[Recording, Scene]:
             f"{source}: {len(recording.frames)} frames with picture and depth; expected at least "
             "two that overlap; look whether names of pictures and depth maps belong together"
         )
-    unreadable = [frame.name for frame in recording.frames if not _readable(frame)]
+    unreadable = []
+    for frame in recording.frames:
+        try:
+            with open_picture(frame.image) as picture:
+                picture.load()
+            if frame.depth is not None:
+                read_depth(frame.depth)
+        except (*UNREADABLE, ProjectError):
+            unreadable.append(frame.name)
     if unreadable:
         text = (
             f"{len(unreadable)} of {len(recording.frames)} frames have a picture or depth map that "
             f"cannot be read: left out ({named(unreadable)}); copy these again"
         )
         met = [*met, Finding("warning", text)]
-        kept = [frame for frame in recording.frames if frame.name not in set(unreadable)]
+        kept = [frame for frame in recording.frames if frame.name not in unreadable]
         if len(kept) < 2:
             raise ProjectError(f"{source}: {text}; expected at least two that overlap")
         recording = replace(recording, frames=kept)
@@ -169,18 +176,6 @@ def _read(source: Path, options: RgbdOptions | None) -> tuple[Recording, Scene]:
     scene = rgbd_scene(recording)
     frames = {frame.name: frame for frame in recording.frames}
     return replace(recording, frames=[frames[name] for name in scene.names]), scene
-
-
-def _readable(frame: PosedFrame) -> bool:
-    """Whether both of a frame's files can be decoded."""
-    try:
-        with open_picture(frame.image) as picture:
-            picture.load()
-        if frame.depth is not None:
-            read_depth(frame.depth)
-    except (*UNREADABLE, ProjectError):
-        return False
-    return True
 
 
 def _names(recording: Recording) -> list[str]:

@@ -102,22 +102,16 @@ def adjust_cameras(
         lift = np.zeros((6 * len(others), 6 * (len(others) + 1)))
         for i, pose in enumerate(relative):
             lift[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] = np.eye(6)
-            lift[6 * i : 6 * i + 6, -6:] = -_adjoint(pose)
+            # A motion in the reference's frame as one in the source's: the adjoint.
+            rotation, (x, y, z) = pose[:3, :3], pose[:3, 3]
+            cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+            lift[6 * i : 6 * i + 3, -6:-3] = lift[6 * i + 3 : 6 * i + 6, -3:] = -rotation
+            lift[6 * i + 3 : 6 * i + 6, -6:-3] = -(cross @ rotation)
         rows = np.concatenate([np.arange(6 * v, 6 * v + 6) for v in (*others, view)])
         system[np.ix_(rows, rows)] += lift.T @ measured.system @ lift
         right[rows] += lift.T @ measured.right
     motion = np.linalg.solve(system, right).reshape(count, 6).astype(np.float64)
     return replace(cameras, cam_from_world=_rigid(motion) @ cameras.cam_from_world)
-
-
-def _adjoint(pose: Float64) -> Float64:
-    """(6, 6) a motion in one camera's frame as a motion in another's (the adjoint)."""
-    rotation, (x, y, z) = pose[:3, :3], pose[:3, 3]
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    carried = np.zeros((6, 6))
-    carried[:3, :3] = carried[3:, 3:] = rotation
-    carried[3:, :3] = cross @ rotation
-    return carried
 
 
 def _derivatives(

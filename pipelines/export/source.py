@@ -139,7 +139,7 @@ class ExportSource:
             return Splats(values[:, : SH + 3], origin, 0, 0, rounds, generated, self.up)
         first = appearance.gaussians
         if exposed and appearance.exposures is not None:
-            from gvtools.appearance.harmonics import expose
+            from gvtools.appearance.camera_corrections import expose
 
             photographs = concatenate([view.camera for view in memory.views.photographed])
             first = expose(first, appearance.exposures, photographs)

@@ -42,7 +42,7 @@ from gvtools.depth.source import DepthMap, MixedDepth, RecordedDepth, is_recorde
 from gvtools.errors import DegenerateError, GvError, MemoryFileError, OptionError, ShapeError
 from gvtools.memory.projection import project
 from gvtools.memory.spatial_memory import SpatialMemory
-from gvtools.poses.views import FitView
+from gvtools.poses.refinement import FitView
 from gvtools.prefetch import prefetch
 from gvtools.runs.poses import RunPoses
 from gvtools.scenes.images import resize_nearest

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from gvtools.cameras import Cameras
 from gvtools.completers.base import Completer, create
 from gvtools.errors import DegenerateError, OptionError, ProjectError
-from gvtools.poses.views import FitView
 from gvtools.prefetch import prefetch
 from gvtools.runs.layout import POSES, TUNED
 from gvtools.runs.poses import RunPoses, posed, with_poses
@@ -231,7 +230,7 @@ def refined_poses_of(
     scale, and poses where features do not.
     """
     from gvtools.poses.bundle_adjustment import SIDE, adjusted_poses, can_adjust, tracks_of
-    from gvtools.poses.refinement import refined_poses
+    from gvtools.poses.refinement import FitView, refined_poses
 
     scene = reduced(scene, SIDE)
     # Lengths stay small there, also in a world whose origin is far away.

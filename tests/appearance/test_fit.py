@@ -30,7 +30,7 @@ from gvtools.appearance.fit_options import (
 )
 from gvtools.appearance.loss import ESTIMATE, ESTIMATE_TOLERANCE, add_depth
 from gvtools.appearance.splat.splat import Lens, Splat
-from gvtools.poses.views import FitView, reduce_view
+from gvtools.poses.refinement import FitView, reduce_view
 
 # Small numbers of steps leave no room for pictures at a quarter of their size; sizes go by share.
 STEPS = 150

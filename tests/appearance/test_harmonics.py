@@ -10,9 +10,8 @@ from reference_gaussians import harmonics as reference
 from scipy.spatial.transform import Rotation
 from splat_scene import HEIGHT, NEAR, WIDTH, K, pose, rough_gaussians, walk
 
-from gvtools.appearance.camera_corrections import Exposures
+from gvtools.appearance.camera_corrections import Exposures, expose
 from gvtools.appearance.gaussians import ATTRIBUTES, FIRST_OPACITY, Gaussians
-from gvtools.appearance.harmonics import expose
 from gvtools.appearance.splat.project_kernels import HARMONICS, LOGIT, SH, VALUES
 from gvtools.appearance.splat.splat import Lens, Splat
 from gvtools.cameras import Cameras

@@ -9,8 +9,7 @@ import pytest
 from splat_scene import photographs, pose_errors, walk
 
 from gvtools.poses.motions import move_pose, nearest_pairs
-from gvtools.poses.refinement import agreeing_poses, refined_poses
-from gvtools.poses.views import FitView
+from gvtools.poses.refinement import FitView, agreeing_poses, refined_poses
 from gvtools.similarity import align_poses
 
 COUNT, SIZE = 8, 3

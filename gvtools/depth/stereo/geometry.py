@@ -174,10 +174,10 @@ def estimate_range(scene: Scene, name: str) -> DepthRange:
     )
 
 
-def range_of_depths(depths: Float64, *, origin: str, margin: float = MARGIN) -> DepthRange:
+def range_of_depths(depths: Float64, *, origin: str) -> DepthRange:
     """The range that known depths (N,) of a view span, outliers among them, times a margin."""
     low, lower, upper, high = np.percentile(depths, [LOW, 25, 75, HIGH])
-    return DepthRange(float(low / margin), float(high * margin), float(lower), float(upper), origin)
+    return DepthRange(float(low / MARGIN), float(high * MARGIN), float(lower), float(upper), origin)
 
 
 def baselines(scene: Scene, name: str) -> Float64:
@@ -252,8 +252,16 @@ def choose_sources(
     score = weight.mean(1) * (turned > np.cos(np.deg2rad(60)))
     score *= shared.mean(1) >= LEAST_OVERLAP
     baseline = baselines(scene, name)[rows]
-    chosen = _spread_out(score * (baseline > 0), baseline, sources.centers, count=count)
-    return tuple(others[i] for i in chosen)
+    score *= baseline > 0
+    baseline = np.where(baseline > 0, baseline, np.inf)
+    chosen: list[str] = []
+    while len(chosen) < count and score.max() > 0:
+        best = int(np.argmax(score))
+        chosen.append(others[best])
+        gap = np.linalg.norm(sources.centers - sources.centers[best], axis=-1) / baseline
+        score = score * (1 - np.exp(-0.5 * (gap / APART) ** 2))
+        score[best] = 0
+    return tuple(chosen)
 
 
 def parallax(center: Float64, others: Float64, points: Float64) -> Float64:
@@ -263,22 +271,6 @@ def parallax(center: Float64, others: Float64, points: Float64) -> Float64:
     cosine = np.einsum("nj,snj->sn", one, two)
     cosine /= np.linalg.norm(one, axis=-1) * np.linalg.norm(two, axis=-1) + 1e-300
     return np.rad2deg(np.arccos(np.clip(cosine, -1, 1)))
-
-
-def _spread_out(score: Float64, baseline: Float64, centers: Float64, *, count: int) -> list[int]:
-    """Rows of the best scores, each lowered by how near it stands to those already taken.
-
-    A score is 0 where the baseline is.
-    """
-    chosen: list[int] = []
-    baseline = np.where(baseline > 0, baseline, np.inf)
-    while len(chosen) < count and score.max() > 0:
-        best = int(np.argmax(score))
-        chosen.append(best)
-        gap = np.linalg.norm(centers - centers[best], axis=-1) / baseline
-        score = score * (1 - np.exp(-0.5 * (gap / APART) ** 2))
-        score[best] = 0
-    return chosen
 
 
 def _frustum_points(camera: Cameras, depths: DepthRange) -> Float64:

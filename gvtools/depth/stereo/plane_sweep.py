@@ -6,6 +6,7 @@ Of one view: a coarse sweep, then planes carried to finer levels.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -102,7 +103,11 @@ class PlaneSweepStereo:
         """The depth of ``view``, whose pixels are ``frame``; 0 where it is not known well."""
         raw = self.raw(view, frame)
         options = self.options
-        others = [other for other in map(self._confirming, raw.sources) if other is not None]
+        others = []
+        for name in raw.sources:
+            # No view of the pool may show what it does.
+            with suppress(DegenerateError):
+                others.append(self.raw(self._scene[name]))
         compared = filtering.agreement(
             raw.inverse_depth, raw.camera,
             [(other.inverse_depth, other.camera) for other in others],
@@ -156,13 +161,6 @@ class PlaneSweepStereo:
         if view.name in self.views:
             self._raw[view.name] = raw
         return raw
-
-    def _confirming(self, name: str) -> RawDepth | None:
-        """A source's own estimate; None when no view of the pool shows what it does."""
-        try:
-            return self.raw(self._scene[name])
-        except DegenerateError:
-            return None
 
     @property
     def cameras(self) -> Cameras:

@@ -23,7 +23,7 @@ from gvtools.errors import DegenerateError, MemoryFileError
 from gvtools.memory.projection import project
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.store.local_frame import LocalFrame
-from gvtools.poses.views import FitView
+from gvtools.poses.refinement import FitView
 from gvtools.runs.poses import RunPoses
 from gvtools.scenes.project import open_project
 from gvtools.settings import with_texts
