@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 
@@ -45,6 +45,8 @@ TAPS = 4
 VIDEO = VideoPriorConfig(taps=(0, 1, 2, 3), channels=48, prompt_rows=6, prompt="zeros")
 WHOLE = "the shipped form: memory, no video prior"
 
+Injection = Literal["control", "shared", "none"]
+
 
 @dataclass(frozen=True)
 class Variant:
@@ -59,7 +61,7 @@ class Variant:
 
     folder: str
     settings: tuple[str, ...] = ()
-    injection: str = "none"
+    injection: Injection = "none"
     memory: bool = True
 
 
@@ -141,7 +143,7 @@ def _train(config: TrainingSettings, out: Path, start: Path) -> None:
         stage.train(resume=True, say=Console().line)
 
 
-def _with_injection(config: GeoVerseConfig, injection: str) -> GeoVerseConfig:
+def _with_injection(config: GeoVerseConfig, injection: Injection) -> GeoVerseConfig:
     if injection == "none":
         return config
     last = config.level1.depth - 1

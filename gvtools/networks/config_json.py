@@ -5,9 +5,9 @@ from __future__ import annotations
 import difflib
 import math
 import types
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
-from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from gvtools.errors import OptionError
 
@@ -36,13 +36,6 @@ def check_range(
         ends = {"at least": ge, "more than": gt, "at most": le, "less than": lt}
         wanted = " and ".join(f"{word} {end:g}" for word, end in ends.items() if end is not None)
         raise OptionError(f"{name} {value}; expected {wanted or 'a number'}")
-
-
-def check_choice(name: str, value: object, known: Collection[object]) -> None:
-    """Refuse a value that is not one of the known ones."""
-    if value not in known:
-        choices = " or ".join(repr(choice) for choice in known)
-        raise OptionError(f"{name} = {value!r}; expected {choices}")
 
 
 def to_json(value: Any) -> Any:
@@ -76,6 +69,11 @@ def _value(kind: Any, data: Any, where: str) -> Any:
             return None
         rest = [choice for choice in arguments if choice is not type(None)]
         return _value(rest[0], data, where)
+    if origin is Literal:
+        if data not in arguments:
+            choices = " or ".join(map(repr, arguments))
+            raise OptionError(f"{where} = {data!r:.60}; expected {choices}")
+        return data
     if origin is tuple:
         if not isinstance(data, (list, tuple)):
             raise OptionError(f"{where} = {data!r:.60}; expected a list")

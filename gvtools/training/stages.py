@@ -20,7 +20,6 @@ from torch import Tensor, nn
 from gvtools.completers.geoverse.composition import compose
 from gvtools.completers.geoverse.flow import (
     clean_from_velocity,
-    fast_loss,
     guide,
     interpolate,
     interval_times,
@@ -220,7 +219,7 @@ class ReflowStage(Stage):
         reflow = self._error(prepared, pair.state, pair.t, velocity=pair.velocity)
         state, time, wanted = self.noisy_state(clean, noise, draws.uniform("t", 1))
         matching = self._error(prepared, state, time, velocity=wanted)
-        total = fast_loss(reflow, matching, rho=options.rho)
+        total = options.rho * reflow + (1 - options.rho) * matching
         return total, {"reflow": reflow, "flow": matching}
 
     def _error(self, prepared: Prepared, state: Tensor, t: Tensor, *, velocity: Tensor) -> Tensor:

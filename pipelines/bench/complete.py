@@ -17,7 +17,7 @@ from torch.utils.flop_counter import FlopCounterMode, sdpa_flop_count
 
 from gvtools.completers.geoverse.conditioning import ViewBatch
 from gvtools.completers.geoverse.config import GeoVerseConfig
-from gvtools.completers.geoverse.flow import interval_bounds
+from gvtools.completers.geoverse.flow import time_grid
 from gvtools.completers.geoverse.model import DECODE, DECODING, LEVEL0, LEVEL1, GeoVerse, no_clock
 from gvtools.completers.geoverse.video_prior import VideoFeatures, VideoPrior, VideoPriorConfig
 from gvtools.completers.geoverse.wan import dtype_of, empty_network
@@ -262,8 +262,8 @@ def complete_figures(options: CompleteOptions) -> dict[str, Any]:
     timed = TimedPass(
         model,
         batch,
-        bounds=interval_bounds(options.steps, shift=config.flow.shift),
-        cascade_bounds=interval_bounds(options.cascade_steps, shift=config.flow.shift),
+        bounds=time_grid(options.steps, shift=config.flow.shift),
+        cascade_bounds=time_grid(options.cascade_steps, shift=config.flow.shift),
         dtype=options.compute_type,
         video=None if options.runs_video(config) else random_features(config, batch),
     )

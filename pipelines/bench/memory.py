@@ -30,7 +30,7 @@ from torch.utils._pytree import tree_leaves
 
 from gvtools.completers.geoverse.conditioning import ViewBatch
 from gvtools.completers.geoverse.config import GeoVerseConfig
-from gvtools.completers.geoverse.flow import interval_bounds
+from gvtools.completers.geoverse.flow import time_grid
 from gvtools.completers.geoverse.model import DECODE, DECODING, VIDEO, GeoVerse
 from gvtools.networks.compute import autocast, name_of
 from gvtools.training.distributed import Processes, Replicated
@@ -226,8 +226,8 @@ def pass_peaks(
         peaks = model.clock = StagePeaks(live)
         model.generate(
             batch,
-            bounds=interval_bounds(steps[0], shift=shift),
-            cascade_bounds=interval_bounds(steps[1], shift=shift),
+            bounds=time_grid(steps[0], shift=shift),
+            cascade_bounds=time_grid(steps[1], shift=shift),
         )
     return peaks.rows
 

@@ -22,7 +22,7 @@ from torch.utils._pytree import tree_leaves
 from torch.utils.flop_counter import flop_registry, sdpa_backward_flop_count, sdpa_flop_count
 
 from gvtools.completers.geoverse.config import GeoVerseConfig
-from gvtools.completers.geoverse.flow import interval_bounds
+from gvtools.completers.geoverse.flow import time_grid
 from gvtools.completers.geoverse.model import DECODING
 from gvtools.networks.compute import autocast
 from pipelines.bench.complete import BETWEEN, CPU_ATTENTION, INSIDE, PASS, random_views
@@ -177,7 +177,7 @@ def row_of(stage: str, work: Counter[Kernel]) -> dict[str, Any]:
 def _pass(options: CompleteOptions, config: GeoVerseConfig) -> dict[str, Counter[Kernel]]:
     """By stage, in their order."""
     steps = (options.steps, options.cascade_steps)
-    bounds = [interval_bounds(count, shift=config.flow.shift) for count in steps]
+    bounds = [time_grid(count, shift=config.flow.shift) for count in steps]
     with fake_tensors():
         model = model_without_numbers(config)
         model.hold_in(options.compute_type)

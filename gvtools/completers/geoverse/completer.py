@@ -34,7 +34,7 @@ from gvtools.completers.geoverse.composition import (
     to_scene_scale,
 )
 from gvtools.completers.geoverse.conditioning import fill_holes
-from gvtools.completers.geoverse.flow import interval_bounds
+from gvtools.completers.geoverse.flow import time_grid
 from gvtools.completers.geoverse.model import GeoVerse
 from gvtools.completers.geoverse.views import choose_views, context_depth, model_size, view_batch
 from gvtools.completers.geoverse.weights import (
@@ -265,7 +265,7 @@ class GeoVerseCompleter(Completer):
             """Times 1 = tau_0 > ... > tau_K = 0 of K Euler steps; empty if nothing is denoised."""
             if steps is None or steps == len(own) - 1:
                 return own
-            return interval_bounds(steps, shift=flow.sampling_shift) if steps else ()
+            return time_grid(steps, shift=flow.sampling_shift) if steps else ()
 
         batch, cameras = view_batch(context, part, size, fill=fill)
         # A photograph and a target of one name must not start from the same noise.

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any
+from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F
@@ -21,8 +21,7 @@ from torch import Tensor, nn
 
 from gvtools.completers.geoverse.camera_encoding import normalised_poses
 from gvtools.completers.push_pull import push_pull, push_pull_depth
-from gvtools.errors import ShapeError
-from gvtools.networks.config_json import check_choice, check_range
+from gvtools.networks.config_json import check_range
 from gvtools.networks.depth_anything.network import DepthAnything3, relative_cameras
 
 LOG_DEPTH_LIMIT = 6.0
@@ -61,31 +60,26 @@ class HintConfig:
 
     # "none": holes are black; "push-pull": they are filled before encoding; "surfaces": likewise,
     # and callers fill what they can along surfaces first (``surface_fill``).
-    fill: str = "none"
+    fill: Literal["none", "push-pull", "surfaces"] = "none"
     # "jointly": context and projections in one pass (Eq. 1); "alone": the context views by
     # themselves, and the projections with them in a second pass; "context": the context views by
     # themselves and no projections, as GLD does.
-    encode: str = "jointly"
+    encode: Literal["jointly", "alone", "context"] = "jointly"
     # Features of a token count where at least this share of its pixels is valid; 0: the features
     # are not masked (of use with filled holes).
     mask: float = 0.5
     cameras: bool = False  # known cameras go into the encoder's camera tokens
     # Of those cameras: "median", the median distance of the centres from the first (DA3); or
     # "depth", the mean known depth of the context, where any is known.
-    camera_unit: str = "median"
+    camera_unit: Literal["median", "depth"] = "median"
     # Level-0 features of the context come from the context "alone" (as GLD trains its cascade) or
     # from the "jointly" encoded sequence.
-    cascade_context: str = "alone"
+    cascade_context: Literal["alone", "jointly"] = "alone"
     # Token 0 of generated features: "first-context" encoded alone and shared by all views (GLD), or
     # each view's "own" of the joint encoding.
-    token: str = "first-context"
+    token: Literal["first-context", "own"] = "first-context"
 
     def __post_init__(self) -> None:
-        check_choice("hints.fill", self.fill, ("none", "push-pull", "surfaces"))
-        check_choice("hints.encode", self.encode, ("jointly", "alone", "context"))
-        check_choice("hints.camera_unit", self.camera_unit, ("median", "depth"))
-        check_choice("hints.cascade_context", self.cascade_context, ("alone", "jointly"))
-        check_choice("hints.token", self.token, ("first-context", "own"))
         check_range("hints.mask", self.mask, ge=0, le=1)
 
 
@@ -105,25 +99,6 @@ class ViewBatch:
     # (B, V, 2, H, W) what the caller's fill of holes rests on: the confidence of its depth, and the
     # weight of the photographs that its colour was seen in, in [0, 1]; None without such a fill.
     evidence: Tensor | None = None
-
-    def __post_init__(self) -> None:
-        views, channels = self.images.shape[1:3] if self.images.ndim == 5 else (0, 0)
-        if channels != 3 or not 1 <= self.context <= views:
-            raise ShapeError(
-                f"images {tuple(self.images.shape)} with {self.context} context view(s); expected "
-                "(B, V, 3, H, W) and 1 to V context views"
-            )
-        batch, _, _, *size = self.images.shape
-        for what, shape in (
-            ("depth", (1, *size)),
-            ("valid", (1, *size)),
-            ("cam_from_world", (4, 4)),
-            ("K", (3, 3)),
-            ("evidence", (2, *size)),
-        ):
-            value, expected = getattr(self, what), (batch, views, *shape)
-            if value is not None and tuple(value.shape) != expected:
-                raise ShapeError(f"{what} {tuple(value.shape)}; expected {expected}")
 
     @property
     def size(self) -> tuple[int, int]:

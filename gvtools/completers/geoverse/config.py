@@ -10,17 +10,18 @@ import json
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
+from typing import Literal
 
 from gvtools.completers.geoverse.conditioning import HintConfig
 from gvtools.completers.geoverse.denoiser import DenoiserConfig
-from gvtools.completers.geoverse.flow import check_bounds
+from gvtools.completers.geoverse.flow import MOST_SHIFT, check_bounds
 from gvtools.completers.geoverse.refiner import RefinerConfig
 from gvtools.completers.geoverse.rgb_head import RGBHeadConfig
 from gvtools.completers.geoverse.video_injection import ControlConfig, SharedAttentionConfig
 from gvtools.completers.geoverse.video_prior import VideoPriorConfig
 from gvtools.completers.geoverse.wan import MOST_BLOCKS
 from gvtools.errors import CheckpointError, OptionError
-from gvtools.networks.config_json import check_choice, check_range, from_json, to_json
+from gvtools.networks.config_json import check_range, from_json, to_json
 from gvtools.networks.depth_anything.network import DepthAnythingConfig
 from gvtools.untrusted import read_json
 
@@ -34,7 +35,7 @@ class FlowConfig:
 
     # What the level-1 denoiser is trained to return: "velocity" (the paper) or "clean" latents,
     # from which the velocity follows.
-    prediction: str = "velocity"
+    prediction: Literal["velocity", "clean"] = "velocity"
     skip: bool = False  # with "clean": the denoiser returns the difference from the hints' features
     least_time: float = 0.05  # t below which a clean prediction's velocity is not divided further
     # Interval bounds of level 1, from 1 to 0 (Geometric Latent Diffusion ends a little above); one
@@ -54,12 +55,11 @@ class FlowConfig:
     temperature: float = 1.0
 
     def __post_init__(self) -> None:
-        check_choice("flow.prediction", self.prediction, ("velocity", "clean"))
         if self.skip and self.prediction != "clean":
             raise OptionError("flow.skip needs flow.prediction = 'clean'")
         check_range("flow.least_time", self.least_time, gt=0, le=1)
-        check_range("flow.shift", self.shift, gt=0)
-        check_range("flow.sampling_shift", self.sampling_shift, gt=0)
+        for name in ("shift", "sampling_shift"):
+            check_range(f"flow.{name}", getattr(self, name), ge=1 / MOST_SHIFT, le=MOST_SHIFT)
         check_range("flow.cfg_scale", self.cfg_scale, ge=0)
         check_range("flow.cascade_cfg_scale", self.cascade_cfg_scale, ge=0)
         check_range("flow.temperature", self.temperature, ge=0)
@@ -107,19 +107,20 @@ class GeoVerseConfig:
     camera: CameraConfig = field(default_factory=CameraConfig)  # camera conventions
     # How generated depth gets the memory's scale, see ``depth_scale``: "centres" (the paper),
     # "hint" or "field".
-    alignment: str = "centres"
+    alignment: Literal["centres", "hint", "field"] = "centres"
     # Whether generated colours stay "unchanged" (the paper) or follow the memory's by a "field",
     # see ``composition.align_color``.
-    color_alignment: str = "unchanged"
+    color_alignment: Literal["unchanged", "field"] = "unchanged"
     # The completion is the model's "decoded" pictures and depth (the paper), or a "correction" of
     # the filled projection, see ``composition``; it needs ``hints.fill``.
-    composition: str = "decoded"
+    composition: Literal["decoded", "correction"] = "decoded"
     # What is asked how far completions are to be trusted, see ``refiner``; None for a model without
     # one. It needs ``composition = "correction"``.
     refiner: RefinerConfig | None = None
     # The video prior; None for a model without one.
     video: VideoPriorConfig | None = field(default_factory=VideoPriorConfig)
-    injection: str = "control"  # how video features enter: "control", "shared" (MoT) or "none"
+    # How video features enter; "shared" is the MoT variant.
+    injection: Literal["control", "shared", "none"] = "control"
     control: ControlConfig = field(default_factory=ControlConfig)  # of the control branch
     # Of the MoT variant.
     shared: SharedAttentionConfig = field(default_factory=SharedAttentionConfig)
@@ -128,11 +129,6 @@ class GeoVerseConfig:
     def __post_init__(self) -> None:
         encoder = self.geometry.encoder
         channels = encoder.channels
-        levels = len(encoder.taps)
-        check_choice("injection", self.injection, ("control", "shared", "none"))
-        check_choice("composition", self.composition, ("decoded", "correction"))
-        check_choice("color_alignment", self.color_alignment, ("unchanged", "field"))
-        check_choice("alignment", self.alignment, ("centres", "hint", "field"))
         if self.composition == "correction" and self.hints.fill == "none":
             raise OptionError("composition = 'correction' needs filled hints; set hints.fill")
         if self.refiner is not None and self.composition != "correction":
@@ -163,7 +159,7 @@ class GeoVerseConfig:
             "geometry.head.patch": (self.geometry.head.patch, encoder.patch),
             "level1.channels": (self.level1.channels, channels),
             "level1.camera_patch": (self.level1.camera_patch, encoder.patch),
-            "rgb.in_channels": (self.rgb.in_channels, levels * channels),
+            "rgb.in_channels": (self.rgb.in_channels, len(encoder.taps) * channels),
             "rgb.patch": (self.rgb.patch, encoder.patch),
         }
         if self.cascade is not None:

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor, nn
 
 from gvtools.completers.geoverse.camera_encoding import HEAD_MULTIPLE, CameraCondition, Projective
-from gvtools.errors import OptionError, ShapeError
+from gvtools.errors import OptionError
 from gvtools.networks.compute import Recomputing, attend
 from gvtools.networks.depth_anything.encoder import PatchEmbed
 
@@ -253,11 +253,10 @@ class Denoiser(Recomputing):
         """Tokens that enter the encoder, (B, V, N, width)."""
         second = noisy
         if self.config.source:
-            if conditions.source is None:
-                raise ShapeError("the cascade got no source latents; give the level-1 latents")
+            assert conditions.source is not None
             second = conditions.source
-        context = conditions.camera.context
-        s = self._split("s", torch.cat((conditions.latents, second), dim=2), context)
+        pair = torch.cat((conditions.latents, second), dim=2)
+        s = self._split("s", pair, conditions.camera.context)
         s = s + _tokens(self.camera_embedder, conditions.camera.map.to(s.dtype))
         if self.config.depth_condition and conditions.depth is not None:
             s = s + _tokens(self.depth_embedder, conditions.depth.to(s.dtype))

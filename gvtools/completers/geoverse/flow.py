@@ -26,7 +26,6 @@ from torch import Tensor
 
 from gvtools.errors import OptionError
 from gvtools.networks.compute import on_device
-from gvtools.networks.config_json import check_range
 
 Time = TypeVar("Time", float, Tensor)
 Velocity = Callable[[Tensor, Tensor], Tensor]
@@ -41,20 +40,17 @@ MOST_THREADS = 8
 
 def shift_time(t: Time, shift: float) -> Time:
     """Uniform time to shifted time; 0 and 1 stay, ``shift`` 1 changes nothing."""
-    check_range("time shift", shift, ge=1 / MOST_SHIFT, le=MOST_SHIFT)
     # 1 + (s - 1) t, written so that nothing cancels and t = 1 gives s to the last digit.
     return shift * t / (1 if shift == 1 else (1 - t) + shift * t)
 
 
 def unshift_time(t: Time, shift: float) -> Time:
     """The inverse of ``shift_time``."""
-    check_range("time shift", shift, ge=1 / MOST_SHIFT, le=MOST_SHIFT)
     return shift_time(t, 1 / shift)
 
 
 def latent_shift(values: int, *, base: int = 4096) -> float:
     """Geometric Latent Diffusion's shift sqrt(values / base), of values = C h w V a sample."""
-    check_range("latent values", values, ge=1)
     return math.sqrt(values / base)
 
 
@@ -62,9 +58,6 @@ def time_grid(
     steps: int, *, shift: float = 1.0, start: float = 1.0, end: float = 0.0
 ) -> tuple[float, ...]:
     """``steps`` + 1 falling times from ``start`` to ``end``, equally spaced before the shift."""
-    check_range("steps", steps, ge=1)
-    check_range("time grid's start", start, gt=0, le=1)
-    check_range("time grid's end", end, ge=0, lt=start)
     first, last = unshift_time(start, shift), unshift_time(end, shift)
     inner = (first + (last - first) * k / steps for k in range(1, steps))
     times = (start, *(shift_time(u, shift) for u in inner), end)
@@ -81,29 +74,15 @@ def gld_time_grid(points: int, *, shift: float) -> tuple[float, ...]:
     return time_grid(points - 1, shift=shift, end=shift_time(GLD_END, shift))
 
 
-def interval_bounds(intervals: int | Sequence[float], *, shift: float = 1.0) -> tuple[float, ...]:
-    """1 = tau_0 > ... > tau_K = 0, equally long before the shift; or an explicit list, checked."""
-    if isinstance(intervals, int):
-        return time_grid(intervals, shift=shift)
-    return check_bounds(intervals)
-
-
 def check_bounds(bounds: Sequence[float], *, whole: bool = False) -> tuple[float, ...]:
     """K + 1 bounds as floats; a ``whole`` list has to end at 0, where no noise is left."""
     tau = tuple(float(bound) for bound in bounds)
-    wanted = f"expected 1 = tau_0 > tau_1 > ... > tau_K {'=' if whole else '>='} 0"
-    if len(tau) < 2:
-        raise OptionError(f"interval bounds {list(tau)}: {len(tau)} value(s); {wanted}")
-    if tau[0] != 1:
-        raise OptionError(f"interval bounds {list(tau)} begin at {tau[0]:g}; {wanted}")
-    for index in range(1, len(tau)):
-        if not tau[index] < tau[index - 1]:
-            raise OptionError(
-                f"interval bounds {list(tau)}: tau_{index} = {tau[index]:g} is not below "
-                f"tau_{index - 1} = {tau[index - 1]:g}; {wanted}"
-            )
-    if tau[-1] < 0 or (whole and tau[-1] != 0):
-        raise OptionError(f"interval bounds {list(tau)} end at {tau[-1]:g}; {wanted}")
+    falls = len(tau) > 1 and all(later < earlier for earlier, later in pairwise(tau))
+    if not falls or tau[0] != 1 or tau[-1] < 0 or (whole and tau[-1] > 0):
+        raise OptionError(
+            f"interval bounds {list(tau)}; expected 1 = tau_0 > tau_1 > ... > tau_K "
+            f"{'=' if whole else '>='} 0"
+        )
     return tau
 
 
@@ -112,7 +91,6 @@ def training_times(uniform: Tensor, *, shift: float = 1.0, most: float = 1.0) ->
 
     The paper's t ~ U(0, 1) is 1 and 1; Geometric Latent Diffusion has 0.999 and ``latent_shift``.
     """
-    check_range("largest training time", most, gt=0, le=1)
     return shift_time(uniform * most, shift)
 
 
@@ -146,7 +124,6 @@ def velocity_from_clean(
 
     As t falls to 0, ``least`` keeps the prediction's errors from growing beyond 1 / least.
     """
-    check_range("least time", least, gt=0, le=1)
     time = over_state(t, state)
     time = time.clamp(min=least) if isinstance(time, Tensor) else max(time, least)
     return ((state - clean) / time).to(state.dtype)
@@ -157,7 +134,6 @@ def guide(both: Velocity, scale: float) -> Velocity:
 
     ``both`` takes a batch twice in one, first without the condition; at a scale of 1 once.
     """
-    check_range("cfg_scale", scale, ge=0, lt=math.inf)
     if scale == 1:
         return both
 
@@ -172,9 +148,6 @@ def integrate(
     velocity: Velocity,  # of (B, ...) and t (B,), returns (B, ...)
     state: Tensor,  # (B, ...) at the first time
     times: Sequence[float] | Tensor,  # (S + 1,), or (S + 1, B) for times of each sample's own
-    *,
-    # Receives the number of steps made, their time (B,) and the state (B, ...).
-    callback: Callable[[int, Tensor, Tensor], None] | None = None,
 ) -> Tensor:
     """Euler steps of dx/dt = velocity(x, t) along ``times``; the state at the last one.
 
@@ -189,8 +162,6 @@ def integrate(
     for step in range(len(strides)):
         u = velocity(current.to(state.dtype), at[step])
         current = current + over_state(strides[step], current) * u.to(wide)
-        if callback is not None:
-            callback(step + 1, at[step + 1], current)
     return current.to(state.dtype)
 
 
@@ -198,11 +169,9 @@ def sample(
     velocity: Velocity,
     noise: Tensor,  # (B, ...), the state at t = 1
     bounds: Sequence[float],  # K + 1 times, see ``check_bounds``; the last is 0 in GeoVerse
-    *,
-    callback: Callable[[int, Tensor, Tensor], None] | None = None,
 ) -> Tensor:  # The state (B, ...) at the last bound
     """From noise to clean with one Euler step an interval."""
-    return integrate(velocity, noise, check_bounds(bounds), callback=callback)
+    return integrate(velocity, noise, check_bounds(bounds))
 
 
 def view_seed(seed: int, *names: int | str) -> int:
@@ -266,7 +235,6 @@ def interval_times(which: Tensor, share: Tensor, bounds: Sequence[float]) -> tup
 
 def teacher_times(upper: Tensor, lower: Tensor, *, steps: int, shift: float = 1.0) -> Tensor:
     """(steps + 1, B) times from ``upper`` to ``lower`` (B,), equally spaced before the shift."""
-    check_range("teacher steps", steps, ge=1)
     share = torch.linspace(0, 1, steps + 1, dtype=upper.dtype, device=upper.device)[:, None]
     times = shift_time(
         torch.lerp(unshift_time(upper, shift), unshift_time(lower, shift), share), shift
@@ -300,9 +268,3 @@ def reflow_pair(
         velocity = ((start - end) / over_state(upper - lower, start)).to(start.dtype)
         state = interpolate(end, start, eta)
     return ReflowPair(state, t.to(wide).to(clean.device), velocity)
-
-
-def fast_loss(reflow: Tensor, flow: Tensor, *, rho: float) -> Tensor:
-    """L_fast = rho L_PRF + (1 - rho) L_FM, of any one shape."""
-    check_range("rho", rho, ge=0, le=1)
-    return rho * reflow + (1 - rho) * flow

@@ -44,7 +44,7 @@ from gvtools.completers.geoverse.refiner import Refiner
 from gvtools.completers.geoverse.rgb_head import RGBHead
 from gvtools.completers.geoverse.video_injection import ControlBranch, SharedAttention, video_keys
 from gvtools.completers.geoverse.video_prior import VideoFeatures, VideoPrior
-from gvtools.errors import CheckpointError, GvError, ShapeError
+from gvtools.errors import CheckpointError, GvError
 from gvtools.networks.compute import hold_in, on_device
 from gvtools.networks.depth_anything.geometry_head import ViewGeometry
 from gvtools.networks.depth_anything.network import DepthAnything3
@@ -103,8 +103,7 @@ class Decoded:
     @property
     def geometry(self) -> ViewGeometry:
         """Of all V views, in the frame of the first view."""
-        if self.all_views is None:
-            raise ShapeError("the targets' depth alone was decoded, not the geometry of all views")
+        assert self.all_views is not None
         return self.all_views
 
 

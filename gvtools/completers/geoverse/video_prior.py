@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F
@@ -24,10 +24,10 @@ from gvtools.completers.geoverse.flow import seeded_noise, view_seed
 from gvtools.completers.geoverse.wan import STRIDE, WanNetworks, load_network, read_empty_prompt
 from gvtools.errors import CheckpointError, OptionError
 from gvtools.networks.compute import half_type
-from gvtools.networks.config_json import check_choice, check_range
+from gvtools.networks.config_json import check_range
 
 GROUP = 4
-LAYOUTS = ("per_view", "video9", "repeat4")
+Layout = Literal["per_view", "video9", "repeat4"]
 # Bytes that a pass of base needs beside all weights: 2.5 GB (benchmarks/complete.md), and what the
 # driver takes and an allocator loses.
 ROOM = 3.5e9
@@ -56,7 +56,7 @@ class ViewLayout:
         return tuple(where[view] for view in sorted(where))
 
 
-def view_layout(name: str, views: int) -> ViewLayout:
+def view_layout(name: Layout, views: int) -> ViewLayout:
     """One of the ways to show ``views`` views to the VAE.
 
     "per_view": each view is a clip of one frame, as Wan encodes reference images. "video9": one
@@ -68,9 +68,7 @@ def view_layout(name: str, views: int) -> ViewLayout:
         return ViewLayout(tuple((view,) for view in range(views)))
     if name == "video9":
         return ViewLayout(((*range(views), *[views - 1] * ((1 - views) % GROUP)),))
-    if name == "repeat4":
-        return ViewLayout(((0, *(view for view in range(1, views) for _ in range(GROUP))),))
-    raise OptionError(f"video layout {name!r}; expected one of {', '.join(LAYOUTS)}")
+    return ViewLayout(((0, *(view for view in range(1, views) for _ in range(GROUP))),))
 
 
 def packed_mask(generate: Tensor, layout: ViewLayout, *, stride: int = 8) -> Tensor:
@@ -95,7 +93,7 @@ class VideoPriorConfig:
 
     # How views become video, see ``view_layout``. The paper does not say; "per_view"
     # has each view's own latent and mask.
-    layout: str = "per_view"
+    layout: Layout = "per_view"
     # Backbone blocks whose outputs, VACE hint included, are the features.
     taps: tuple[int, ...] = (0, 5, 10, 15)
     channels: int = 5120  # of a feature, the backbone's width; checked against the weights
@@ -109,16 +107,13 @@ class VideoPriorConfig:
     resolution: tuple[int, int] | None = None
     multiple: int = 16  # of both sides, px; itself a multiple of a token's 16
     # Of the transformer; None as stored. What diffusers keeps in float32 stays so.
-    dtype: str | None = None
+    dtype: Literal["float32", "bfloat16", "float16"] | None = None
     # "empty", Wan's embedding of the empty prompt; or "zeros", for tests and tiny configurations:
     # Wan was not trained on it.
-    prompt: str = "empty"
+    prompt: Literal["empty", "zeros"] = "empty"
     prompt_rows: int = 512  # rows that the prompt's embedding is padded to with zeros
 
     def __post_init__(self) -> None:
-        check_choice("video.layout", self.layout, LAYOUTS)
-        check_choice("video.prompt", self.prompt, ("empty", "zeros"))
-        check_choice("video.dtype", self.dtype, (None, "float32", "bfloat16", "float16"))
         if not self.taps or list(self.taps) != sorted({*self.taps}) or self.taps[0] < 0:
             raise OptionError(f"video.taps = {self.taps}; expected ascending block numbers")
         if self.multiple < 1 or self.multiple % 16:

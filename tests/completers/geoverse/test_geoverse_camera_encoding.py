@@ -220,18 +220,3 @@ def test_half_precision_rounds_the_result_only():
         with torch.autocast("cpu", dtype=torch.bfloat16):
             under = method(x.float())
         torch.testing.assert_close(under, method(x.float()), rtol=0, atol=0)
-
-
-@pytest.mark.gpu
-@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-def test_cuda_agrees(dtype):
-    pose, K = cameras(dtype=torch.float32)
-    x = tokens(24, dtype=dtype)
-    here = Projective(pose, K, PICTURE, grid=GRID, head_dim=24)
-    there = Projective(pose.cuda(), K.cuda(), PICTURE, grid=GRID, head_dim=24)
-    tolerance = 1e-5 if dtype == torch.float32 else 1e-2
-    for name in ("query", "key", "value", "output"):
-        torch.testing.assert_close(
-            getattr(there, name)(x.cuda()).cpu(), getattr(here, name)(x),
-            rtol=tolerance, atol=tolerance,
-        )  # fmt: skip

@@ -20,7 +20,6 @@ from gvtools.completers.geoverse.conditioning import (
     feature_mask,
     fill_holes,
 )
-from gvtools.errors import OptionError, ShapeError
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -181,8 +180,9 @@ def test_level_0_of_the_context_comes_from_where_it_is_asked_for(model):
     batch = micro.batch(1)
     joint = model.geometry.encode(batch.images, levels=1)[0][:, :2, 1:]
     expected = model.statistics[0].normalise(joint.mT.unflatten(3, micro.GRID))
-    for source, level in (("alone", alone(model, batch)[0]), ("jointly", expected)):
-        found = hints(model, batch, HintConfig(cascade_context=source)).level0
+    jointly = HintConfig(cascade_context="jointly")
+    for config, level in ((HintConfig(), alone(model, batch)[0]), (jointly, expected)):
+        found = hints(model, batch, config).level0
         close(found[:, :2], level)
         assert not found[:, 2:].any()
     assert (expected - alone(model, batch)[0]).abs().max() > 0.01
@@ -218,29 +218,6 @@ def test_known_cameras_count_relative_to_each_other_alone(model, factor):
     turned[:, 1] = turned[:, 2]
     other = hints(model, replace(batch, cam_from_world=turned), KNOWN_CAMERAS)
     assert (other.unmasked - expected.unmasked).abs().max() > 0.01
-
-
-@torch.no_grad()
-def test_the_context_is_encoded_once_more_only_where_it_is_asked_for(model, monkeypatch):
-    calls: list[int] = []
-    encode = type(model.geometry).encode
-
-    def counted(self: Any, images: Tensor, **options: Any) -> list[Tensor]:
-        calls.append(images.shape[1])
-        return encode(self, images, **options)
-
-    monkeypatch.setattr(type(model.geometry), "encode", counted)
-    batch = micro.batch(2, context=2, targets=2)
-    own = HintConfig(token="own", cascade_context="jointly")
-    for config, views in (
-        (own, [4]),
-        (replace(own, cascade_context="alone"), [4, 2]),
-        (replace(own, encode="alone"), [4, 2]),
-        (HintConfig(), [4, 2, 1]),
-    ):
-        calls.clear()
-        hints(model, batch, config)
-        assert sorted(calls, reverse=True) == views, config
 
 
 def test_depth_is_told_as_its_logarithm_in_the_cameras_unit():
@@ -296,26 +273,3 @@ def test_statistics_there_and_back():
     expected = (raw.movedim(1, -1) - statistics.mean.double()) / deviation
     torch.testing.assert_close(latent, expected.movedim(-1, 1))
     torch.testing.assert_close(statistics.denormalise(latent), raw)
-
-
-@pytest.mark.parametrize(
-    "change",
-    [{"fill": "black"}, {"encode": "both"}, {"token": "none"}, {"camera_unit": "m"}, {"mask": 1.5}],
-)
-def test_unknown_ways_are_refused(change):
-    name = next(iter(change))
-    with pytest.raises(OptionError, match=rf"hints\.{name}.*expected"):
-        HintConfig(**change)
-
-
-def test_views_of_wrong_shapes_are_refused():
-    batch = micro.batch(1)
-    for name in ("depth", "valid", "cam_from_world", "K"):
-        with pytest.raises(ShapeError, match=rf"{name} \(1, 3, .*expected \(1, 4, "):
-            replace(batch, **{name: getattr(batch, name)[:, :3]})
-    for images in (batch.images[0], batch.images[:, :, :2]):
-        with pytest.raises(ShapeError, match=r"images .*expected \(B, V, 3, H, W\)"):
-            replace(batch, images=images)
-    for context in (0, 5):
-        with pytest.raises(ShapeError, match="1 to V context views"):
-            replace(batch, context=context)

@@ -10,51 +10,11 @@ import geoverse_models as micro
 import pytest
 import torch
 
-from gvtools.completers.geoverse.config import CameraConfig, FlowConfig, GeoVerseConfig, named
+from gvtools.completers.geoverse.config import GeoVerseConfig, named
 from gvtools.errors import OptionError
 from gvtools.networks.config_json import from_json, to_json
 from gvtools.settings import dotted, with_file
 from gvtools.training.options import TrainingSettings
-
-
-@pytest.mark.parametrize(
-    ("field", "refused", "taken", "said"),
-    [
-        ("shift", (0.0, -3.0, float("nan")), (1.0,), "more than 0"),
-        ("least_time", (0.0, -0.1, 1.5, float("nan")), (1.0,), "more than 0 and at most 1"),
-        ("cfg_scale", (-1.0,), (0.0,), "at least 0"),
-        ("temperature", (-0.1,), (0.0,), "at least 0"),
-    ],
-)
-def test_flow_settings_outside_their_range_are_refused(field, refused, taken, said):
-    for value in refused:
-        with pytest.raises(OptionError, match=rf"flow\.{field} .*{said}"):
-            FlowConfig(**{field: value})
-    for value in taken:
-        assert getattr(FlowConfig(**{field: value}), field) == value
-
-
-@pytest.mark.parametrize(
-    ("field", "refused", "taken", "said"),
-    [
-        ("camera.reference", (-6, 5), (-5, 0, 4), "at least -5 and at most 4"),
-        ("decode_views", (0, -1), (1,), "at least 1"),
-    ],
-)
-def test_settings_of_a_pass_outside_their_range_are_refused(field, refused, taken, said):
-    def built(value: int) -> GeoVerseConfig:
-        camera = field == "camera.reference"
-        return micro.config(
-            views=5,
-            camera=CameraConfig(reference=value if camera else -1),
-            decode_views=2 if camera else value,
-        )
-
-    for value in refused:
-        with pytest.raises(OptionError, match=rf"{field} .*{said}"):
-            built(value)
-    for value in taken:
-        built(value)
 
 
 def test_wrong_ranges_in_a_file_are_refused():

@@ -16,7 +16,7 @@ from gvtools.completers.geoverse.depth_scale import (
     pass_scale,
     scale_depth,
 )
-from gvtools.completers.geoverse.views import EDGE, resample, resample_depth
+from gvtools.completers.geoverse.views import resample_depth
 from gvtools.networks.depth_anything.geometry_head import ViewGeometry
 
 ALIGNMENTS = ("centres", "hint", "field")
@@ -255,19 +255,6 @@ def test_damaged_depth_does_no_harm_around_it(alignment):
     intact[8:11, 8:11] = False
     np.testing.assert_allclose(found.depth[0][intact], truth[0][intact], rtol=0.01)
     assert np.isfinite(found.depth).all()
-
-
-@pytest.mark.parametrize("size", [(60, 80), (31, 47), (24, 33), (24, 90)])
-def test_depth_at_another_size_never_lies_between_two_surfaces(size):
-    near, far = 1.0, 1.0 + 2 * (EDGE - 1)
-    depth = torch.where(torch.rand(2, 24, 32, generator=torch.Generator().manual_seed(0)) < 0.5,
-                        near, far)  # fmt: skip
-    found = resample_depth(depth, size)
-    assert found.shape == (2, *size)
-    gap = torch.minimum((found - near).abs(), (found - far).abs())
-    assert gap.max() < 1e-6
-    mixed = resample(depth[:, None], size)
-    assert ((mixed - near).abs() > 0.05).logical_and((mixed - far).abs() > 0.05).any()
 
 
 @pytest.mark.parametrize("size", [(96, 128), (50, 61), (24, 32)])

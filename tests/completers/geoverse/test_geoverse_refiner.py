@@ -21,7 +21,6 @@ from gvtools.completers.geoverse.refiner import (
     distance_to,
 )
 from gvtools.completers.geoverse.weights import save_pretrained
-from gvtools.errors import OptionError
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 SMALL = RefinerConfig(widths=(8, 16))
@@ -124,20 +123,6 @@ def test_the_targets_of_a_batch_are_taken_with_their_contexts_mean():
     assert torch.equal(found.filled, batch.images[:, 2:].flatten(0, 1))
     mean = batch.images[1, :2].mean((0, 2, 3))
     assert torch.allclose(found.mean[2:], mean.expand(2, 3)) and not found.evidence.any()
-
-
-@pytest.mark.parametrize(
-    ("changes", "said"),
-    [({"widths": ()}, "widths"), ({"widths": (12,)}, "multiple of 8"), ({"offset": -1}, "offset")],
-)
-def test_wrong_sizes_are_refused(changes, said):
-    with pytest.raises(OptionError, match=said):
-        RefinerConfig(**changes)
-
-
-def test_a_refiner_needs_corrections():
-    with pytest.raises(OptionError, match="correction"):
-        micro.config(refiner=SMALL)
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from gvtools.completers.geoverse.camera_encoding import Projective
-from gvtools.completers.geoverse.denoiser import Conditions, Positions
+from gvtools.completers.geoverse.denoiser import Positions
 from gvtools.completers.geoverse.video_injection import (
     ControlBranch,
     ControlConfig,
@@ -111,41 +111,6 @@ def test_residuals_enter_after_the_configured_blocks_and_no_others(layers):
     for layer in layers:
         rest = {index: value for index, value in residuals.items() if index != layer}
         assert (case.velocity(rest) - expected).abs().max() > 1e-4, layer
-
-
-@torch.no_grad()
-def test_the_branch_sees_time_cameras_and_state_as_the_denoiser_does():
-    case = Case()
-    micro.awake(case.branch)
-    before = case.residuals()
-
-    def moved(**changes: Any) -> float:
-        kept = case.x, case.t, case.known, case.positions
-        for name, value in changes.items():
-            setattr(case, name, value)
-        found = case.residuals()
-        case.x, case.t, case.known, case.positions = kept
-        return max(float((found[layer] - before[layer]).abs().max()) for layer in LAYERS)
-
-    known: Conditions = case.known
-    turned = replace(known.camera, cam_from_world=known.camera.cam_from_world.flip(1))
-    assert moved() == 0
-    assert moved(x=case.x + 1) > 1e-3
-    assert moved(t=case.t / 2) > 1e-3
-    assert moved(known=replace(known, latents=known.latents + 1)) > 1e-3
-    assert moved(positions=Positions(case.net.config, turned, micro.GRID)) > 1e-3
-
-
-@torch.no_grad()
-def test_features_of_the_grid_are_taken_as_they_are():
-    case = Case()
-    generator = torch.Generator().manual_seed(3)
-    feature = torch.randn(1, 2, micro.VIDEO.channels, *micro.GRID, generator=generator)
-    adapter = case.branch.adapters[0]
-    expected = adapter.mix(F.silu(adapter.reduce(feature[0]))).flatten(2).mT
-    assert torch.equal(adapter(feature, micro.GRID)[0], expected)
-    half = adapter(feature.bfloat16(), micro.GRID)
-    assert half.dtype == torch.float32 and (half - expected).abs().max() < 0.05
 
 
 @pytest.mark.parametrize("layers", [(0, 1, 2, 5), (0, 1, 2), (3, 1, 2, 4), (1, 1, 2, 3)])
@@ -262,27 +227,6 @@ def test_a_gate_of_zero_is_the_pretrained_block_and_of_one_the_papers():
     torch.testing.assert_close(gated.velocity(gated.keys()), expected, rtol=1e-9, atol=1e-9)
     gated.shared.gates.fill_(0.5)
     assert (gated.velocity(gated.keys()) - expected).abs().max() > 1e-3
-
-
-def test_the_gates_learn_first_and_the_projections_after_them():
-    case = SharedCase(gated=True)
-
-    def learning() -> dict[str, set[bool]]:
-        case.shared.zero_grad()
-        case.velocity(case.keys()).square().mean().backward()
-        found: dict[str, set[bool]] = {}
-        for name, parameter in case.shared.named_parameters():
-            assert parameter.grad is not None
-            found.setdefault(name.split(".")[0], set()).add(bool(parameter.grad.all()))
-            if not parameter.grad.all():
-                assert not parameter.grad.any(), name
-        return found
-
-    assert learning() == {"gates": {True}, "kv": {False}, "norms": {False}}
-    torch.optim.SGD(case.shared.parameters(), lr=10.0).step()
-    assert case.shared.gates.all()
-    # The bias of a key shifts all scores of a query alike only without positions.
-    assert learning()["kv"] == {True}
 
 
 @torch.no_grad()

@@ -13,19 +13,19 @@ from torch import Tensor, nn
 from gvtools.completers.geoverse.flow import view_seed
 from gvtools.completers.geoverse.video_prior import (
     ROOM,
+    Layout,
     VideoPrior,
-    VideoPriorConfig,
     _leaves,
     packed_mask,
     resize_views,
     view_layout,
 )
-from gvtools.errors import CheckpointError, OptionError
+from gvtools.errors import CheckpointError
 
 pytest.importorskip("diffusers", reason="the extra wan is not installed")
 
 
-LAYOUTS = ("per_view", "video9", "repeat4")
+LAYOUTS: tuple[Layout, ...] = ("per_view", "video9", "repeat4")
 
 
 class Spy:
@@ -149,7 +149,7 @@ def test_layouts_say_which_latent_holds_which_view() -> None:
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
-def test_views_in_one_latent_share_features_and_others_do_not(network: Any, name: str) -> None:
+def test_views_in_one_latent_share_features_and_others_do_not(network: Any, name: Layout) -> None:
     images, valid = tiny.views(6)
     features = tiny.prior(network, layout=name).features(images, valid, 1)
     assert features.latent_of_view == view_layout(name, 6).latent_of_view
@@ -162,7 +162,7 @@ def test_views_in_one_latent_share_features_and_others_do_not(network: Any, name
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
-def test_masks_are_packed_as_in_the_pipeline_for_the_views_of_the_latent(name: str) -> None:
+def test_masks_are_packed_as_in_the_pipeline_for_the_views_of_the_latent(name: Layout) -> None:
     generate = (
         torch.rand(2, 6, 1, 16, 24, generator=torch.Generator().manual_seed(0)) > 0.6
     ).float()
@@ -263,22 +263,6 @@ def test_the_video_model_runs_once_and_gradients_stop_at_its_features(network: A
     assert not any(m._forward_pre_hooks for m in [*network.blocks, network.norm_out])
 
 
-def test_the_zero_latent_is_computed_once_a_resolution(network: Any) -> None:
-    prior = tiny.prior(network, layout="video9")
-    spy = Spy(prior)
-    for size, encoded in (((32, 32), 2), ((32, 32), 1), ((16, 32), 2)):
-        spy.clips.clear()
-        prior.features(*tiny.views(3, size=size), 1)
-        assert len(spy.clips) == encoded
-
-
-def test_sizes_are_multiples_near_the_one_that_is_wanted() -> None:
-    assert VideoPriorConfig().size(502, 506) == (496, 512)
-    assert VideoPriorConfig(resolution=(576, 576)).size(504, 504) == (576, 576)
-    assert VideoPriorConfig(multiple=32).size(378, 500) == (384, 512)
-    assert VideoPriorConfig().size(5, 20) == (16, 16)
-
-
 def test_other_sizes_give_the_tokens_of_the_resolution(network: Any) -> None:
     prior = tiny.prior(network, resolution=(48, 64))
     features = prior.features(*tiny.views(2, size=(42, 56)), 1)
@@ -325,27 +309,6 @@ def test_a_configuration_that_does_not_fit_the_weights_is_refused(network: Any) 
         tiny.prior(network, channels=5120)
     with pytest.raises(CheckpointError, match="4 blocks"):
         tiny.prior(network, taps=(0, 4))
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"layout": "video8"},
-        {"taps": ()},
-        {"taps": (5, 0)},
-        {"taps": (0, 0)},
-        {"timestep": 1500.0},
-        {"sigma": 1.5},
-        {"proxy_noise": -0.1},
-        {"multiple": 14},
-        {"dtype": "int8"},
-        {"prompt": "a house"},
-        {"prompt_rows": 0},
-    ],
-)
-def test_options_out_of_range_are_refused(options: dict[str, Any]) -> None:
-    with pytest.raises(OptionError, match=f"video.{next(iter(options))}"):
-        VideoPriorConfig(**options)
 
 
 def test_a_copied_model_shares_its_prior(network):
@@ -397,32 +360,6 @@ def test_lent_weights_come_home_without_being_copied_back(network, monkeypatch):
     assert [tensor.data_ptr() for tensor in tensors] == home
 
 
-@pytest.mark.parametrize("locked", [10**6, 7])
-def test_weights_that_leave_are_locked_in_memory_as_far_as_there_is_room(
-    tmp_path, monkeypatch, network, locked
-):
-    prior = tiny.prior(network)
-    for name in ("transformer", "vae"):
-        getattr(prior.networks, name).save_pretrained(tmp_path / name)
-    given: list[Tensor] = []
-
-    def pin_memory(tensor: Tensor) -> Tensor:
-        if len(given) == locked:
-            raise RuntimeError("CUDA error: out of memory")
-        given.append(tensor.clone())
-        return given[-1]
-
-    monkeypatch.setattr(Tensor, "pin_memory", pin_memory)
-    config = replace(tiny.CONFIG, prompt="zeros")
-    there = VideoPrior.from_pretrained(tmp_path, config=config, device="cuda", offload="always")
-    tensors = there.networks._tensors()
-    pinned = {tensor.data_ptr() for tensor in given}
-    assert len(given) == min(locked, len(tensors)) and there.networks.device.type == "cpu"
-    assert sum(tensor.data_ptr() in pinned for tensor in tensors) == len(given)
-    VideoPrior.from_pretrained(tmp_path, config=config, device="cpu", offload="always")
-    assert len(given) == min(locked, len(tensors))
-
-
 @pytest.mark.parametrize(
     ("device", "offload", "free", "leaves"),
     [
@@ -442,14 +379,3 @@ def test_weights_leave_where_a_pass_would_lack_room(
     (tmp_path / "vae" / "x.safetensors").write_bytes(bytes(1000))
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda place: (free, 1e12))
     assert _leaves(tmp_path, device, offload) is leaves
-
-
-def test_pictures_are_encoded_as_clips_of_one_frame(network: Any) -> None:
-    networks = tiny.prior(network).networks
-    clips = torch.rand(2, 3, 1, 32, 48, generator=torch.Generator().manual_seed(3)) * 2 - 1
-    stored = networks.vae.encode(clips).latent_dist.mode()
-    mean, deviation = (
-        torch.tensor(networks.vae.config[name])[:, None, None, None]
-        for name in ("latents_mean", "latents_std")
-    )
-    torch.testing.assert_close(networks.encode(clips), (stored - mean) / deviation)

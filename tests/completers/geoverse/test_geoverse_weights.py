@@ -248,12 +248,6 @@ def test_a_published_file_with_wrong_tensors_is_refused(folder: Path, damage: st
     refused_part(folder, "level1", message)
 
 
-def test_loading_and_checking_name_the_file_with_wrong_tensors(folder: Path) -> None:
-    tensors_changed(folder / LEVEL1, DAMAGES["missing"][0])
-    assert "da3_level1.pt" in refused(folder, f"missing: {LAYER}")
-    assert [part.name for part in check_folder(folder) if not part.ok] == ["level1"]
-
-
 def test_a_name_that_is_there_twice_is_refused(folder: Path) -> None:
     tensors_changed(folder / LEVEL1, lambda t: t.update({f"module.{LAYER}": t[LAYER] + 1}))
     refused_part(folder, "level1", f"holds {LAYER} twice, also as module.{LAYER}")
@@ -513,18 +507,6 @@ def test_a_damaged_configuration_is_refused(own: Path, text: str, message: str) 
         with pytest.raises(CheckpointError, match=message) as caught:
             read(own)
         assert "\n" not in str(caught.value)
-
-
-UNGATED = replace(SHARED, shared=replace(SHARED.shared, gated=False))
-
-
-def test_an_absent_video_folder_is_named(folder: Path) -> None:
-    with pytest.raises(CheckpointError, match=r"video: absent; .*truncate-wan"):
-        from_pretrained(folder, config=UNGATED)
-    found = report(folder, "video", UNGATED)
-    assert not found.ok
-    assert "truncate-wan" in found.summary
-    assert load(folder, SHARED).video is None
 
 
 def test_the_video_folder_is_checked_as_it_is_loaded(folder: Path) -> None:

@@ -13,7 +13,7 @@ from command_line import run_command
 from benchmarks.memory import CASES, peak, predicted_peak
 from gvtools.completers.geoverse import model as stages
 from gvtools.completers.geoverse.config import named
-from gvtools.completers.geoverse.flow import interval_bounds
+from gvtools.completers.geoverse.flow import time_grid
 from gvtools.completers.geoverse.model import LEVEL0, LEVEL1
 from gvtools.errors import OptionError
 from gvtools.networks.compute import attend
@@ -61,8 +61,8 @@ def timed(config, *, context: int = 1, targets: int = 2, steps: int = 1) -> Time
     return TimedPass(
         micro.model(config),
         batch,
-        bounds=interval_bounds(steps),
-        cascade_bounds=interval_bounds(1),
+        bounds=time_grid(steps),
+        cascade_bounds=time_grid(1),
         video=random_features(config, batch),
     )
 
