@@ -409,14 +409,7 @@ def _complete_in_parts(
         )
         for end in ends
     )
-    try:
-        return Completion.joined(parts, guidance.cameras)
-    except MemoryError as error:
-        raise OptionError(
-            f"completer {completer.name}: memory does not suffice for the results of {count} views "
-            f"of {width}x{height} ({error}); expected fewer of them, as --views-per-round 1, or "
-            "smaller pictures"
-        ) from None
+    return Completion.joined(parts, guidance.cameras)
 
 
 def _lacks_memory(error: Exception) -> bool:

@@ -34,10 +34,9 @@ class SmallHolesInpainted(Completer):
     Name, files, notes and weights are the costly one's.
     """
 
-    def __init__(self, costly_one: Completer, below: float, *, cheap_one: Completer | None = None):
+    def __init__(self, costly_one: Completer, below: float) -> None:
         super().__init__()
         self.costly_one, self.below = costly_one, below
-        self.cheap_one = cheap_one or create("inpaint")
         self.name = costly_one.name
         self.batches_targets = costly_one.batches_targets
 
@@ -65,7 +64,7 @@ class SmallHolesInpainted(Completer):
         small = [hole_radius(valid) <= self.below for valid in guidance.valid]
 
         def parts() -> Iterator[tuple[list[int], Completion]]:
-            for completer, cheap in ((self.cheap_one, True), (self.costly_one, False)):
+            for completer, cheap in ((create("inpaint"), True), (self.costly_one, False)):
                 rows = [row for row, is_small in enumerate(small) if is_small == cheap]
                 if rows:
                     yield rows, completer.complete(context, guidance.select(rows), seed=seed)

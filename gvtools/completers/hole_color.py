@@ -45,8 +45,8 @@ def fill_color(
     known: NDArray[np.bool_],
     surface: HoleDepth,
     *,
-    evidence: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None,
-    sweeps: int = 60,
+    evidence: tuple[NDArray[np.float32], NDArray[np.float32]],
+    sweeps: int,
 ) -> NDArray[np.float32]:
     """(H, W, 3) colour diffused from the rim into the holes, along surfaces; 0 where no depth is.
 
@@ -60,12 +60,10 @@ def fill_color(
     result = filled.astype(np.float64)
     flat = surface.plane_of.ravel()
     _seed_colors(result, holes, surface.inverse, surface.hits, surface.planes, flat, DIRECTIONS)
-    hint, weight = np.zeros((1, 1, 3), np.float32), np.zeros((1, 1), np.float32)
-    if evidence is not None:
-        hint, weight = evidence
-        share = (weight.ravel()[holes] / (1 + weight.ravel()[holes]))[:, None]
-        seeds = result.reshape(-1, 3)
-        seeds[holes] = seeds[holes] * (1 - share) + hint.reshape(-1, 3)[holes] * share
+    hint, weight = evidence
+    share = (weight.ravel()[holes] / (1 + weight.ravel()[holes]))[:, None]
+    seeds = result.reshape(-1, 3)
+    seeds[holes] = seeds[holes] * (1 - share) + hint.reshape(-1, 3)[holes] * share
     neighbors, links = _links(holes, surface.inverse)
     relax(result.reshape(-1, 3), holes, neighbors, links, hint.reshape(-1, 3), weight.ravel(),
            sweeps)  # fmt: skip
@@ -166,31 +164,6 @@ def depth_error(distance: Float64, spread: Float64) -> Float64:
     return np.asarray(DEPTH_ERROR + DEPTH_ERROR_PER_PIXEL * distance + spread)
 
 
-def rank_views(
-    camera: Cameras,
-    depth: NDArray[np.float32],
-    error: Float64,
-    *,
-    holes: NDArray[np.bool_],
-    context: Sequence[ContextView],
-) -> list[int]:
-    """The photographs that show hole points at all, the most reliable first; see ``look_up``."""
-    rows, columns = np.nonzero(holes & (depth > 0))
-    some = slice(None, None, max(1, len(rows) // SAMPLES))
-    rows, columns = rows[some], columns[some]
-    rays = _rays(camera, rows, columns)
-    z = depth[rows, columns].astype(np.float64)
-    points = {"center": camera.centers[0], "rays": rays, "z": z, "error": error[rows, columns]}
-    scores = np.zeros(len(context))
-    if context:
-        cameras = concatenate([view.camera for view in context])
-        # Those in whose pictures any of the points falls, hidden or not.
-        inside = in_view(cameras, camera.centers[0] + rays * z[:, None]).any(axis=-1)
-        for index in np.flatnonzero(inside).tolist():
-            scores[index] = _visible(context[index], **points)[2].sum()
-    return [int(i) for i in np.argsort(-scores, kind="stable") if scores[i] > 0]
-
-
 def look_up(
     camera: Cameras,
     depth: NDArray[np.float32],
@@ -207,13 +180,15 @@ def look_up(
     """
     colors = np.zeros((*depth.shape, 3), np.float32)
     weights = np.zeros(depth.shape, np.float32)
-    best = rank_views(camera, depth, error, holes=holes, context=context)[: max(views, 0)]
-    if not best:
-        return colors, weights
     rows, columns = np.nonzero(holes & (depth > 0))
+    if not (context and views and len(rows)):
+        return colors, weights
     rays = _rays(camera, rows, columns)
     z = depth[rows, columns].astype(np.float64)
     points = {"center": camera.centers[0], "rays": rays, "z": z, "error": error[rows, columns]}
+    best = _best_views(context, views, **points)
+    if not best:
+        return colors, weights
     found = np.zeros((len(best), len(rows), 3))
     trust = np.zeros((len(best), len(rows)))
     for row, index in enumerate(best):
@@ -233,6 +208,22 @@ def look_up(
     harmony = total / np.maximum(trust.sum(axis=0), 1e-12)
     weights[rows, columns] = agree.max(axis=0) * harmony
     return colors, weights
+
+
+def _best_views(
+    context: Sequence[ContextView], most: int, *, center: Float64, rays: Float64, z: Float64,
+    error: Float64,
+) -> list[int]:  # fmt: skip
+    """The photographs that show some of the points at all, the most reliable first."""
+    some = slice(None, None, max(1, len(z) // SAMPLES))
+    rays, z, error = rays[some], z[some], error[some]
+    cameras = concatenate([view.camera for view in context])
+    # Those in whose pictures any of the points falls, hidden or not.
+    inside = in_view(cameras, center + rays * z[:, None]).any(axis=-1)
+    scores = np.zeros(len(context))
+    for index in np.flatnonzero(inside).tolist():
+        scores[index] = _visible(context[index], center, rays, z=z, error=error)[2].sum()
+    return [int(i) for i in np.argsort(-scores, kind="stable") if scores[i] > 0][:most]
 
 
 def _rays(camera: Cameras, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> Float64:

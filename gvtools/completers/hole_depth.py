@@ -84,14 +84,12 @@ def fill_depth(
     *,
     focal: float,
     steepest_deg: float = 80.0,
-    smoothing: bool = True,
     generated: NDArray[np.bool_] | None = None,
 ) -> HoleDepth:
     """Continue the surfaces around the holes of a z-depth map (H, W) through them.
 
     A surface seen at a more grazing angle than ``steepest_deg`` counts as a step; ``generated``
-    (H, W) are known pixels that a completer made; ``smoothing``: medians, wider the farther from
-    the rim, settle the fill. ``focal`` is in pixels.
+    (H, W) are known pixels that a completer made. ``focal`` is in pixels.
     """
     known = valid & (depth > 0) & np.isfinite(depth)
     inverse = np.zeros(depth.shape, np.float64)
@@ -120,11 +118,11 @@ def fill_depth(
         _combine, len(depth), inverse, known, hits, planes, plane_of.ravel(), slope, limits, spread,
         values, weights,
     )  # fmt: skip
-    if smoothing:
-        for step in (8, 4, 2, 1, 1):
-            settled = inverse.copy()
-            in_threads(_median_rows, len(inverse), inverse, known, distance, step, settled)
-            inverse = settled
+    # Medians, wider the farther from the rim, settle the fill.
+    for step in (8, 4, 2, 1, 1):
+        settled = inverse.copy()
+        in_threads(_median_rows, len(inverse), inverse, known, distance, step, settled)
+        inverse = settled
     return HoleDepth(inverse, hits, planes, plane_of, spread, distance)
 
 

@@ -51,8 +51,6 @@ STORED_TYPES = {
     "U8": torch.uint8,
     "BOOL": torch.bool,
 }
-# The format's own limit of a header, bytes.
-_LARGEST_HEADER = 100_000_000
 _ZIP, _PICKLE = b"PK\x03\x04", b"\x80"
 # The number that torch.save before PyTorch 1.6 pickled first.
 _LEGACY = b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P\x19."
@@ -338,8 +336,6 @@ def _read_header(path: Path) -> dict[str, _Entry]:
     try:
         with regular(path).open("rb") as file:
             length = int.from_bytes(file.read(8), "little")
-            if length > _LARGEST_HEADER:
-                raise ValueError("no header")
             if length > path.stat().st_size:
                 raise ValueError(f"a header of {length} bytes")
             stored = parse_json(file.read(length))

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.errors import OptionError
 from gvtools.kernels import compiled
 from gvtools.optional import installed, package_folder
 from gvtools.procedural.render import decode_srgb
@@ -24,8 +23,6 @@ from gvtools.procedural.render import decode_srgb
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-
-SPLITS = ("train", "held-out")
 
 # Names in skimage.data, and of scikit-learn's sample images ("sklearn:").
 PHOTOGRAPHS = {
@@ -49,16 +46,8 @@ PHOTOGRAPHS = {
 LONGEST = 512  # side that larger photographs are reduced to, pixels
 
 
-def check_split(split: str) -> int:
-    """The number of a split."""
-    if split not in SPLITS:
-        raise OptionError(f"split {split!r}; expected one of {', '.join(SPLITS)}")
-    return SPLITS.index(split)
-
-
 def photograph_names(split: str) -> tuple[str, ...]:
     """The photographs of a split that are installed."""
-    check_split(split)
     learn = installed("sklearn")
     return tuple(name for name in PHOTOGRAPHS[split] if learn or not name.startswith("sklearn:"))
 

@@ -23,7 +23,6 @@ from gvtools.completers.geoverse.conditioning import ViewBatch
 from gvtools.completers.geoverse.flow import seeded_noise, view_seed
 from gvtools.completers.geoverse.views import resample_nearest, view_batch
 from gvtools.completers.surface_fill import surface_fill
-from gvtools.errors import ShapeError
 from gvtools.guidance import Guidance
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.training.corruption import (
@@ -197,12 +196,6 @@ def _mean_known(depths: Sequence[Float32]) -> float:
 
 def collate(samples: Sequence[TrainingSample]) -> TrainingBatch:
     """Samples of one size and one number of context views as a batch."""
-    kinds = {(tuple(sample.images.shape), sample.context) for sample in samples}
-    if len(kinds) != 1:
-        raise ShapeError(
-            f"a batch of samples with {sorted(kinds)} as shapes and context counts; expected one; "
-            "take the samples of a batch from one group"
-        )
     stacked = {name: torch.stack([getattr(sample, name) for sample in samples]) for name in TENSORS}
     notes = Counter(note for sample in samples for note in sample.notes)
     views = ViewBatch(

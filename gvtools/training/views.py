@@ -18,7 +18,7 @@ from gvtools.errors import DegenerateError, GvError, ProjectError
 from gvtools.procedural.layouts import scene
 from gvtools.procedural.paths import camera_path
 from gvtools.procedural.render import radiance, to_srgb
-from gvtools.procedural.textures import check_split, photograph_names
+from gvtools.procedural.textures import PHOTOGRAPHS, photograph_names
 from gvtools.scenes.collection import SceneCollection
 from gvtools.scenes.scene import View
 from gvtools.scenes.selection import select
@@ -178,9 +178,6 @@ class ClipSamples(ABC):
 class ProceduralViews(ClipSamples):
     """Views of procedural scenes; every number has a scene of its own, the same at any attempt."""
 
-    def __post_init__(self) -> None:
-        check_split(self.split)
-
     def rng(self, index: int, stream: int, attempt: int = 0) -> np.random.Generator:
         """A stream of random numbers of a sample."""
         return np.random.default_rng([*context_seed(self.seed, self.split), index, stream])
@@ -208,7 +205,7 @@ class ProceduralViews(ClipSamples):
 
 def context_seed(seed: int, split: str = "train") -> list[int]:
     """What numbers of context views are drawn with: one for all sources that batches mix."""
-    return [seed, PROCEDURAL, check_split(split)]
+    return [seed, PROCEDURAL, list(PHOTOGRAPHS).index(split)]
 
 
 ATTEMPTS = 40

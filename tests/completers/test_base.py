@@ -290,17 +290,6 @@ def test_one_view_that_does_not_fit_is_one_line(error):
     assert not re.search("\n", str(caught.value))
 
 
-def test_results_that_do_not_fit_together_are_one_line(monkeypatch):
-    def full(parts, cameras):
-        raise MemoryError("Unable to allocate 9 MiB")
-
-    monkeypatch.setattr("gvtools.completers.base.Completion.joined", full)
-    said = r"results of 2 views of 8x6 \(Unable to allocate 9 MiB\); expected fewer"
-    with pytest.raises(OptionError, match=said) as caught:
-        run_completer(Hungry(1, MemoryError()), (), guidance(2))
-    assert not re.search("\n", str(caught.value))
-
-
 def test_other_errors_are_no_lack_of_memory():
     completer = Hungry(0, RuntimeError("a shape is wrong"))
     with pytest.raises(RuntimeError, match="a shape is wrong"):

@@ -62,7 +62,10 @@ def test_the_faults_of_observations_are_settings():
         ("denoiser.weights.rgb=-1", "rgb -1"),
         ("denoiser.weights.rgbs=1", "did you mean 'denoiser.weights.rgb'"),
         ("data.size=[0,0]", "data.size 0; expected greater than or equal to 1"),
-        ("reflow.bounds=[1,0.9,0.5]", "end at 0.5; expected 1 = tau_0 > tau_1 > ... > tau_K = 0"),
+        (
+            "reflow.bounds=[1,0.9,0.5]",
+            "[1.0, 0.9, 0.5]; expected 1 = tau_0 > tau_1 > ...",
+        ),
     ],
 )
 def test_a_wrong_text_is_one_line_before_anything_is_trained(text, complaint):

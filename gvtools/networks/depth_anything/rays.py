@@ -16,11 +16,12 @@ entries are wrong by 0.03 to 0.05 on rays without noise. ``factorisation="qr"`` 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor
 
-from gvtools.errors import DegenerateError, OptionError, ShapeError
+from gvtools.errors import DegenerateError
 
 # Depth Anything 3's settings.
 ITERATIONS = 100
@@ -45,8 +46,6 @@ def candidates(count: int) -> int:
 
 def draw_samples(count: int, *, seed: int) -> Tensor:
     """(ITERATIONS, SAMPLE) candidates of ``count`` rays, as Depth Anything 3 draws them."""
-    if count < SAMPLE:
-        raise DegenerateError(f"{count} rays; a homography is sampled from at least {SAMPLE}")
     generator = torch.Generator().manual_seed(seed)
     pool = candidates(count)
     draws = [torch.randperm(pool, generator=generator)[:SAMPLE] for _ in range(ITERATIONS)]
@@ -89,12 +88,6 @@ def ransac(
     error is below ``threshold``. The best is fitted again to all inliers (Depth Anything 3: at most
     8000).
     """
-    pool = min(candidates(len(source)), len(source))
-    if samples.ndim != 2 or int(samples.min()) < 0 or int(samples.max()) >= pool:
-        raise ShapeError(
-            f"samples {tuple(samples.shape)} up to {int(samples.max())}; expected "
-            f"(iterations, {SAMPLE}) below {pool}"
-        )
     chosen = weight.argsort(descending=True, stable=True)[samples]
     tried, _ = fit_homography(source[chosen], target[chosen], weight[chosen])
     point = torch.cat((source, torch.ones_like(source[:, :1])), dim=-1)
@@ -148,7 +141,6 @@ class RayCameras:
 
 def camera_centres(ray: Tensor, confidence: Tensor | None = None) -> Tensor:
     """(..., 3) mean of the origins of each view's rays (..., h, w, 6), weighted; differentiable."""
-    _check(ray, confidence)
     origin = ray[..., 3:]
     if confidence is None:
         return origin.mean(dim=(-3, -2))
@@ -177,9 +169,6 @@ def poses_least_squares(
     K is H⁻¹ of the first view, R the rotation nearest to H_v K, the centre the weighted mean of all
     origins. Rays with noise leave small numbers in K's lower triangle; they stay.
     """
-    _check(ray, confidence, views=True)
-    if subsample < 1:
-        raise OptionError(f"subsample {subsample}; expected at least 1")
     height, width = ray.shape[-3:-1]
     ray, weight = _precise(ray, confidence)
     centre = camera_centres(ray, weight)
@@ -212,7 +201,9 @@ def poses_ransac(
     seed: int = 0,  # of the samples
     # (iterations, 8), places among the most confident rays, instead of the seed's.
     samples: Tensor | None = None,
-    factorisation: str = "ql",  # "ql" as published, "qr" as it should be: see the module
+    factorisation: Literal[
+        "ql", "qr"
+    ] = "ql",  # "ql" as published, "qr" as it should be: see the module
 ) -> RayCameras:
     """Poses by a robust homography from each view's directions, as Depth Anything 3 takes them.
 
@@ -220,9 +211,6 @@ def poses_ransac(
     to 8 rays of the 30 % most confident, 100 times; the fit whose inliers have the most
     confidence is fitted again to all of these, and factored into a rotation and intrinsics.
     """
-    _check(ray, confidence, views=True)
-    if factorisation not in ("ql", "qr"):
-        raise OptionError(f"factorisation {factorisation!r}; expected 'ql' or 'qr'")
     batch, (height, width) = ray.shape[:-3], ray.shape[-3:-1]
     ray, weight = _precise(ray, confidence)
     ray = ray.reshape(-1, height * width, 6)
@@ -254,18 +242,6 @@ def nearest_rotation(matrix: Tensor) -> Tensor:
     u, _, vh = torch.linalg.svd(matrix)
     sign = torch.linalg.det(u @ vh).sign()
     return torch.cat((u[..., :2], u[..., 2:] * sign[..., None, None]), dim=-1) @ vh
-
-
-def _check(ray: Tensor, confidence: Tensor | None, *, views: bool = False) -> None:
-    least = 4 if views else 3
-    shape = "(..., V, h, w, 6)" if views else "(..., h, w, 6)"
-    if ray.ndim < least or ray.shape[-1] != 6 or 0 in ray.shape:
-        raise ShapeError(f"ray map {tuple(ray.shape)}; expected {shape}")
-    if confidence is not None and confidence.shape != ray.shape[:-1]:
-        raise ShapeError(
-            f"ray confidence {tuple(confidence.shape)} for a ray map {tuple(ray.shape)}; expected "
-            f"{tuple(ray.shape[:-1])}"
-        )
 
 
 def _check_rank(rows: Tensor, what: str) -> None:
