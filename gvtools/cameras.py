@@ -171,6 +171,16 @@ class Cameras:
         return np.concatenate([direction, moment], axis=-1)
 
 
+def reduced_size(width: int, height: int, longest: int) -> tuple[int, int]:
+    """Width and height of a picture, reduced to a longer side of ``longest`` where it is larger.
+
+    >>> reduced_size(640, 480, 320), reduced_size(64, 48, 320)
+    ((320, 240), (64, 48))
+    """
+    scale = min(1.0, longest / max(width, height))
+    return max(1, round(width * scale)), max(1, round(height * scale))
+
+
 def check_usable(cameras: Cameras) -> None:
     """Refuse cameras that no picture can be taken with."""
     for camera in cameras:

@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from gvtools.cameras import reduced_size
 from gvtools.errors import ProjectError
 from gvtools.features import FeatureMatcher, Features, quiet_colmap, root_sift
 from gvtools.poses.colmap import SEED, adjust, extract_sift, fix_cameras, list_pairs, verification
@@ -446,32 +447,27 @@ def learned_features(
     """Features of pictures, in the pixels of the pictures as they are stored."""
     found = {}
     for number, name in enumerate(names, start=1):
-        features = _of_picture(read_image(images / name).rgb, matcher)
+        rgb = read_image(images / name).rgb
+        height, width = rgb.shape[:2]
+        small = reduced_size(width, height, LEARNED_SIDE)
+        if small != (width, height):
+            rgb = np.asarray(Image.fromarray(rgb).resize(small, Image.Resampling.LANCZOS))
+        features = matcher.extract(np.ascontiguousarray(rgb))
+        # Pixels' centres are at +0.5 in both pictures, so that positions scale; a learned one may
+        # lie half a pixel outside.
+        xy = features.xy * (np.array([width, height]) / small)
+        xy = np.clip(xy, 0.5, [width - 0.5, height - 0.5])
+        features = Features(xy, features.descriptors, width, height)
         mask = None if masks is None else masks / f"{name}.png"
         if mask is not None and mask.is_file():
             usable = read_mask(mask)
-            check_size(usable.shape[::-1], (features.width, features.height), path=mask)
-            x, y = np.floor(features.xy).astype(int).T
+            check_size(usable.shape[::-1], (width, height), path=mask)
+            x, y = np.floor(xy).astype(int).T
             features = features[usable[y, x]]
         found[name] = features
         if number % EVERY == 0:
             say(f"features of {number} of {len(names)} pictures")
     return found
-
-
-def _of_picture(rgb: np.ndarray, matcher: FeatureMatcher) -> Features:
-    height, width = rgb.shape[:2]
-    scale = min(1.0, LEARNED_SIDE / max(height, width))
-    small = (max(1, round(width * scale)), max(1, round(height * scale)))
-    if small != (width, height):
-        rgb = np.asarray(Image.fromarray(rgb).resize(small, Image.Resampling.LANCZOS))
-    features = matcher.extract(np.ascontiguousarray(rgb))
-    # Pixels' centres are at +0.5 in both pictures, so that positions scale.
-    xy = features.xy * (np.array([width, height]) / small)
-    # A learned position may lie half a pixel outside.
-    return Features(
-        np.clip(xy, 0.5, [width - 0.5, height - 0.5]), features.descriptors, width, height
-    )
 
 
 def write_keypoints(database: Path, features: Mapping[str, Features]) -> None:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from gvtools.cameras import reduced_size
 from gvtools.capture.photographs import JPEG_QUALITY, CapturedPhotograph
 from gvtools.errors import OptionError
 from gvtools.scenes.faces import FACE_DEGREES, PANORAMA, Face, face_name, panorama_faces
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
 LENSES = ("auto", "perspective", "equirectangular", "fisheye")
 # XMP of Google's photo sphere schema, near the beginning of a file.
 XMP_KEY, XMP_VALUE, XMP_WITHIN = b"ProjectionType", b"equirectangular", 1 << 18
+# Lenses are recognised at this length of the longer side. [pixels]
+JUDGED_SIDE = 512
 # A 2:1 picture is a panorama if its left and right borders continue each other: the mean difference
 # between first and last column is at most this many times that of neighbouring columns, plus one.
 # [grey levels]
@@ -117,11 +120,10 @@ def _is_fisheye(item: CapturedPhotograph) -> bool:
     return bool(len(dark) and dark.max() <= DARK and grey[radius < 0.5].mean() > 2 * DARK)
 
 
-def _grey(item: CapturedPhotograph, side: int = 512) -> NDArray[np.float64]:
+def _grey(item: CapturedPhotograph) -> NDArray[np.float64]:
     with Image.open(item.path) as opened:
         image = opened.convert("L")
-        factor = min(1.0, side / max(image.size))
-        size = (max(1, round(image.width * factor)), max(1, round(image.height * factor)))
+        size = reduced_size(image.width, image.height, JUDGED_SIDE)
         return np.asarray(image.resize(size, Image.Resampling.BOX), np.float64)
 
 

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.cameras import Float64, invert_rigid, rigid_poses
+from gvtools.cameras import Float64, invert_rigid, reduced_size, rigid_poses
 from gvtools.features import mutual_nearest, root_sift
 from gvtools.poses.motions import Pair, optimise, turn_of, within
 from gvtools.scenes.scene import Scene
@@ -303,9 +303,7 @@ def start_from_features(frames: RgbdFrames, first: int, second: int) -> Float64 
 def _reduced(scene: Scene, side: int) -> tuple[tuple[int, int], Float64]:
     """Width and height of reduced pictures, and K, pixels counting from the first one's centre."""
     camera = scene.views[0].camera
-    width, height = int(camera.width[0]), int(camera.height[0])
-    scale = min(1.0, side / max(width, height))
-    size = max(1, round(width * scale)), max(1, round(height * scale))
+    size = reduced_size(int(camera.width[0]), int(camera.height[0]), side)
     K = camera.resized(*size).K[0].copy()
     K[:2, 2] -= 0.5
     return size, K

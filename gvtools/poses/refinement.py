@@ -16,7 +16,7 @@ import torch
 from kornia.filters import gaussian_blur2d
 from numpy.typing import NDArray
 
-from gvtools.cameras import Float64
+from gvtools.cameras import Float64, reduced_size
 from gvtools.o3d import o3d
 from gvtools.poses.motions import (
     Pair,
@@ -213,8 +213,7 @@ def refined_poses(views: Sequence[FitView], poses: Float64 | None = None) -> Ref
 def agreeing_poses(views: Sequence[FitView]) -> Float64:
     """(V, 4, 4) refined ``cam_from_local``, on average where they were given."""
     height, width = views[0].rgb.shape[:2]
-    scale = min(1.0, SIDE / max(height, width))
-    size = (round(width * scale), round(height * scale))
+    size = reduced_size(width, height, SIDE)
     smaller = [np.diag([*(np.array(size) / view.rgb.shape[1::-1]), 1]) for view in views]
     K = np.median([a @ view.K for a, view in zip(smaller, views, strict=True)], axis=0)
     K[0, 1] = 0  # Open3D knows no skew; views that have some are warped

@@ -19,7 +19,7 @@ from kornia.filters import box_blur
 from kornia.geometry.transform import remap
 from numpy.typing import NDArray
 
-from gvtools.cameras import Cameras, concatenate
+from gvtools.cameras import Cameras, concatenate, reduced_size
 from gvtools.depth.options import StereoOptions
 from gvtools.depth.stereo.geometry import relative_warps
 
@@ -98,19 +98,13 @@ class Pyramid:
     cameras: tuple[Cameras, ...]  # the view's camera for each level, batches of one
 
 
-def working_size(width: int, height: int, max_side: int) -> tuple[int, int]:
-    """Width and height of the finest level: the picture's, or reduced to ``max_side``."""
-    scale = min(1.0, max_side / max(width, height))
-    return max(1, round(width * scale)), max(1, round(height * scale))
-
-
 def build_pyramid(
     rgb: NDArray[np.uint8], camera: Cameras, *, max_side: int, levels: int
 ) -> Pyramid:
     """The levels of one picture, each half the size of the one before, at least 16 pixels."""
     colors = torch.from_numpy(rgb).permute(2, 0, 1).float() / 255
     luminance = rgb_to_grayscale(colors)[0]  # (H, W), BT.601
-    width, height = working_size(rgb.shape[1], rgb.shape[0], max_side)
+    width, height = reduced_size(rgb.shape[1], rgb.shape[0], max_side)
     images: list[torch.Tensor] = []
     cameras: list[Cameras] = []
     for _ in range(levels):

@@ -14,7 +14,7 @@ import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
 
-from gvtools.cameras import Cameras, concatenate
+from gvtools.cameras import Cameras, concatenate, reduced_size
 from gvtools.depth.options import StereoOptions
 from gvtools.depth.source import DepthMap
 from gvtools.depth.stereo import filtering
@@ -40,7 +40,6 @@ from gvtools.depth.stereo.matching import (
     resample_colors,
     residual_flow,
     textured,
-    working_size,
 )
 from gvtools.depth.stereo.matching_cpu import CpuMatcher
 from gvtools.errors import DegenerateError, OptionError
@@ -291,7 +290,7 @@ class PlaneSweepStereo:
             # As large as the finest level, whose pixels are meant.
             most = self.options.max_side
             camera, *others = (
-                each.resized(*working_size(int(each.width[0]), int(each.height[0]), most))
+                each.resized(*reduced_size(int(each.width[0]), int(each.height[0]), most))
                 for each in (self._scene[name].camera for name in (view.name, *names))
             )
             moved = enough_disparity(camera, concatenate(others), depths)
