@@ -20,10 +20,10 @@ if TYPE_CHECKING:
     from gvtools.evaluation.published import Benchmark
     from gvtools.scenes.scene import Scene
     from pipelines.console import Console
+    from pipelines.fleet.run import Pool
     from pipelines.reconstruction.plan import Plan
     from pipelines.reconstruction.settings import RunSettings
     from pipelines.scoring.benchmark import BenchmarkCell
-    from pipelines.scoring.sweep import Pool
 
 
 class BenchmarkCommand(LpipsArguments):
@@ -319,8 +319,9 @@ class FleetCommand(Arguments):
 
     def run(self, console: Console) -> None:
         from gvtools.runs.folder import folder_lock
-        from pipelines.fleet.run import Ray, jobs_of, report, run_fleet, this_machine, write_slurm
-        from pipelines.fleet.spec import is_url, read_list, tasks_of
+        from pipelines.fleet.run import Ray, report, run_fleet, this_machine, write_slurm
+        from pipelines.fleet.spec import Task, is_url, read_list, tasks_of
+        from pipelines.fleet.task import finished_record
 
         if self.engine != "ray":
             self.refuse(("address",), f"belongs to --engine ray, not {self.engine}")
@@ -338,14 +339,15 @@ class FleetCommand(Arguments):
         # A second driver would begin the same commands; of a URL, the user has to take care.
         alone = nullcontext() if self.collect or is_url(root) else folder_lock(Path(root))
         with alone:
-            jobs = [] if self.collect else jobs_of(tasks)
-            left = [job.work for job in jobs if job.record is None]
+            left, finished = list[Task](), list[Task]()
+            for task in () if self.collect else tasks:
+                (left if finished_record(task) is None else finished).append(task)
             if left:
                 pool: Pool = this_machine(left)
                 if self.engine == "ray":
                     pool = Ray(left, address=self.address or "local", console=console)
-                run_fleet(jobs, pool, console=console)
-            elif jobs:
+                run_fleet(left, pool, finished=finished, console=console)
+            elif not self.collect:
                 console.line(f"all {len(tasks)} tasks were finished before")
             failed = report(tasks, root, console)
         if failed:

@@ -8,12 +8,13 @@ import os
 import shlex
 import socket
 import sys
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from gvtools.errors import OptionError, ProjectError
 from gvtools.evaluation.tables import Column, Table, csv_text, markdown
@@ -21,25 +22,17 @@ from gvtools.files import make_folder, write_json, write_text
 from gvtools.optional import require
 from pipelines.console import Console
 from pipelines.fleet.spec import Task, is_url
-from pipelines.fleet.task import finished_record, read_record, run_task, write_record
-from pipelines.scoring.sweep import (
-    AGAIN,
-    BEGUN,
+from pipelines.fleet.task import (
     DONE,
-    ENDED,
     FAILED,
-    FOUND,
-    WAIT_S,
-    Event,
-    Job,
-    Pool,
     Record,
-    Threads,
-    difference,
-    lost_worker,
-    sweep,
+    read_record,
+    run_task,
+    write_record,
 )
 
+# Longest wait for a task to end [s]: then another one may have come.
+WAIT_S = 1.0
 # Time-out for connecting to a cluster [s].
 CONNECT_S = 10.0
 NOT_RUN = "not run"
@@ -47,51 +40,107 @@ TASKS, SUBMIT = "tasks.json", "submit.sh"
 _STATES = ("done", "running", "waiting", "failed", "again")
 
 
-def jobs_of(tasks: Sequence[Task]) -> list[Job[Task]]:
-    """The tasks as jobs of a sweep: the stages of a scene one after another."""
-    return [Job(task, finished_record(task), task.scene, task.retries) for task in tasks]
+class Pool(Protocol):
+    """Where tasks run."""
+
+    slots: float
+    """Tasks at a time."""
+
+    def submit(self, task: Task, attempt: int) -> Any:
+        """Begin a task; returns a handle."""
+
+    def finished(self, handles: Sequence[Any]) -> list[tuple[Any, Record]]:
+        """Handles of tasks that ended, with their records; waits for one at most ``WAIT_S``."""
+
+    def close(self) -> None:
+        """Release the workers."""
 
 
-def run_fleet(jobs: Sequence[Job[Task]], pool: Pool, *, console: Console) -> None:
-    """Run the tasks that are not finished; at the end every task has a record.
+class Threads:
+    """Several tasks at a time on this machine, each waited for by a thread."""
+
+    def __init__(self, slots: int) -> None:
+        self.slots = float(slots)
+        self._pool = ThreadPoolExecutor(slots)
+
+    def submit(self, task: Task, attempt: int) -> Future[Record]:
+        """Begin a task."""
+        return self._pool.submit(run_task, task, attempt)
+
+    def finished(self, handles: Sequence[Future[Record]]) -> list[tuple[Future[Record], Record]]:
+        """See Pool."""
+        ended, _ = wait(handles, timeout=WAIT_S, return_when=FIRST_COMPLETED)
+        return [(handle, self._record(handle)) for handle in ended]
+
+    def _record(self, handle: Future[Record]) -> Record:
+        try:
+            return handle.result()
+        except Exception as error:
+            return lost_worker(f"{type(error).__name__}: {error}")
+
+    def close(self) -> None:
+        """Start no other task, and wait for those that run."""
+        self._pool.shutdown(cancel_futures=True)
+
+
+def lost_worker(reason: str) -> Record:
+    """The record of a task whose worker could not write one; it may be run again."""
+    return {"status": FAILED, "reason": reason, "again": True}
+
+
+def run_fleet(
+    tasks: Sequence[Task], pool: Pool, *, finished: Sequence[Task] = (), console: Console
+) -> None:
+    """Run tasks, the stages of a scene in turn, beside those finished before; each leaves a record.
 
     Progress is one table of counts on a terminal, and a line for each event elsewhere.
     """
-    counts: dict[str, Counter[str]] = {job.work.stage: Counter() for job in jobs}
-    for job in jobs:
-        counts[job.work.stage]["waiting" if job.record is None else "done"] += 1
-    before = sum(job.record is not None for job in jobs)
-    console.line(f"{len(jobs)} tasks" + (f", {before} finished before" if before else ""))
-    with _live_table(counts, console), closing(sweep(jobs, pool)) as events:
-        for event in events:
-            task, record, reason = event.job.work, event.record, event.record.get("reason")
-            count, name = counts[task.stage], f"{task.scene} {task.stage}"
-            if event.kind == BEGUN:
-                count.update(running=1, waiting=-1)
-            elif event.kind == AGAIN:
-                count.update(running=-1, waiting=1, again=1)
-                console.warn(f"{name}: attempt {event.attempt} failed: {reason}")
-            elif event.kind != FOUND:
-                done = event.kind == ENDED and record["status"] == DONE
-                count.update({"running" if event.kind == ENDED else "waiting": -1})
-                count["done" if done else "failed"] += 1
-                over = sum(stage["done"] + stage["failed"] for stage in counts.values())
-                head = f"[{over}/{len(jobs)}] {name}"
-                if done and not console.interactive:
-                    console.line(f"{head}: {record['seconds']:.1f} s on {record['node']}")
-                elif not done:
-                    record = _failure(event)
-                    write_record(task.record(), record)
-                    console.warn(f"{head}: failed: {record['reason']}")
+    counts: dict[str, Counter[str]] = {task.stage: Counter() for task in (*finished, *tasks)}
+    for task in finished:
+        counts[task.stage]["done"] += 1
+    scenes: dict[str, deque[Task]] = {}
+    for task in tasks:
+        scenes.setdefault(task.scene, deque()).append(task)
+        counts[task.stage]["waiting"] += 1
+    total, before = len(tasks) + len(finished), len(finished)
+    console.line(f"{total} tasks" + (f", {before} finished before" if before else ""))
+    ready = deque((stages[0], 1) for stages in scenes.values())
+    running: dict[Any, tuple[Task, int]] = {}
 
+    def ended(task: Task, record: Record, *, state: str, attempts: int) -> None:
+        done = record["status"] == DONE
+        counts[task.stage].update({state: -1, "done" if done else "failed": 1})
+        over = sum(count["done"] + count["failed"] for count in counts.values())
+        head = f"[{over}/{total}] {task.scene} {task.stage}"
+        if not done:
+            about = {"scene": task.scene, "stage": task.stage, "attempts": attempts}
+            write_record(task.record(), {**about, **task.identity, **record})
+            console.warn(f"{head}: failed: {record['reason']}")
+        elif not console.interactive:
+            console.line(f"{head}: {record['seconds']:.1f} s on {record['node']}")
 
-def _failure(event: Event[Task]) -> Record:
-    """The record of a task that is given up, or not begun since one before it was."""
-    task, record = event.job.work, event.record
-    head = {"scene": task.scene, "stage": task.stage, "attempts": event.attempt, **task.identity}
-    if event.after is not None:
-        record = {"status": FAILED, "reason": f"stage {event.after.work.stage} failed"}
-    return {**head, **record}
+    with _live_table(counts, console), closing(pool):
+        while ready or running:
+            while ready and len(running) < pool.slots:
+                task, attempt = ready.popleft()
+                counts[task.stage].update(running=1, waiting=-1)
+                running[pool.submit(task, attempt)] = task, attempt
+            for handle, record in pool.finished(list(running)):
+                task, attempt = running.pop(handle)
+                failed, stages = record["status"] == FAILED, scenes[task.scene]
+                if failed and record.get("again") and attempt <= task.retries:
+                    counts[task.stage].update(running=-1, waiting=1, again=1)
+                    name = f"{task.scene} {task.stage}"
+                    console.warn(f"{name}: attempt {attempt} failed: {record['reason']}")
+                    ready.append((task, attempt + 1))
+                    continue
+                ended(task, record, state="running", attempts=attempt)
+                stages.popleft()
+                if not failed and stages:
+                    ready.append((stages[0], 1))
+                for later in stages if failed else ():
+                    skipped = {"status": FAILED, "reason": f"stage {task.stage} failed"}
+                    ended(later, skipped, state="waiting", attempts=0)
 
 
 def _live_table(
@@ -115,7 +164,7 @@ def this_machine(tasks: Sequence[Task]) -> Threads:
     """As many at a time as there are cores for the task with the most; one with any GPU."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     gpus = any(task.gpus for task in tasks)
-    return Threads(run_task, 1 if gpus else max(1, (cores or 1) // max(t.cpus for t in tasks)))
+    return Threads(1 if gpus else max(1, (cores or 1) // max(t.cpus for t in tasks)))
 
 
 class Ray:
@@ -154,20 +203,20 @@ class Ray:
                 raise OptionError(f"{text}; ask for less")
             console.warn(f"{text}; it waits until one joins")
 
-    def submit(self, work: Task, attempt: int) -> Any:
+    def submit(self, task: Task, attempt: int) -> Any:
         """Begin a task on a machine with its labels, or, where none of those is free, on any."""
         options: dict[str, Any] = {
-            "num_cpus": work.cpus,
-            "num_gpus": work.gpus,
+            "num_cpus": task.cpus,
+            "num_gpus": task.gpus,
             "max_retries": 0,
-            "name": f"{work.scene} {work.stage}",
+            "name": f"{task.scene} {task.stage}",
         }
-        if work.memory_gb:
-            options["memory"] = int(work.memory_gb * 1e9)
-        if work.labels:
-            options["label_selector"] = dict(work.labels)
+        if task.memory_gb:
+            options["memory"] = int(task.memory_gb * 1e9)
+        if task.labels:
+            options["label_selector"] = dict(task.labels)
             options["fallback_strategy"] = [{"label_selector": {}}]
-        return self._remote.options(**options).remote(work, attempt)
+        return self._remote.options(**options).remote(task, attempt)
 
     def finished(self, handles: Sequence[Any]) -> list[tuple[Any, Record]]:
         """Those that ended, also by the loss of their worker or machine."""
@@ -256,7 +305,7 @@ def collect(tasks: Sequence[Task]) -> list[Record]:
         head = {"scene": task.scene, "stage": task.stage, "status": NOT_RUN,
                 "reason": "left no record"}  # fmt: skip
         record = read_record(task.record())
-        if record is not None and difference(record, {"command": [*task.command]}):
+        if record is not None and record.get("command") != [*task.command]:
             record, head["reason"] = None, "was run with another command"
         records.append({**head, **(record or {})})
     return sorted(records, key=lambda record: record["scene"])

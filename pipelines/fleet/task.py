@@ -23,8 +23,10 @@ from gvtools.errors import GvError, OptionError, ProjectError
 from gvtools.files import digest, remove, write_json
 from gvtools.optional import require
 from pipelines.fleet.spec import Task, is_url
-from pipelines.scoring.sweep import DONE, FAILED, Record, difference
 
+Record = dict[str, Any]
+# Statuses of a record. One that failed has a ``reason``, and ``again`` where another attempt helps.
+DONE, FAILED = "done", "failed"
 # Commands that go on where an earlier attempt stopped, when told so.
 RESUMABLE = ("reconstruct", "train", "merge")
 # Commands whose folder appears at once, and that refuse one which is there.
@@ -36,9 +38,8 @@ _BUSY = "another process is at work there"
 def finished_record(task: Task) -> Record | None:
     """The record of a stage that was finished by the same command on the same input."""
     record = read_record(task.record())
-    if record is None or record.get("status") != DONE or difference(record, task.identity):
-        return None
-    return record
+    wanted = {"status": DONE, **task.identity}
+    return record if record and wanted.items() <= record.items() else None
 
 
 def run_task(task: Task, attempt: int = 1) -> Record:

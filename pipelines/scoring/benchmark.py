@@ -37,17 +37,6 @@ from pipelines.scoring.benchmark_scenes import (
     split_of_scene,
     write_thumbnails,
 )
-from pipelines.scoring.sweep import (
-    BEGUN,
-    ENDED,
-    FAILED,
-    FOUND,
-    InTurn,
-    Job,
-    Record,
-    difference,
-    sweep,
-)
 
 if TYPE_CHECKING:
     from gvtools.evaluation.lpips_distance import Lpips
@@ -56,7 +45,8 @@ if TYPE_CHECKING:
     from pipelines.reconstruction.settings import RunSettings
     from pipelines.scoring.measurement import MeasureOptions
 
-MEASURED = "measured"
+Record = dict[str, Any]
+MEASURED, FAILED = "measured", "failed"
 DEFAULT = "default"
 # Settings of the paper's protocol, and of its ablation "w/o spatial memory".
 PAPER: Mapping[str, Mapping[str, Any]] = {
@@ -372,7 +362,8 @@ def read_cell(cell: BenchmarkCell) -> Record | None:
     except (OSError, ValueError, KeyError, TypeError):
         return None
     now = cell.identity
-    if key := difference(before, now):
+    key = next((key for key, value in now.items() if before.get(key) != value), None)
+    if key is not None:
         raise OptionError(
             f"{cell.result}: measured with {key} {before.get(key)!r}, now {now[key]!r}; give the "
             "same, or another --out"
@@ -392,30 +383,20 @@ def measure_cells(
     ``measure`` writes a cell's file, ``after`` is called behind each. Pictures of other methods are
     always measured: they may have changed, and it takes no time.
     """
-
-    def run(cell: BenchmarkCell) -> Record:
+    records = [read_cell(cell) for cell in cells]
+    for number, (cell, record) in enumerate(zip(cells, records, strict=True), start=1):
+        head = f"[{number}/{len(cells)}] {cell.scene}, {cell.views} views, {cell.method.name}"
+        if record and record["status"] == MEASURED and cell.method.pictures is None:
+            console.line(f"{head}: measured before, {_summary_line(record)}")
+            continue
+        console.line(head)
         measure(cell)
-        return read_cell(cell) or {"status": FAILED, "reason": "left no result"}
-
-    jobs = []
-    for cell in cells:
-        record = read_cell(cell)
-        measured = record is not None and record["status"] == MEASURED
-        jobs.append(Job(cell, record if measured and cell.method.pictures is None else None))
-    for event in sweep(jobs, InTurn(run)):
-        cell = event.job.work
-        head = f"[{jobs.index(event.job) + 1}/{len(jobs)}] {cell.scene}, {cell.views} views"
-        head = f"{head}, {cell.method.name}"
-        if event.kind == BEGUN:
-            console.line(head)
-        elif event.kind == FOUND:
-            console.line(f"{head}: measured before, {_summary_line(event.record)}")
-        elif event.record["status"] == FAILED:
-            console.warn(f"{head}: failed: {event.record['reason']}")
+        record = read_cell(cell) or {"status": FAILED, "reason": "left no result"}
+        if record["status"] == FAILED:
+            console.warn(f"{head}: failed: {record['reason']}")
         else:
-            console.line(f"{head}: {_summary_line(event.record)}")
-        if event.kind == ENDED:
-            after()
+            console.line(f"{head}: {_summary_line(record)}")
+        after()
 
 
 def _summary_line(result: Mapping[str, Any]) -> str:
@@ -459,13 +440,10 @@ def measure_apart(cell: BenchmarkCell) -> None:
         process.kill()
         raise
     if not cell.result.is_file():
-        _write(cell, {"status": FAILED, "reason": _end_of_process(process.exitcode)})
-
-
-def _end_of_process(code: int | None) -> str:
-    if code == -9:
-        return "its process was killed; the system does that when memory runs out"
-    return f"its process ended with exit status {code}"
+        reason = f"its process ended with exit status {process.exitcode}"
+        if process.exitcode == -9:
+            reason = "its process was killed; the system does that when memory runs out"
+        _write(cell, {"status": FAILED, "reason": reason})
 
 
 def _child(cell: BenchmarkCell) -> None:

@@ -19,8 +19,7 @@ from gvtools.evaluation.published import (
 from gvtools.evaluation.statistics import Interval, mean_interval
 from gvtools.evaluation.tables import Column, Table, Value
 from gvtools.files import write_json, write_text
-from pipelines.scoring.benchmark import BenchmarkCell, read_cell
-from pipelines.scoring.sweep import FAILED
+from pipelines.scoring.benchmark import FAILED, BenchmarkCell, read_cell
 from pipelines.scoring.tables import write_tables
 
 if TYPE_CHECKING:

@@ -36,7 +36,6 @@ from pipelines.scoring.measurement import (
     run_targets,
     true_pictures,
 )
-from pipelines.scoring.sweep import Record, records_of
 from pipelines.scoring.tables import (
     measured_row,
     print_table,
@@ -166,13 +165,13 @@ def evaluate_runs(
     """The figures of each run, with what they were measured on."""
     matcher = matcher_called(options.matcher)
 
-    def measure(run: Run) -> Record:
+    def measure(run: Run) -> dict[str, Any]:
         console.line(f"{run.path}: {len(run.rounds) - 1} rounds")
         if not run.complete:
             console.warn(f"{run.path}: not every round is done; measured are those that are")
         return evaluate_run(run, options, matcher=matcher, console=console)
 
-    evaluations = records_of(runs, measure)
+    evaluations = [measure(run) for run in runs]
     # Runs of one name are told apart by the folders that they lie in.
     names = [evaluation["name"] for evaluation in evaluations]
     for evaluation in evaluations:

@@ -41,7 +41,6 @@ from pipelines.scoring.measurement import (
     run_targets,
     true_pictures,
 )
-from pipelines.scoring.sweep import Record, records_of
 from pipelines.scoring.tables import differences, judge_markdown, judge_tables, print_judgement
 from viz.report.pictures import JudgedView, method_sheet
 
@@ -372,8 +371,7 @@ def judge(
     shown = {targets[row].key: targets[row] for row in evenly(len(targets), sheet_views)}
     on_sheets: dict[str, dict[tuple[str, int], NDArray[np.uint8]]] = {}
 
-    def measure(given: tuple[Path, str]) -> Record:
-        path, name = given
+    def measure(path: Path, name: str) -> dict[str, Any]:
         method = open_method(path, name, targets, rule=rule, others=reference.others)
         if "consistency" in options.parts:
             # Pictures without depth get the memory's.
@@ -387,7 +385,7 @@ def judge(
             **measurement.of(method.targets),
         }
 
-    measured = records_of(zip(paths, names, strict=True), measure)
+    measured = [measure(path, name) for path, name in zip(paths, names, strict=True)]
     figures = {
         "against": str(reference.run.path),
         "project": reference.run.record["project"],

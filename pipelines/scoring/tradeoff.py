@@ -23,7 +23,6 @@ from gvtools.untrusted import read_json
 from pipelines.console import Console, Silent
 from pipelines.reconstruction.run import reconstruct
 from pipelines.reconstruction.settings import RunSettings
-from pipelines.scoring.sweep import BEGUN, DONE, FAILED, InTurn, Job, Record, sweep
 from pipelines.tuning.options import FEWEST_VIEWS, TuneOptions
 from viz.plots.curves import draw_pareto
 
@@ -213,39 +212,26 @@ def run_trials(
     trials: list[Trial] = []
     left_out: list[str] = []
     end = clock() + limit
-
-    def run(work: tuple[str, Settings]) -> Record:
+    for label, settings in planned.items():
+        trial = runs.stored(label, settings)
+        if trial is None and trials:
+            # A trial is expected to take as long as the start and its tuning, or the time of its
+            # fit.
+            tuning = 60 * settings.get("tune.minutes", 0.0)
+            fit = settings.get("refine.seconds") or 0.0
+            if clock() + max(trials[0].seconds + tuning, fit) > end:
+                left_out.append(label)
+                continue
         try:
-            return {"status": DONE, "trial": runs.make(*work)}
+            trial = trial or runs.make(label, settings)
         except GvError as error:
             # Without the start there is nothing to compare with.
             if not trials:
                 raise
-            return {"status": FAILED, "reason": str(error)}
-
-    def in_time(job: Job[tuple[str, Settings]]) -> bool:
-        label, settings = job.work
-        # A trial is expected to take as long as the start and its tuning, or the time of its fit.
-        tuning = 60 * settings.get("tune.minutes", 0.0)
-        fit = settings.get("refine.seconds") or 0.0
-        fits = not trials or clock() + max(trials[0].seconds + tuning, fit) <= end
-        if not fits:
-            left_out.append(label)
-        return fits
-
-    jobs = []
-    for work in planned.items():
-        trial = runs.stored(*work)
-        jobs.append(Job(work, None if trial is None else {"status": DONE, "trial": trial}))
-    for event in sweep(jobs, InTurn(run), admit=in_time):
-        label, record = event.job.work[0], event.record
-        if event.kind == BEGUN:
+            console.line(f"{label}: refused, {error}")
             continue
-        if record["status"] == FAILED:
-            console.line(f"{label}: refused, {record['reason']}")
-        else:
-            trials.append(record["trial"])
-            console.line(f"{label}: {record['trial']}")
+        trials.append(trial)
+        console.line(f"{label}: {trial}")
     if left_out:
         console.warn(
             f"{len(left_out)} trials were left out for --limit: {', '.join(left_out[:4])}; "

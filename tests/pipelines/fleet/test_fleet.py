@@ -21,7 +21,7 @@ from pipelines.cli import main
 from pipelines.console import Console
 from pipelines.fleet.run import (
     collect,
-    jobs_of,
+    lost_worker,
     result_table,
     run_fleet,
     this_machine,
@@ -29,7 +29,6 @@ from pipelines.fleet.run import (
 )
 from pipelines.fleet.spec import FleetSpec, Task, read_list, tasks_of
 from pipelines.fleet.task import fetch, read_record, run_task, upload
-from pipelines.scoring.sweep import lost_worker
 
 ROOT = Path(__file__).resolve().parents[3]
 # Quick, since it imports neither torch nor numba, and needs no scene.
@@ -125,7 +124,7 @@ def test_lost_workers_are_replaced_and_a_failure_skips_what_follows(scenes, tmp_
     wrong = {"status": "failed", "reason": "no cameras", "again": False}
     pool = Script({("a", "first"): [lost_worker("node lost")], ("b", "first"): [wrong],
                      ("c", "second"): [lost_worker("killed")] * 9})  # fmt: skip
-    run_fleet(jobs_of(tasks), pool, console=Console(quiet=True))
+    run_fleet(tasks, pool, console=Console(quiet=True))
     assert ("a", "first", 2) in pool.begun and ("a", "second", 1) in pool.begun
     assert ("b", "first", 2) not in pool.begun and ("b", "second", 1) not in pool.begun
     assert [n for scene, stage, n in pool.begun if (scene, stage) == ("c", "second")] == [1, 2, 3]
@@ -296,7 +295,7 @@ def test_a_fleet_at_a_url_reads_and_writes_there(tmp_path, monkeypatch):
             if p.is_file()} == contents  # fmt: skip
     spec = FleetSpec(stages={"x": {"command": QUICK}}, scenes=[{"project": url}])
     tasks = tasks_of(spec, "memory://bucket/fleet", folder=tmp_path)
-    run_fleet(jobs_of(tasks), this_machine(tasks), console=Console(quiet=True))
+    run_fleet(tasks, this_machine(tasks), console=Console(quiet=True))
     [record] = collect(tasks)
     assert (record["scene"], record["status"]) == ("scene", "done")
 
