@@ -6,10 +6,9 @@ run as it stands, else those that the run wrote itself.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cache
 from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -390,7 +389,7 @@ def contact_sheets(
     path, reports = run.path, run.rounds
     places = chosen_targets(reports, psnr, most)
     total = sum(len(report["views"]) for report in reports)
-    nearest = _nearest_context(scene, run.context)
+    given = None if scene is None or not run.context else scene.subset(run.context)
 
     def row(place: tuple[int, int]) -> SheetRow | str:
         number, at = place
@@ -400,7 +399,7 @@ def contact_sheets(
         if psnr.get(name) is not None:
             heading += f", PSNR {psnr[name]:.2f} dB"
         try:
-            pictures = _pictures(path, number, entry, truth=truths.get(name), nearest=nearest)
+            pictures = _pictures(path, number, entry, truth=truths.get(name), given=given)
             return SheetRow(heading, contact_row(pictures))
         except (GvError, OSError, ValueError) as error:
             return f"pictures of {name} (round {number}) cannot be shown: {error}"
@@ -432,7 +431,7 @@ def _pictures(
     entry: Mapping[str, Any],
     *,
     truth: View | None,
-    nearest: Callable[[Mapping[str, Any]], tuple[str, Any] | None],
+    given: Scene | None,
 ) -> TargetPictures:
     folder = round_folder(path, number)
     hint, support, completion = (
@@ -440,7 +439,10 @@ def _pictures(
     )
     scanned = support == SUPPORT_SCANNED
     frame = None if truth is None else truth.load()
-    given = nearest(entry)
+    nearest = None
+    if given is not None:
+        (place,) = nearest_views(given.cameras, entry_camera(entry), 1)
+        nearest = given.views[place]
     return TargetPictures(
         name=str(entry["name"]),
         hint=hint,
@@ -450,8 +452,8 @@ def _pictures(
         completion=completion,
         truth=None if frame is None else frame.rgb,
         mask=None if frame is None else frame.mask,
-        context=None if given is None else given[1],
-        context_name="" if given is None else given[0],
+        context=None if nearest is None else nearest.load().rgb,
+        context_name="" if nearest is None else nearest.name,
     )
 
 
@@ -475,23 +477,3 @@ def frame_rows(run: Run) -> list[tuple[str, list[NDArray[np.uint8] | None]]]:
                 pictures = [target.read().picture, None if truth is None else truth.load().rgb]
                 columns.append((f"round {number}, {frame}: {target.name}", pictures))
     return columns
-
-
-def _nearest_context(
-    scene: Scene | None, context: Sequence[str]
-) -> Callable[[Mapping[str, Any]], tuple[str, Any] | None]:
-    """Finds name and picture of the context view that stands and looks most like a target."""
-    if scene is None or not context:
-        return lambda entry: None
-    given = scene.subset(context)
-    cameras = given.cameras
-
-    @cache
-    def load(place: int) -> Any:
-        return given.views[place].load().rgb
-
-    def nearest(entry: Mapping[str, Any]) -> tuple[str, Any]:
-        (place,) = nearest_views(cameras, entry_camera(entry), 1)
-        return given.views[place].name, load(place)
-
-    return nearest

@@ -97,14 +97,8 @@ def test_growth_draws_the_path_once_for_each_round(run: Path, tmp_path: Path) ->
     ],
 )
 def test_wrong_options_are_refused_and_nothing_is_written(
-    run: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-    *,
-    arguments: list[str],
-    said: str,
-) -> None:
+    run, tmp_path, capsys, monkeypatch, arguments, said
+):
     monkeypatch.chdir(tmp_path)
     assert said in refused(capsys, "film", run, *arguments)
     assert not list(tmp_path.iterdir())

@@ -309,8 +309,3 @@ def test_every_help_of_an_action_starts_with_two_examples(action, capsys):
     assert len(lines) == 2
     for line in lines:
         build_parser().parse_args(line.split()[1:])
-
-
-def test_a_wrong_action_or_option_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
-    for arguments in ((), ("lst",), ("check",), ("list", "--jsn", "x"), ("create", "tiny")):
-        refused(capsys, "weights", *arguments)

@@ -218,12 +218,3 @@ def test_a_report_that_cannot_be_read_does_not_end_the_viewer(small_run, tmp_pat
     kept.rename(growing / "round_002")
     following.look()
     assert rounds == [2]
-
-
-def test_an_interrupted_start_is_no_interrupted_run(small_run, monkeypatch, capsys):
-    def interrupted(self):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(ViewSource, "read", interrupted)
-    assert main(["view", str(small_run)]) == 0
-    assert capsys.readouterr() == ("viewer ended\n", "")

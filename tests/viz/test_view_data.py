@@ -5,7 +5,6 @@ import shutil
 
 import numpy as np
 import pytest
-from memory_scenes import points
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -161,17 +160,6 @@ def test_what_is_drawn_is_even_and_does_not_change_as_the_memory_grows(run, smal
     now, before = detail(memory, budget), detail(earlier, budget)
     assert now.edge == before.edge == memory.voxel
     assert set(before.rows.tolist()) < set(now.rows.tolist())
-
-
-@pytest.mark.parametrize("budget", [1, 2, 5, 16])
-def test_a_budget_below_the_cells_around_the_origin_is_kept(budget):
-    memory = SpatialMemory(0.1)
-    corners = [(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
-    memory.fuse(points(corners), round=0)
-    memory.fuse(points(np.array(corners) * 0.9), round=1, generated=True)
-    drawn = detail(memory, budget)
-    assert 1 <= len(drawn.rows) <= budget
-    assert np.isfinite([drawn.edge, drawn.size]).all()
 
 
 def test_rendering_goes_back_and_forth_between_rounds_exactly(run, small_run):

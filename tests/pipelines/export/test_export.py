@@ -6,20 +6,16 @@ import sys
 import numpy as np
 import pycolmap
 import pytest
-from box_project import VOXEL, fused
+from box_project import fused
 from export_runs import Y_UP, export_run, glb_colors
-from memory_scenes import points
 from PIL import Image
 from plyfile import PlyData
 
 from gvtools.errors import OptionError, ProjectError
 from gvtools.memory.ply import export_memory_ply
-from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.thinning import thin
 from gvtools.scenes.project import open_project
 from pipelines.export.formats import FORMATS
-
-ORIGIN = (431_000.0, 5_650_000.0, 120.0)
 
 
 @pytest.fixture(scope="module")
@@ -36,37 +32,6 @@ def saved(memory, tmp_path):
     (folder / "round_002").mkdir()
     Image.new("RGB", (96, 72)).save(folder / "round_002" / "generated_view_4.png")
     return folder
-
-
-def test_thinning_keeps_the_most_confident_of_each_voxel(memory):
-    kept = thin(memory, None)
-    cells = [
-        tuple(cell)
-        for cell in np.floor(memory.columns.positions.astype(np.float64) * (1 / VOXEL)).astype(int)
-    ]
-    best: dict[tuple[int, ...], int] = {}
-    for row, cell in enumerate(cells):
-        if cell not in best or memory.confidence[row] > memory.confidence[best[cell]]:
-            best[cell] = row
-    assert kept.rows.tolist() == sorted(best.values())
-    assert len(kept.rows) == memory.voxels
-    np.testing.assert_array_equal(kept.rows[kept.group], [best[cell] for cell in cells])
-
-
-@pytest.mark.parametrize("limit", [1, 50, 700])
-def test_thinning_to_a_number(memory, limit):
-    kept = thin(memory, limit)
-    assert limit / 6 < len(kept.rows) <= limit
-    assert kept.edge > VOXEL
-
-
-@pytest.mark.parametrize("limit", [1, 5, 7])
-def test_points_all_around_the_origin_are_thinned_to_few(limit):
-    memory = SpatialMemory(0.1)
-    memory.fuse(points(np.random.default_rng(0).uniform(-3, 3, (500, 3))), round=0)
-    kept = thin(memory, limit)
-    assert 1 <= len(kept.rows) <= limit
-    assert kept.edge < 12 and kept.group.max() == len(kept.rows) - 1
 
 
 def test_an_earlier_round(memory, saved, tmp_path):

@@ -202,9 +202,7 @@ def put(path, text="mine"):
     [
         ("colmap", "", ["sparse/0/cameras.bin"]),
         ("colmap", "", ["sparse/0/cameras.txt", "sparse/0/generated.txt"]),
-        ("colmap", "", ["sparse/cameras.bin"]),
         ("colmap", "", ["cameras.bin", "images.bin"]),
-        ("colmap", "", ["cameras.txt"]),
         ("transforms", "", ["transforms.json"]),
         ("transforms", "mine.JSON", ["mine.JSON"]),
     ],

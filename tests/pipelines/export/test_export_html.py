@@ -85,15 +85,6 @@ def test_words_hold_what_was_packed(degree):
         assert (np.abs(found - sh[:, 1:]) <= largest / 255 + 2.0**-15 / 255).all()
 
 
-def test_numbers_beyond_half_precision_stay_finite():
-    one = np.ones((1, 4), np.float32)
-    _, words = pack_gaussians(
-        one[:, :3], log_scales=1e6 * one[:, :3], quaternions=one, logits=1e3 * one[:, 0],
-        harmonics=1e30 * one[:, None, :3],
-    )  # fmt: skip
-    assert np.isfinite([halves(words[:, k]) for k in range(3)]).all()
-
-
 def scene_of(path):
     """What the page's script reads, and its groups: round, generated, fitted, count, words."""
     text = path.read_text("utf-8")

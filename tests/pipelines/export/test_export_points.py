@@ -194,15 +194,6 @@ def test_nothing_observed_is_said(scene, tmp_path):
         assert not (tmp_path / name).exists()
 
 
-def test_thinning_some_observations_counts_no_others(bare_run):
-    memory = bare_run.memory
-    among = memory.generated
-    kept = thin(memory, 100, among=among)
-    assert among[kept.rows].all() and 10 < len(kept.rows) <= 100
-    np.testing.assert_array_equal(kept.group >= 0, among)
-    np.testing.assert_array_equal(kept.group[kept.rows], np.arange(len(kept.rows)))
-
-
 def told_in(path):
     """The line of a text, or of a header, that begins with "up"."""
     lines = path.read_bytes()[:4096].decode("latin1").splitlines()
@@ -333,19 +324,6 @@ def test_upright_splats_stay_right_where_another_program_saved_them(bare_run, tm
         aside = turn.inv().apply([5, 0, 0]) - tree["nodes"][0]["translation"]
         off = aside if change is beside_another else np.zeros(3)
         np.testing.assert_allclose(others, there + off, atol=1e-5)
-
-
-@pytest.mark.parametrize("data", [{"up": "y"}, {"turn": 90.0}])
-def test_data_of_other_programs_in_usd_is_passed_over(bare_run, tmp_path, data):
-    pytest.importorskip("pxr")
-    from pxr import Sdf
-
-    out = tmp_path / "a.usda"
-    export_run(bare_run.folder, "splat", out, *Y_UP)
-    layer = Sdf.Layer.FindOrOpen(str(out))
-    layer.customLayerData = data
-    layer.Save()
-    assert read_splats(out).up.tolist() == [0, 1, 0]
 
 
 WKT = 'LOCAL_CS["site",UNIT["metre",1]]'

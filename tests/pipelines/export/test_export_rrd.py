@@ -11,8 +11,6 @@ from gvtools.memory.thinning import thin
 
 pytest.importorskip("rerun")
 
-ORIGIN = (431_000.0, 5_650_000.0, 120.0)
-
 
 def chunks(path):
     """Entity, and its columns by name, of every chunk that is not static."""

@@ -16,8 +16,6 @@ from gvtools.memory.thinning import thin
 from gvtools.runs.run import load_appearance
 from pipelines.rendering import render_view
 
-ORIGIN = (431_000.0, 5_650_000.0, 120.0)
-
 
 def psnr(one: np.ndarray, two: np.ndarray) -> float:
     return float(-10 * np.log10(np.square(one - two).mean()))
