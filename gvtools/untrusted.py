@@ -108,10 +108,7 @@ def regular(path: Path) -> Path:
         ...
     OSError: [Errno 22] is a folder; expected a file: '/'
     """
-    try:
-        mode = os.stat(path).st_mode
-    except ValueError as error:  # a name with a null
-        raise OSError(22, str(error), repr(str(path))) from None
+    mode = os.stat(path).st_mode
     if not stat.S_ISREG(mode):
         what = "folder" if stat.S_ISDIR(mode) else "pipe or a device"
         raise OSError(22, f"is a {what}; expected a file", str(path))
@@ -182,13 +179,11 @@ def parse_yaml(text: str, *, most: int = MOST_CHARACTERS) -> Any:
         if _nodes(value, {}) > limit:
             raise ValueError(f"aliases stand for more than {limit} values")
         return value
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, *PARSER_ERRORS, KeyError) as error:
         mark = getattr(error, "problem_mark", None)
         where = "" if mark is None else f"line {mark.line + 1}: "
-        problem = getattr(error, "problem", None) or str(error).splitlines()[0]
+        problem = getattr(error, "problem", None) or f"no YAML ({type(error).__name__})"
         raise ValueError(f"{where}{problem}") from None
-    except (RecursionError, OverflowError, KeyError, AttributeError, TypeError) as error:
-        raise ValueError(f"no YAML ({type(error).__name__})") from None
 
 
 def _nodes(value: Any, known: dict[int, int]) -> int:
@@ -220,16 +215,15 @@ def named_file(folder: Path, name: str | Path, *, where: str, follow_links: bool
         path = Path(name) if inside else folder / name
         resolved = os.path.abspath if follow_links else os.path.realpath
         home, real = resolved(folder), resolved(path)
-        if "\0" in real:
-            raise ValueError("a null in its name")
+        wrong = "a null in its name" if "\0" in real else ""
+        if real != home and not real.startswith(home.rstrip("/") + "/"):
+            wrong = f"which lies outside of {folder}"
     except (OSError, ValueError) as error:
+        wrong = str(error)
+    if wrong:
         raise ProjectError(
-            f"{where}: names the file {str(name)[:80]!r} ({error}); expected a path in {folder}"
-        ) from None
-    if real != home and not real.startswith(home.rstrip("/") + "/"):
-        raise ProjectError(
-            f"{where}: names the file {str(name)[:80]!r}, which lies outside of {folder}; expected "
-            "a path below it; copy the file there"
+            f"{where}: names the file {str(name)[:80]!r}, {wrong}; expected a path below {folder}; "
+            "copy the file there"
         )
     return path
 
@@ -369,9 +363,8 @@ def read_array(stream: IO[bytes], size: int) -> NDArray[Any]:
     except Exception as error:
         # What its parser of the head, which is Python's own, stumbles upon, it raises as it comes.
         raise ValueError(f"an array with a damaged head ({type(error).__name__})") from None
-    if dtype.hasobject:
-        raise ValueError("an array of objects, which may hold code")
-    if min(shape, default=0) < 0 or math.prod(map(int, shape)) * dtype.itemsize > size:
+    fits = min(shape, default=0) >= 0 and math.prod(map(int, shape)) * dtype.itemsize <= size
+    if dtype.hasobject or not fits:  # objects may hold code
         raise ValueError(f"an array of shape {shape} and type {dtype} in {size} bytes")
     stream.seek(0)
     array: NDArray[Any] = form.read_array(stream, allow_pickle=False)
@@ -382,14 +375,11 @@ def read_array(stream: IO[bytes], size: int) -> NDArray[Any]:
     return array
 
 
-def _head(path: Path) -> bytes:
-    with regular(path).open("rb") as file:
-        return file.read(64)
-
-
-def _held(head: bytes) -> str:
+def _held(source: Path | bytes) -> str:
     """What the first bytes of a file say that is no picture, "" where they say nothing."""
-    return next((kind for mark, kind in HELD.items() if mark in head[:32].lower()), "")
+    with io.BytesIO(source) if isinstance(source, bytes) else source.open("rb") as file:
+        head = file.read(32).lower()
+    return next((kind for mark, kind in HELD.items() if mark in head), "")
 
 
 def open_picture(source: Path | bytes) -> Image.Image:
@@ -399,11 +389,12 @@ def open_picture(source: Path | bytes) -> Image.Image:
     size = len(source) if isinstance(source, bytes) else regular(source).stat().st_size
     try:
         image = Image.open(io.BytesIO(source) if isinstance(source, bytes) else source)
-    except UnidentifiedImageError:
-        kind = _held(source[:64] if isinstance(source, bytes) else _head(source))
-        raise ValueError(f"no picture{kind and f', but {kind}'}") from None
-    except (Image.DecompressionBombError, LookupError, *PARSER_ERRORS) as error:
-        raise ValueError(str(error) or type(error).__name__) from None
+    except (Image.DecompressionBombError, LookupError, OSError, *PARSER_ERRORS) as error:
+        text = str(error) or type(error).__name__
+        if isinstance(error, UnidentifiedImageError):
+            kind = _held(source)
+            text = f"no picture{kind and f', but {kind}'}"
+        raise ValueError(text) from None
     width, height = image.size
     pixel = len(image.getbands()) * (4 if image.mode[:1] in "IF" else 1)
     if width * height * pixel > PIXEL_BYTES + PIXEL_RATIO * size:

@@ -193,13 +193,10 @@ def camera_of(
         )
     width, height = (int(value) for value in size)
     values = [float(value) for value in params]
-    if not 1 <= min(width, height) <= max(width, height) <= MOST_PIXELS:
-        raise ProjectError(
-            f"{what}: {model} {width}x{height} has an impossible size; expected pixels; solve "
-            "or export the model again"
-        )
-    camera = pycolmap.Camera(model=model, width=width, height=height, params=values)
-    wrong = _impossible(camera)
+    possible = 1 <= min(width, height) <= max(width, height) <= MOST_PIXELS
+    side = (width, height) if possible else (1, 1)
+    camera = pycolmap.Camera(model=model, width=side[0], height=side[1], params=values)
+    wrong = _impossible(camera) if possible else "has an impossible size"
     if wrong:
         raise ProjectError(
             f"{what}: {model} {width}x{height} with parameters {values} {wrong}; "
