@@ -97,10 +97,7 @@ def _filled(network: nn.Module, device: torch.device | str, dtype: torch.dtype) 
 
 
 def random_views(size: tuple[int, int], *, context: int, targets: int, seed: int = 0) -> ViewBatch:
-    """One sample of views on an arc about a point in front of them.
-
-    ``size``: (H, W), px.
-    """
+    """One sample of views on an arc about a point in front of them."""
     generator = torch.Generator().manual_seed(seed)
     views, (height, width) = context + targets, size
 

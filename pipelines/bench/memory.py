@@ -12,7 +12,7 @@ import multiprocessing
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -76,7 +76,8 @@ class LiveBytes(TorchDispatchMode):
             for tensor in (*module.parameters(), *module.buffers())
         }
         # At most what is held: what was given back since the last look is still in it.
-        self._most = self._peak = 0
+        self._most = 0
+        self.peak = 0  # the most bytes that were held since ``forget_peak``
 
     def __torch_dispatch__(  # noqa: PLR0917
         self, func: Any, types: Any, args: Any = (), kwargs: Any = None
@@ -86,8 +87,8 @@ class LiveBytes(TorchDispatchMode):
         for leaf in tree_leaves(out):
             if isinstance(leaf, Tensor):
                 self._hold(leaf)
-        if self._most > self._peak * (1 + NOTICED):
-            self._peak = max(self._peak, self.live)
+        if self._most > self.peak * (1 + NOTICED):
+            self.peak = max(self.peak, self.live)
         return out
 
     @property
@@ -99,18 +100,9 @@ class LiveBytes(TorchDispatchMode):
         self._most = sum(size for size, _ in self._held.values())
         return self._most
 
-    @property
-    def peak(self) -> int:
-        """The most bytes that were held since ``forget_peak``."""
-        return self._peak
-
-    @peak.setter
-    def peak(self, value: int) -> None:
-        self._peak = value
-
     def forget_peak(self) -> None:
         """Begin a new peak at what is held now."""
-        self._peak = self.live
+        self.peak = self.live
 
     def __exit__(self, *error: Any) -> None:
         """Let go of what was counted; ``peak`` stays."""
@@ -157,18 +149,13 @@ def alone(run: Callable[..., Any], *given: Any, **named: Any) -> Any:
 
 
 def run_without_numbers(func: Any, *args: Any, **kwargs: Any) -> Any:
-    """What an operation gives, on whatever tensors."""
-    try:
-        return func(*args, **kwargs)
-    except (DataDependentOutputException, DynamicOutputShapeException):
-        return _supposed(func, *args, **kwargs)
+    """What an operation gives, on whatever tensors.
 
-
-def _supposed(func: Any, *args: Any, **kwargs: Any) -> Any:
-    """What an operation that depends on numbers gives in the ordinary, full case.
-
-    Checks pass and every view is informative: a truth is True, a number 0, all places are found.
+    Where that depends on numbers, it is the ordinary, full case: checks pass and every view is
+    informative. A truth is True, a number 0, all places are found.
     """
+    with suppress(DataDependentOutputException, DynamicOutputShapeException):
+        return func(*args, **kwargs)
     if func is _ATEN._local_scalar_dense.default:
         return True if args[0].dtype == torch.bool else 0.0
     if func is _ATEN.nonzero.default:
@@ -183,7 +170,7 @@ def _supposed(func: Any, *args: Any, **kwargs: Any) -> Any:
 
 
 CPU = torch.device("cpu")
-FORWARD, BACKWARD, OPTIMISER = "forward", "backward", "optimiser"
+FORWARD, BACKWARD, OPTIMISER = PARTS = "forward", "backward", "optimiser"
 WITHOUT, WITH = "without the video prior", "with the video prior"
 # The stages that train a large model: the denoisers, then their distillation beside a teacher.
 STAGES: dict[str, tuple[type[Stage], Any]] = {
@@ -217,10 +204,7 @@ class StagePeaks:
 def pass_peaks(
     model: GeoVerse, batch: ViewBatch, *, steps: tuple[int, int], dtype: torch.dtype
 ) -> dict[str, int]:
-    """Bytes beside the weights at the peak of each stage of a pass.
-
-    ``steps``: of level 1 and of the cascade.
-    """
+    """Bytes beside the weights at the peak of each stage of a pass."""
     shift = model.config.flow.shift
     with LiveBytes([model, *prior_networks(model)]) as live, autocast(CPU, dtype):
         peaks = model.clock = StagePeaks(live)
@@ -402,9 +386,6 @@ def show_memory(figures: dict[str, Any], console: Console) -> None:
     )
     if figures["card_gb"] is not None:
         console.line(card_line(figures, figures["card_gb"]))
-
-
-PARTS = ("forward", "backward", "optimiser")
 
 
 def _show_pass(model: str, rows: list[dict[str, Any]], console: Console) -> None:

@@ -89,10 +89,7 @@ def photograph(size: Float64, camera: Cameras) -> tuple[NDArray[np.uint8], NDArr
 def layers_in_view(
     count: int, camera: Cameras, *, seed: int = 0, layers: int = 4, block: float = 0.08
 ) -> NDArray[np.float32]:
-    """(N, 3) float32 points of wavy surfaces behind each other, all in view, in block order.
-
-    ``block``: edge of the cubes in whose order the points come, scene units.
-    """
+    """(N, 3) float32 points of wavy surfaces behind each other, all in view, in block order."""
     rng = np.random.default_rng(seed)
     width, height = int(camera.width[0]), int(camera.height[0])
     uv = rng.uniform(0.01, 0.99, (count, 2)) * (width, height)

@@ -51,6 +51,7 @@ from pipelines.reconstruction.plan import Plan, Targets, describe, run_identity
 from pipelines.reconstruction.prepare import make_plan, placed_scan
 from pipelines.reconstruction.run import Draw, compile_kernels, complete_run, saved_fit, say_results
 from pipelines.reconstruction.settings import RunSettings
+from pipelines.reconstruction.voxel import grid_frame
 
 if TYPE_CHECKING:
     from gvtools.scenes.scene import Scene
@@ -176,10 +177,7 @@ def scale_colors(values: NDArray[np.float32], log_gain: Float64) -> NDArray[np.f
 def _exposures(
     parts: Sequence[BlockAppearance], gains: Float64, frame: LocalFrame
 ) -> Exposures | None:
-    """Exposures of all blocks' own photographs in order of their names, as a run has its context.
-
-    None where a block has none.
-    """
+    """Exposures of all blocks' own photographs by name; None where a block has none."""
     names, poses, logs, depths = [], [], [], []
     for part, gain in zip(parts, gains, strict=True):
         own, exposures = set(part.block.owners), part.appearance.exposures
@@ -309,10 +307,7 @@ class BlockRun:
 
 
 def read_runs(paths: Sequence[Path], *, blocks: Path | None = None) -> list[BlockRun]:
-    """The runs of all blocks of one split, in order of the blocks' names.
-
-    ``blocks``: where the split lies now; None: where it lay.
-    """
+    """The runs of all blocks of one split, in order of the blocks' names."""
     known = {} if blocks is None else {path.name: path for path, _ in read_blocks(blocks)}
     found: dict[str, BlockRun] = {}
     for path in paths:
@@ -528,13 +523,8 @@ def _take_depth(plan: Plan, runs: Sequence[BlockRun], directory: RunDirectory) -
 
 def _fitted(plan: Plan, runs: Sequence[BlockRun], console: Console) -> Fitted | None:
     """The blocks' Gaussians, joined and fitted across faces; None where a block has none."""
-    from pipelines.reconstruction.fitting import Fitted
-    from pipelines.reconstruction.voxel import grid_frame
-
     files = [round_folder(item.run.path, 0) / APPEARANCE for item in runs]
-    without = [
-        str(item.run.path) for item, file in zip(runs, files, strict=True) if not file.exists()
-    ]
+    without = [file.parents[1] for file in files if not file.exists()]
     if without:
         if len(without) < len(runs):
             console.warn(

@@ -23,7 +23,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,10 +45,6 @@ from gvtools.scenes.selection import select
 from gvtools.untrusted import read_json
 from gvtools.view_selection import nearest_views
 from pipelines.reconstruction.prepare import refined_poses_of
-
-if TYPE_CHECKING:
-    pass
-
 
 FILE = "block.json"
 Float64 = NDArray[np.float64]

@@ -107,10 +107,7 @@ def _attempt(task: Task) -> tuple[str, str, bool]:
 
 
 def _ending_with(worker: int) -> Callable[[], None] | None:
-    """What a command's process does first, so that it ends with its worker.
-
-    The next attempt needs the folder.
-    """
+    """What a command's process does first, so that it ends with its worker."""
     if sys.platform != "linux":
         return None
     import ctypes

@@ -138,10 +138,7 @@ def _placed(
 
 
 def _by_cameras(path: Path, plan: Plan) -> Placement | None:
-    """By the cameras that 3D Gaussian Splatting leaves above its splats.
-
-    None where no file tells them, or the project's are others.
-    """
+    """By the cameras that 3D Gaussian Splatting leaves above its splats."""
     files = [folder / "cameras.json" for folder in path.resolve().parents[:ABOVE]]
     file = next((file for file in files if file.is_file()), None)
     if file is None:

@@ -217,11 +217,7 @@ class Sweep:
 
 @dataclass(frozen=True)
 class FitValidation:
-    """PSNR of a fit's validation photographs, at the size of its sweep.
-
-    >>> FitValidation(20.0, 20.1, 5).fit_is_used, str(FitValidation(18.0, 20.0, 5))
-    (True, "the memory's own (validation photographs: 20.00 dB, Gaussians 18.00 dB)")
-    """
+    """PSNR of a fit's validation photographs, at the size of its sweep."""
 
     gaussians: float  # PSNR of the Gaussians' pictures [dB]
     memory: float  # of the memory's own colours, and the Gaussians' where it knows nothing [dB]
@@ -242,10 +238,7 @@ class FitValidation:
 def validate_fit(
     predicted: Mapping[str, Picture], plan: Plan, sweep: Sweep
 ) -> FitValidation | None:
-    """Predict the validation photographs both ways; None where the memory shows nothing of them.
-
-    ``predicted`` are their pictures before they joined the fit; ``plan`` is without its depth.
-    """
+    """Predict the validation photographs both ways; None where the memory shows nothing of them."""
     assert plan.config.voxel is not None
     scene, place = sweep.scene, grid_frame(plan.scene, plan.context)
     size = float(np.mean([plan.scene[n].camera.K[0, 0, 0] for n in predicted]))
@@ -511,10 +504,7 @@ def _recorded(plan: Plan) -> bool:
 
 @contextmanager
 def _stopped_by_ctrl_c(fit: Fit, console: Console) -> Iterator[None]:
-    """Ctrl-C ends the fit and keeps what is fitted; the second time it ends the run, as ever.
-
-    Where nothing can be told of it, or somebody else takes it, it does what it always did.
-    """
+    """Ctrl-C ends the fit and keeps what is fitted; the second time it ends the run, as ever."""
     before = signal.getsignal(signal.SIGINT)
     main = threading.current_thread() is threading.main_thread()
     if console.quiet or not main or before is not signal.default_int_handler:

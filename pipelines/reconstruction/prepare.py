@@ -175,10 +175,7 @@ def _with_voxel(
 
 
 def _on_device(config: RunSettings) -> RunSettings:
-    """The device of the projection: "cuda" takes the torch back end there, "cpu" no other.
-
-    "auto" is CUDA where the torch back end was chosen, may choose, and finds such a device.
-    """
+    """The device of the projection: "cuda" takes the torch back end there, "cpu" no other."""
     from gvtools.appearance.splat.gsplat_splatter import gsplat_installed
     from gvtools.settings import with_values
 
@@ -269,11 +266,7 @@ def refined_poses_of(
 
 
 def saved_poses(round_0: Path, context: Sequence[str], targets: Cameras) -> RunPoses | None:
-    """The refined poses of a run whose round 0 is complete; None where the given ones stayed.
-
-    None, too, where they are of another number of views: the run is another one then, and is
-    refused for that.
-    """
+    """The refined poses of a run whose round 0 is complete; None where the given ones stayed."""
     path = round_0 / POSES
     poses = RunPoses.load(path) if path.exists() else None
     if poses is None or (len(poses.context), len(poses.targets)) != (len(context), len(targets)):

@@ -80,10 +80,7 @@ class CachedProjection:
         self._picture: Picture | None = None
 
     def prefetch(self, snapshot: SpatialMemory) -> None:
-        """Project what observed views show ahead of ``guidance``, where that is reused.
-
-        Of a snapshot of the memory; so this may run beside fusions of generated content.
-        """
+        """Project what observed views show ahead of ``guidance``, where that is reused."""
         if self.reuse and self.options.backend == "cpu":
             self._observed = Projection(snapshot, self.camera, self.options).observed()
             self._at = (-1, snapshot.observed_changes)
@@ -362,11 +359,7 @@ def complete_round(
     plan: Plan, round_targets: RoundTargets, number: int, *, context: Sequence[ContextView],
     folder: Path, console: Console,
 ) -> dict[str, Any]:  # fmt: skip
-    """Round ``number``, from 1: complete and fuse its targets, and write their files.
-
-    Files are compressed and written in the background while the next targets are completed. Returns
-    the round's report.
-    """
+    """Round ``number``, from 1: complete and fuse its targets, and write their files."""
     memory, rows = round_targets.memory, plan.schedule[number - 1]
     clock, begun, voxels, total = Clock(), time.perf_counter(), memory.voxels, FuseReport()
     all_stems = target_stems(plan.targets.cameras.names)

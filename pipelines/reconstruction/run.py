@@ -232,11 +232,7 @@ def complete_run(
     console: Console,
     draw: Draw | None,
 ) -> Sequence[str]:
-    """The rounds from number ``done`` on, and the end products.
-
-    ``plan`` has the cameras that were fitted to; without a fit, colours are the memory's own.
-    Returns the names of the files that ``draw`` wrote.
-    """
+    """The rounds from number ``done`` on, and the end products."""
     if fitted is not None:
         plan = fitted.apply(plan)
     memory = (
@@ -284,10 +280,7 @@ def complete_run(
 
 
 def saved_fit(plan: Plan, directory: RunDirectory) -> Fitted | None:
-    """Gaussians that a resumed run's round 0 left; None where there are none.
-
-    None are there where none were wanted or could be fitted; ``gvtools refine`` adds them.
-    """
+    """Gaussians that a resumed run's round 0 left; None where there are none."""
     saved = directory.round_path(0) / APPEARANCE
     return Fitted.load(saved).on(plan.config.device) if saved.exists() else None
 

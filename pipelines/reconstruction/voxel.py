@@ -211,10 +211,7 @@ def _search(look: Callable[[float], dict[float, float]], loss: float) -> dict[fl
 
 
 def at_scale(config: RunSettings, scale: float) -> RunSettings:
-    """``config`` with all voxels so many times as wide.
-
-    An edge of twice the typical footprint means voxels of twice the footprint everywhere.
-    """
+    """``config`` with all voxels so many times as wide."""
     assert config.voxel is not None
     changes = {
         "voxel": scale * config.voxel,
@@ -281,10 +278,7 @@ def _probe(scene: Scene, name: str, others: Sequence[str], *, frames: dict[str, 
 def _pixels_onto(
     camera: Cameras, frame: Frame, onto: Cameras, *, wanted: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """(H, W), the pixels with depth that fall on the ``wanted`` pixels of another camera.
-
-    One pixel of each BLOCK x BLOCK speaks for all.
-    """
+    """(H, W), the pixels with depth that fall on the ``wanted`` pixels of another camera."""
     assert frame.depth is not None
     depth = frame.depth[::BLOCK, ::BLOCK]
     use = np.isfinite(depth) & (depth > 0)

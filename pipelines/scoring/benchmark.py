@@ -202,10 +202,7 @@ class _OpenCell:
 
 
 def measure_cell(cell: BenchmarkCell) -> dict[str, Any]:
-    """Make the pictures of a cell, unless the method is a folder of pictures, and measure them.
-
-    The figures and what they were measured on are JSON-ready.
-    """
+    """Make the pictures of a cell, unless the method is a folder of pictures, and measure them."""
     from gvtools.evaluation.lpips_distance import Lpips
 
     benchmark = load_benchmark(cell.benchmark).at(cell.views)
@@ -277,11 +274,7 @@ def _reconstruct(opened: _OpenCell) -> float:
 
 
 def _of_pictures(opened: _OpenCell) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Figures of pictures in a folder, as ``gvtools judge`` has them, and the pictures by target.
-
-    What the context observed, and the poses that pictures are located against, come from a memory
-    of the context alone, which is kept in the cell's run.
-    """
+    """Figures of pictures in a folder, as ``gvtools judge`` has them, and these by target."""
     from gvtools.runs.digests import versions
     from pipelines.scoring.judging import open_method, reference_from_context
     from pipelines.scoring.measurement import Measurement

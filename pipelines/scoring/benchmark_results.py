@@ -50,10 +50,7 @@ class MethodResult:
 
 
 def method_results(benchmark: Benchmark, cells: Sequence[BenchmarkCell]) -> list[MethodResult]:
-    """The results of the methods, in the cells' order, without methods not yet measured.
-
-    The benchmark has one number of context views; cells with another are ignored.
-    """
+    """The results of the methods, in the cells' order, without methods not yet measured."""
     own = [cell for cell in cells if cell.views == benchmark.context]
     names = dict.fromkeys(cell.method.name for cell in own)
     results = []
@@ -198,10 +195,7 @@ def scene_table(benchmark: Benchmark, by_views: Mapping[int, Sequence[MethodResu
 def write_results(
     benchmark: Benchmark, cells: Sequence[BenchmarkCell], out: Path, *, title: str
 ) -> dict[int, Table]:
-    """Write results.json, the tables (CSV, Markdown, LaTeX), and the HTML page.
-
-    Cells may be measured or not. Returns the comparison tables by number of context views.
-    """
+    """Write results.json, the tables (CSV, Markdown, LaTeX), and the HTML page."""
     from viz.report.page import benchmark_html
 
     views = dict.fromkeys(cell.views for cell in cells)

@@ -131,10 +131,7 @@ def pictures_folder(folder: Path, scene: str, *, views: int) -> Path:
 def object_mask(
     benchmark: Benchmark, root: Path, *, scene: str, index: int, shape: tuple[int, int]
 ) -> np.ndarray | None:
-    """(H, W) bool, the object in a scene's view of this number; None where there is no mask of it.
-
-    White is the object, as RegNeRF's evaluation reads it; the nearest pixel is taken.
-    """
+    """(H, W) bool, the object (white) in a scene's view of this number; None without a mask."""
     from PIL import Image
 
     paths = [root / pattern.format(scene=scene, index=index) for pattern in benchmark.masks]
@@ -156,11 +153,7 @@ def masked_figures(
     *,
     lpips: Lpips | None,
 ) -> dict[str, float | None]:
-    """PSNR of the object's pixels; SSIM and LPIPS of pictures that are white outside it.
-
-    Pictures (H, W, 3) uint8 and masks (H, W) bool are by target; the figures are means over them,
-    and none where a target has no mask.
-    """
+    """PSNR of the object's pixels; SSIM and LPIPS of pictures that are white outside it."""
     from gvtools.evaluation.images import psnr, ssim
 
     if not masks or any(mask is None for mask in masks.values()):

@@ -81,11 +81,7 @@ def run_protocol(
     reading: Mapping[str, Any],
     console: Console,
 ) -> Path:
-    """Split the views by one of PROTOCOLS, run, and write the split beside the run; its folder.
-
-    Defaults: the widest stride, and the settings' completer and profile. Changes are settings as
-    KEY=VALUE.
-    """
+    """Split the views by one of PROTOCOLS, run, and write the split beside the run; its folder."""
     from gvtools.settings import with_texts, with_values
     from pipelines.reconstruction.run import reconstruct
     from pipelines.reconstruction.settings import RunSettings
@@ -124,11 +120,7 @@ def evaluate_run(
     matcher: FeatureMatcher | None = None,
     console: Console,
 ) -> dict[str, Any]:
-    """Measure one run with at least one round of targets, and say what was measured.
-
-    The figures are JSON-ready, by part; what could not be measured is None, with the reason under
-    ``notes``.
-    """
+    """Measure one run with at least one round of targets, and say what was measured."""
     record, targets = run.record, run_targets(run)
     measurement = Measurement(
         options=options,

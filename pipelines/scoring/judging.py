@@ -229,10 +229,7 @@ def open_method(
     rule: str,
     others: Sequence[str] = (),
 ) -> MethodPictures:
-    """The pictures of a run of gvtools, or those that ``open_pictures`` reads, for the targets.
-
-    They are matched by a rule of ``match_pictures``, and resized to their targets.
-    """
+    """The pictures of a run of gvtools, or those that ``open_pictures`` reads, for the targets."""
     pictures = _run_pictures(path) if (path / RECORD).is_file() else open_pictures(path)
     views = [target.picture.name for target in targets]
     matching = match_pictures(

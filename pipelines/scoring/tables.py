@@ -167,10 +167,7 @@ def _without_figures(evaluation: Mapping[str, Any]) -> list[str]:
 def measured_row(
     name: str, evaluations: Sequence[Mapping[str, Any]], setting: Setting
 ) -> MeasuredRow:
-    """The protocol's figures: means over scenes of what each scene's views come to.
-
-    The time is that of all rounds, as published.
-    """
+    """The protocol's figures: means over scenes of what each scene's views come to."""
 
     def mean(path: str) -> float | None:
         values = [nested(evaluation, path) for evaluation in evaluations]
@@ -374,10 +371,7 @@ PAIRED = [
 
 
 def differences(methods: Sequence[Figures], seed: int) -> list[dict[str, Any]]:
-    """For each pair of methods and figure: first minus second over the views that both have.
-
-    An entry holds mean, interval, number of views, and the share in which the first is better.
-    """
+    """For each pair of methods and figure: first minus second over the views that both have."""
     out = []
     for first, second in combinations(methods, 2):
         for figure in PAIRED:

@@ -366,10 +366,7 @@ def tune(
 def previous_tuning(
     scene: Scene, weights: Path, out: Path, *, options: TuneOptions, seed: int = 0
 ) -> dict[str, Any] | None:
-    """The record of a tuning that ``tune`` would make again with these arguments; None without one.
-
-    None, too, where its weights are damaged.
-    """
+    """The record of a whole tuning that ``tune`` would make again with these arguments, if any."""
     with suppress(OSError, ValueError, CheckpointError):
         record: dict[str, Any] = read_json(out / RECORD)
         split = split_context(scene, check_headers(out), seed=seed)
