@@ -27,13 +27,12 @@ from pipelines.reconstruction.voxel import grid_frame
 from pipelines.tuning.options import FEWEST_VIEWS
 
 if TYPE_CHECKING:
-    from gvtools.appearance.fit_options import FitOptions
     from gvtools.depth.source import DepthSource
     from gvtools.runs.context_depth import DepthCache
     from gvtools.runs.folder import RunDirectory
     from gvtools.scans.points import Scan
     from gvtools.scans.registration import Placement, Surface
-    from pipelines.reconstruction.settings import RunSettings, ScanOptions
+    from pipelines.reconstruction.settings import RunSettings
 
 # A fit whose length is not given takes at most so long if no photographs can be left out to tell
 # whether it gains [s].
@@ -57,8 +56,7 @@ def make_plan(
     from gvtools.depth.choice import choose_source
     from gvtools.depth.source import RecordedDepth
 
-    check_scan(settings.scan, init=settings.refine.init)
-    check_start(settings.refine)
+    check_files(settings)
     config = _on_device(settings)
     _check(scene, config)
     scene = reduced(scene, config.max_side)
@@ -278,32 +276,25 @@ def saved_poses(round_0: Path, context: Sequence[str], targets: Cameras) -> RunP
 VIEWS, PIXELS = 40, 5000
 
 
-def check_scan(options: ScanOptions, *, init: str | None = None) -> None:
-    """Refuse a scan that cannot be read or placed before anything is computed."""
+def check_files(config: RunSettings) -> None:
+    """Refuse a scan or a start of a fit that cannot be read or placed, before it is needed."""
     from gvtools.scans.read import open_scan
     from gvtools.scans.registration import given_placement
-
-    if options.file is None:
-        if options.placement != "estimate" and init is None:
-            raise OptionError(
-                "scan.placement without a scan; expected --cloud or --init FILE beside it"
-            )
-    else:
-        open_scan(Path(options.file))
-    given_placement(options.placement)
-
-
-def check_start(options: FitOptions) -> None:
-    """Refuse a file to begin a fit with that cannot be read, or that no fit begins with."""
-    from gvtools.scans.read import open_scan
     from gvtools.splat_files import holds_splats, read_splats
 
-    if options.init is None:
-        return
-    if not options.wanted:
-        raise OptionError("--init without a fit; leave it out, or give --refine some seconds")
-    path = Path(options.init)
-    read_splats(path) if holds_splats(path) else open_scan(path)
+    scan, init = config.scan, config.refine.init
+    if scan.placement != "estimate" and scan.file is None and init is None:
+        raise OptionError(
+            "scan.placement without a scan; expected --cloud or --init FILE beside it"
+        )
+    if scan.file is not None:
+        open_scan(Path(scan.file))
+    given_placement(scan.placement)
+    if init is not None:
+        if not config.refine.wanted:
+            raise OptionError("--init without a fit; leave it out, or give --refine some seconds")
+        path = Path(init)
+        read_splats(path) if holds_splats(path) else open_scan(path)
 
 
 def placed_scan(plan: Plan, console: Console) -> PlacedScan | None:

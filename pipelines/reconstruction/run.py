@@ -8,10 +8,9 @@ from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from gvtools.errors import OptionError, ProjectError
 from gvtools.evaluation.images import FIGURES, view_figures
+from gvtools.evaluation.statistics import mean_known
 from gvtools.files import folder_replaced_when_written, only_in, recover_folder, write_json
 from gvtools.memory.ply import export_memory_ply
 from gvtools.memory.spatial_memory import SpatialMemory, TiledMemory
@@ -108,10 +107,9 @@ def measure_run(
     notes = [NO_LPIPS]
     if not any("psnr" in view for view in views):
         notes.append("no target has a true picture, so there are no image figures")
-    summary: dict[str, Any] = {name: mean_of(views, name) for name in FIGURES}
-    summary |= {
-        "coverage": mean_of(views, "coverage"),
-        "coverage_after": mean_of(views, "coverage_after"),
+    means = (*FIGURES, "coverage", "coverage_after")
+    summary: dict[str, Any] = {
+        **{name: mean_known([view.get(name) for view in views]) for name in means},
         "targets": len(views),
         "observations": len(memory),
         "voxels": memory.voxels,
@@ -166,12 +164,6 @@ def _figures_of_targets(plan: Plan, directory: RunDirectory) -> list[dict[str, A
             )
         views.append(figures)
     return views
-
-
-def mean_of(views: list[dict[str, Any]], name: str) -> float | None:
-    """The mean over the views that have the figure."""
-    values = [view[name] for view in views if view.get(name) is not None]
-    return float(np.mean(values)) if values else None
 
 
 def reconstruct(
