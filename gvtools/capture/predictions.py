@@ -176,24 +176,23 @@ def _from_arrays(arrays: Arrays) -> Predictions:
         height, width = shaped[0].shape[1:3]
     elif K is not None:
         width, height = np.rint(2 * K[..., :2, 2].reshape(-1, 2)[0]).astype(int)
-    else:
-        raise ValueError("no intrinsics, nor focal lengths with depth, points or pictures")
     for each in shaped:
         if each.shape[:3] != (len(poses), height, width):
             raise ValueError(f"{len(poses)} poses of {width}x{height} pixels beside {each.shape}")
     if K is None and focals is None and world is not None:
         focals = _focal_lengths(world, rigid)
     if K is None:
-        if focals is None:
-            raise ValueError("neither intrinsics nor points that tell them")
+        if focals is None or not shaped:
+            raise ValueError(
+                "no intrinsics, nor points, or focal lengths of pictures, to tell them"
+            )
         K = np.tile([[1.0, 0, width / 2], [0, 1.0, height / 2], [0, 0, 1]], (len(focals), 1, 1))
         K[:, [0, 1], [0, 1]] = focals.reshape(len(focals), -1)
     # One is of all pictures.
     K = np.broadcast_to(K, (len(poses), *K.shape[-2:])) if K.size == 9 else K
-    if K.shape != (len(poses), 3, 3) or not np.isfinite(K).all():
-        raise ValueError(f"{len(poses)} poses, and intrinsics of shape {K.shape} or not finite")
-    if not (K[:, [0, 1], [0, 1]] > 0).all():
-        raise ValueError("focal lengths that are not above 0")
+    usable = K.shape == (len(poses), 3, 3) and np.isfinite(K).all()
+    if not (usable and (K[:, [0, 1], [0, 1]] > 0).all()):
+        raise ValueError(f"{len(poses)} poses, and K of shape {K.shape}, not finite or not above 0")
     K = np.where([[1, 0, 1], [0, 1, 1], [0, 0, 1]], K, 0).astype(np.float64)
     cameras = Cameras(K, rigid, np.array(width), np.array(height), ())
     seen = sample_points(depth if depth is not None else world, sure)

@@ -82,10 +82,6 @@ class PlaneSweepStereo:
         """Prepare; nothing is computed yet."""
         self.options = options or StereoOptions()
         self.views = tuple(dict.fromkeys(views))
-        if len(self.views) < 2:
-            raise OptionError(
-                f"stereo: {len(self.views)} view(s) to look at; expected at least 2; name more"
-            )
         self._pool = replace(scene, views=tuple(scene[name] for name in self.views), points=None)
         self._scene = scene
         self._matcher, self._device = make_matcher(self.options)

@@ -25,7 +25,7 @@ from gvtools.depth.stereo.filtering import (
 from gvtools.depth.stereo.geometry import DepthRange, baselines
 from gvtools.depth.stereo.matching import CLEAR, detail_of, noise_of, textured
 from gvtools.depth.stereo.plane_sweep import PlaneSweepStereo, enough_disparity
-from gvtools.errors import DegenerateError, OptionError, ProjectError
+from gvtools.errors import DegenerateError
 from gvtools.scenes.scene import Frame, Scene, View
 
 OPTIONS = StereoOptions(levels=2, align=False, speckle=20)
@@ -110,13 +110,6 @@ def test_masked_pixels_are_left_out(slanted, stereo):
     found = stereo.depth(scene, scene["v2"], replace(frame, mask=mask))
     assert (found.depth[:60] == 0).all()
     assert (found.depth[60:] > 0).mean() > 0.7
-
-
-def test_errors_name_what_is_wrong(slanted):
-    with pytest.raises(OptionError, match="expected at least 2"):
-        PlaneSweepStereo(slanted.scene, views=("v0",))
-    with pytest.raises(ProjectError, match="nothing"):
-        PlaneSweepStereo(slanted.scene, views=("v0", "nothing"))
 
 
 def test_speckles_go_and_surfaces_stay():
