@@ -75,10 +75,6 @@ class Published:
     def difference(self, path: Path) -> str:
         """What a whole file is that is not the published one; empty if it is, as far as known."""
         size = path.stat().st_size
-        if self.older and size > 2 * self.size:
-            return (
-                f"the first upload, with its optimizer's state ({next(iter(self.older.values()))})"
-            )
         if not self.fits(size):
             return self.sizes(size)
         found = sha256_of(path) if self.sha256 else ""

@@ -87,6 +87,14 @@ def open_sources(run: Run) -> ReportScenes:
     return ReportScenes(scene, {name: by_name.get(name) for name in run.record["targets"]})
 
 
+def load_started(path: Path, *, project: Path | None = None) -> Run:
+    """A run with at least one whole round; ``project`` is where its project lies now."""
+    run = load_run(path, project=project)
+    if not run.rounds:
+        raise ProjectError(f"{path}: no round is done yet; expected one; wait, or add --resume")
+    return run
+
+
 def collect(
     path: Path,
     *,
@@ -98,10 +106,8 @@ def collect(
 
     ``sources`` is the project where it is open already, else ``project`` where it lies now.
     """
-    run = load_run(path, project=project)
+    run = load_started(path, project=project)
     record, reports = run.record, run.rounds
-    if not reports:
-        raise ProjectError(f"{path}: no round is done yet; expected one; wait, or add --resume")
     sources = sources or open_sources(run)
     measures = read_measures(run)
     psnr = {view["name"]: view.get("psnr") for view in measures.views}

@@ -32,10 +32,10 @@ def _intrinsics(text: Any) -> Any:
         return text
     try:
         fx, fy, cx, cy = (float(part) for part in text.split(","))
+        if not (min(fx, fy) > 0 and all(math.isfinite(value) for value in (fx, fy, cx, cy))):
+            raise ValueError
     except ValueError:
-        raise ValueError("four numbers FX,FY,CX,CY in pixels") from None
-    if not (min(fx, fy) > 0 and all(math.isfinite(value) for value in (fx, fy, cx, cy))):
-        raise ValueError("finite numbers, FX and FY above 0")
+        raise ValueError("four finite numbers FX,FY,CX,CY in pixels, FX and FY above 0") from None
     return [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]
 
 

@@ -90,7 +90,14 @@ def capture(
         reading: what the user said of RGB-D, see ``RecordingArguments.reading``.
         options: what the user said of photographs and videos, by names of PHOTOGRAPHIC.
     """
-    from gvtools.scenes.project import BAG, VIDEOS, is_archive, is_recording
+    from gvtools.scenes.project import (
+        BAG,
+        VIDEOS,
+        is_archive,
+        is_project,
+        is_recording,
+        rgbd_options,
+    )
     from gvtools.scenes.rgbd import count_unposed
     from gvtools.untrusted import unpacked
 
@@ -109,16 +116,29 @@ def capture(
     masks = options.get("masks")
     if masks is not None and not masks.is_dir():
         raise ProjectError(f"--masks {masks}: no such folder")
-    if is_bag or (source.is_dir() and count_unposed(source)):
-        _capture_rgbd(source, out, console=console, reading=reading, options=options)
+    rgbd = is_bag or (source.is_dir() and count_unposed(source) > 0)
+    if source.is_dir() and (is_project(source) if rgbd else is_recording(source)):
+        raise ProjectError(
+            f"{source}: has poses already; expected a recording without; give it to gvtools "
+            "reconstruct as it is"
+        )
+    if rgbd:
+        from gvtools.capture.rgbd_project import capture_rgbd
+
+        for name in options:
+            raise OptionError(
+                f"--{name}: of photographs and videos; {source} is an RGB-D recording, of which "
+                "all frames are taken and depth tells the metres"
+            )
+        recording = capture_rgbd(
+            source, out, options=rgbd_options(reading), say=console.line,
+            draw=partial(_draw, title=out.name),
+        )  # fmt: skip
+        _print_rgbd(recording, console)
     elif reading:
         raise OptionError(
             f"{source}: no folder of colour and depth; expected none of the options of RGB-D "
             f"recordings ({', '.join(reading)})"
-        )
-    elif source.is_dir() and is_recording(source):
-        raise ProjectError(
-            f"{source}: has poses and depth already; give it to gvtools reconstruct as it is"
         )
     elif "poses" in options:
         from gvtools.capture.posed_photographs import capture_posed
@@ -212,30 +232,6 @@ def _matcher(features: str | None, weights: Sequence[Path] | None) -> LightGlueM
 
     device = "cuda" if torch.cuda.is_available() else "cpu"
     return LightGlueMatcher(features, max_features=LEARNED_FEATURES, weights=weights, device=device)
-
-
-def _capture_rgbd(
-    source: Path, out: Path, *, console: Console, reading: Mapping[str, Any],
-    options: Mapping[str, Any],
-) -> None:  # fmt: skip
-    from gvtools.capture.rgbd_project import capture_rgbd
-    from gvtools.scenes.project import is_project, rgbd_options
-
-    if source.is_dir() and is_project(source):
-        raise ProjectError(
-            f"{source}: has poses already; expected a recording without; give it to gvtools "
-            "reconstruct as it is"
-        )
-    for name in options:
-        raise OptionError(
-            f"--{name}: of photographs and videos; {source} is an RGB-D recording, of which all "
-            "frames are taken and depth tells the metres"
-        )
-    report = capture_rgbd(
-        source, out, options=rgbd_options(reading), say=console.line,
-        draw=partial(_draw, title=out.name),
-    )  # fmt: skip
-    _print_rgbd(report, console)
 
 
 def _print(report: CaptureReport, console: Console) -> None:

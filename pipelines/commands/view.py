@@ -169,12 +169,10 @@ def _figure(what: str, folder: Path) -> Figure:
         from viz.plots.curves import draw_losses
 
         return draw_losses(read_training(folder), title=title)
-    from gvtools.runs.run import load_run
+    from pipelines.report import load_started
 
-    run = load_run(folder)
+    run = load_started(folder)
     rounds = run.rounds
-    if not rounds:
-        raise ProjectError(f"{folder}: no round is done yet; expected one; wait, or add --resume")
     if what == "trajectories":
         from pipelines.report import open_sources, read_measures, report_poses
         from viz.plots.trajectories import draw_trajectories

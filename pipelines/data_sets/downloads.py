@@ -44,7 +44,11 @@ def list_data_sets(args: ListData, console: Console) -> None:
     names = spec_names() if args.name is None else (args.name,)
     specs = [load_spec(name) for name in names]
     if args.json_ is not None:
-        write_json(args.json_, {"data_sets": [known_of(spec) for spec in specs]})
+        known = [
+            {**spec.model_dump(mode="json"), "weight": spec.weight, "share": share_of(spec)}
+            for spec in specs
+        ]
+        write_json(args.json_, {"data_sets": known})
         console.line(f"{len(specs)} data sets written to {args.json_}")
     elif args.name is None:
         console.table(COLUMNS, table_rows())
@@ -85,11 +89,6 @@ def table_rows() -> list[tuple[str | None, ...]]:
             )
         )
     return rows
-
-
-def known_of(spec: DataSetSpec) -> dict[str, Any]:
-    """A spec as JSON-ready values, with its weight and its share in a mixture."""
-    return {**spec.model_dump(mode="json"), "weight": spec.weight, "share": share_of(spec)}
 
 
 def as_yaml(spec: DataSetSpec) -> str:

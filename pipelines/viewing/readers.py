@@ -55,15 +55,14 @@ def load_mesh(path: Path) -> trimesh.Trimesh | trimesh.PointCloud:
         scene = trimesh.load_scene(place, process=False, resolver=_beside(path), file_type=kind)
         loaded: Any = scene.to_geometry()
     loaded.apply_transform(rigid_poses(back))
-    points = isinstance(loaded, trimesh.PointCloud)
-    if not points and not (isinstance(loaded, trimesh.Trimesh) and len(loaded.faces)):
-        raise MemoryFileError(f"{path}: no triangles and no points; expected either")
-    if not np.isfinite(loaded.vertices).all():
-        raise MemoryFileError(f"{path}: vertices that are no finite numbers; save it again")
-    if not points:
-        faces = np.asarray(loaded.faces)
-        if faces.min() < 0 or faces.max() >= len(loaded.vertices):
-            raise MemoryFileError(f"{path}: a triangle of vertices that are not there")
+    whole = isinstance(loaded, trimesh.PointCloud)
+    if isinstance(loaded, trimesh.Trimesh) and len(loaded.faces):
+        whole = loaded.faces.min() >= 0 and loaded.faces.max() < len(loaded.vertices)
+    if not (whole and np.isfinite(loaded.vertices).all()):
+        raise MemoryFileError(
+            f"{path}: expected points, or triangles of vertices that are there, all finite; save "
+            "it again"
+        )
     geometry: trimesh.Trimesh | trimesh.PointCloud = loaded
     return geometry
 

@@ -151,7 +151,7 @@ def test_frames_that_cannot_be_read_are_left_out_and_named(walked, tmp_path, cap
 def test_a_phone_export_with_poses_is_no_capture(tmp_path, capsys) -> None:
     polycam(tmp_path / "walk")
     line = refused(capsys, "capture", tmp_path / "walk", "--out", tmp_path / "out")
-    assert "has poses and depth already; give it to gvtools reconstruct" in line
+    assert "has poses already; expected a recording without; give it to" in line
 
 
 def test_features_start_pairs_that_motion_alone_does_not(walked, recording) -> None:

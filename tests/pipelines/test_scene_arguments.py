@@ -75,7 +75,7 @@ def test_a_file_without_a_matrix(tmp_path, text):
     [
         (("--depth-unit", "-1"), "--depth-unit -1; expected more than 0"),
         (("--depth-unit", "nan"), "--depth-unit nan; expected more than 0"),
-        (("--color-intrinsics", "1,2,3"), "four numbers"),
+        (("--color-intrinsics", "1,2,3"), "four finite numbers"),
         (("--depth-intrinsics", "0,1,2,3"), "above 0"),
     ],
 )

@@ -8,7 +8,6 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from gvtools.errors import OptionError
 from gvtools.memory.spatial_memory import SpatialMemory
 from pipelines.viewing.source import ViewSource
 from viz.plots.canvas import COLORS, GREY
@@ -109,8 +108,6 @@ def test_colours_say_what_is_so(run):
     assert {color for color, _ in point_colors(memory, "source").legend.swatches} == {
         COLORS["observed"], COLORS["generated"],
     }  # fmt: skip
-    with pytest.raises(OptionError, match="colour mode"):
-        point_colors(memory, "colour")
 
 
 def test_views_of_a_voxel_are_counted(run):

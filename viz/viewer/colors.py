@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.errors import OptionError
 from viz.plots.canvas import COLORS, GREY, rgb_of
 
 if TYPE_CHECKING:
@@ -70,6 +69,7 @@ def point_colors(
     """Colours of observations; an observation's is the same whichever others are asked for.
 
     Args:
+        mode: of MODES.
         rows: (P,) the observations; None for all.
         true_depth: the recorded depth (H, W) of a view by its name, or None; for "depth-error".
         counts: the memory's view_counts, for "views"; None: they are counted.
@@ -88,9 +88,7 @@ def point_colors(
         top = max(2, int(counts.max(initial=1)))
         legend = Legend("views with observations in the point's voxel", scale=("1", str(top)))
         return PointColors(viridis((counts[chosen] - 1) / (top - 1)), legend)
-    if mode == "depth-error":
-        return _by_depth_error(memory, chosen, true_depth)
-    raise OptionError(f"colour mode {mode!r}; expected one of {', '.join(MODES)}")
+    return _by_depth_error(memory, chosen, true_depth)
 
 
 def view_counts(memory: SpatialMemory) -> NDArray[np.int64]:
@@ -184,10 +182,7 @@ def _by_confidence(memory: SpatialMemory, rows: NDArray[np.int64]) -> PointColor
 def _by_depth_error(
     memory: SpatialMemory, rows: NDArray[np.int64], true_depth: TrueDepth | None
 ) -> PointColors:
-    if true_depth is None:
-        errors = np.full(len(rows), np.nan, np.float32)
-    else:
-        errors = depth_errors(memory, rows, true_depth)
+    errors = depth_errors(memory, rows, true_depth or (lambda name: None))
     known = np.isfinite(errors)
     rgb = np.empty((len(rows), 3), np.uint8)
     rgb[:] = rgb_of(GREY)

@@ -75,10 +75,8 @@ def chosen_camera(run: RunView, name: str | None) -> ShownCamera:
     for shown in run.cameras:
         if shown.name == name:
             return shown
-    names = [shown.name for shown in run.cameras]
-    if not names:
-        raise OptionError(f"--camera {name!r}: {run.path} holds no cameras; leave the option out")
-    raise OptionError(
-        f"--camera {name!r}: no such view; expected one of {len(names)}, such as {names[0]!r} or "
-        f"{names[-1]!r}"
-    )
+    known = f"{run.path} holds no cameras; leave the option out"
+    if run.cameras:
+        first, last = run.cameras[0].name, run.cameras[-1].name
+        known = f"no such view; expected one of {len(run.cameras)}, such as {first!r} or {last!r}"
+    raise OptionError(f"--camera {name!r}: {known}")

@@ -267,11 +267,6 @@ def detail(memory: SpatialMemory, budget: int) -> Detail:
         edge *= max(1.1, float(np.sqrt(len(first) / budget)))
 
 
-def point_pixels(focal: float, chosen: Detail, run: RunView) -> float:
-    """How wide to draw points where all have one size, pixels: as wide as they are at mid depth."""
-    return float(np.clip(1.2 * focal * chosen.size / run.typical_depth, 2.0, 8.0))
-
-
 def _cell_keys(positions: NDArray[np.float32], edge: float) -> NDArray[np.int64]:
     """(N,) int64 below 2⁶⁰, equal for positions (N, 3) of one cell."""
     keys = np.zeros(len(positions), np.int64)

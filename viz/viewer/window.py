@@ -11,7 +11,7 @@ import numpy as np
 from gvtools.errors import OptionError
 from viz.plots.canvas import rgb_of
 from viz.viewer.colors import KINDS, MODES, point_colors
-from viz.viewer.run_view import RunView, detail, point_pixels
+from viz.viewer.run_view import RunView, detail
 from viz.viewer.standpoint import PageFrame, home
 
 if TYPE_CHECKING:
@@ -109,7 +109,9 @@ class Open3dViewer:
         parameters.intrinsic = o3d.camera.PinholeCameraIntrinsic(
             width, height, focal, focal, width / 2 - 0.5, height / 2 - 0.5
         )
-        self.window.get_render_option().point_size = point_pixels(focal, self._detail, self.run)
+        # All points have one size, pixels: as wide as they are at mid depth.
+        width_px = 1.2 * focal * self._detail.size / self.run.typical_depth
+        self.window.get_render_option().point_size = float(np.clip(width_px, 2.0, 8.0))
         parameters.extrinsic = local.cam_from_world[0]
         view.convert_from_pinhole_camera_parameters(parameters, allow_arbitrary=True)
 
