@@ -254,7 +254,7 @@ def test_poses_alone_of_pictures_without_features_become_a_project(truth, tmp_pa
 @pytest.mark.parametrize(
     ("arrays", "reason"),
     [
-        ({"extrinsics": np.array([None])}, "objects"),
+        ({"extrinsics": np.array([None])}, "type object"),
         ({"depth": np.ones((2, 4, 4))}, "no poses"),
         ({"extrinsics": np.tile(np.eye(4), (3, 1, 1))}, "no intrinsics"),
         (
