@@ -2,7 +2,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import cv2
 import geoverse_models as micro
 import numpy as np
 import pytest
@@ -11,14 +10,12 @@ from scipy.spatial.transform import Rotation
 
 from gvtools.completers.geoverse.conditioning import HintConfig, ViewBatch, encode_views
 from gvtools.errors import DegenerateError
-from gvtools.networks.depth_anything import rays as ray_fits
 from gvtools.networks.depth_anything.encoder import patch_rays
 from gvtools.networks.depth_anything.network import DepthAnything3
 from gvtools.networks.depth_anything.rays import (
     camera_centres,
     nearest_rotation,
     poses_least_squares,
-    poses_ransac,
 )
 
 SIZE = (84, 112)
@@ -96,78 +93,27 @@ def test_weights_multiply_the_equations():
         np.testing.assert_allclose(found.world_from_cam[view, :3, 3], mean, rtol=1e-9)
 
 
-def test_ransac_with_the_right_factors_is_exact_off_centre_too():
-    pose, K = poses(4), intrinsics(centred=False)
-    found = poses_ransac(ray_map(pose, K), size=SIZE, factorisation="qr")
-    np.testing.assert_allclose(found.world_from_cam, pose, atol=1e-6)
-    np.testing.assert_allclose(found.K, np.tile(K, (4, 1, 1)), atol=1e-4)
-
-
-def test_the_published_factors_hold_for_a_centred_principal_point_alone():
-    pose = poses(4)
-    centred = poses_ransac(ray_map(pose, intrinsics(centred=True)), size=SIZE)
-    np.testing.assert_allclose(centred.world_from_cam, pose, atol=1e-6)
-    np.testing.assert_allclose(centred.K, np.tile(intrinsics(centred=True), (4, 1, 1)), atol=1e-4)
-    off = poses_ransac(ray_map(pose, intrinsics(centred=False)), size=SIZE)
-    assert 0.01 < np.abs(off.world_from_cam.numpy() - pose).max() < 0.1
-
-
-def test_wrong_rays_are_left_out():
+def test_wrong_rays_weigh_nothing_where_no_confidence_is():
     pose, K = poses(3), intrinsics(centred=True)
     ray = noisy(ray_map(pose, K), 1e-3)
     rng = np.random.default_rng(4)
     wrong = torch.from_numpy(rng.random(ray.shape[:-1]) < 0.3)
     damaged = ray.clone()
     damaged[..., :3][wrong] = torch.from_numpy(rng.normal(size=(int(wrong.sum()), 3)))
-    robust = poses_ransac(damaged, size=SIZE, threshold=0.05)
-    np.testing.assert_allclose(robust.world_from_cam[:, :3, :3], pose[:, :3, :3], atol=5e-3)
     plain = poses_least_squares(damaged, size=SIZE)
     assert np.abs(plain.world_from_cam.numpy() - pose)[:, :3, :3].max() > 0.02
     confident = poses_least_squares(damaged, (~wrong).double(), size=SIZE)
     np.testing.assert_allclose(confident.world_from_cam[:, :3, :3], pose[:, :3, :3], atol=5e-3)
 
 
-def test_the_same_seed_gives_the_same_bytes_and_a_batch_its_parts():
+def test_a_batch_gives_what_its_parts_give():
     ray = noisy(ray_map(poses(4), intrinsics(centred=True)), 0.02)
-    one, two = (poses_ransac(ray, size=SIZE, seed=3) for _ in range(2))
-    torch.testing.assert_close(one.world_from_cam, two.world_from_cam, rtol=0, atol=0)
     batch = ray.unflatten(0, (2, 2))
-    for solve in (poses_ransac, poses_least_squares):
-        whole = solve(batch, size=SIZE)
-        assert whole.world_from_cam.shape == (2, 2, 4, 4) and whole.K.shape == (2, 2, 3, 3)
-        second = solve(batch[1], size=SIZE)
-        torch.testing.assert_close(whole.world_from_cam[1], second.world_from_cam)
-        torch.testing.assert_close(whole.K[1], second.K)
-
-
-def test_homographies_are_opencvs():
-    rng = np.random.default_rng(5)
-    source = rng.uniform(-1, 1, (60, 2))
-    H = np.eye(3) + rng.normal(0, 0.2, (3, 3))
-    target = np.concatenate([source, np.ones((60, 1))], 1) @ H.T
-    target = target[:, :2] / target[:, 2:]
-    found, share = ray_fits.fit_homography(*map(torch.from_numpy, (source, target, np.ones(60))))
-    expected, _ = cv2.findHomography(source, target)
-    np.testing.assert_allclose(found / found[2, 2], expected, atol=1e-6)
-    assert share > 1e-6
-
-
-@pytest.mark.parametrize("upper", [True, False])
-def test_factors_multiply_to_the_matrix(upper):
-    generator = torch.Generator().manual_seed(7)
-    H = torch.randn((3, 3), generator=generator, dtype=torch.float64)
-    H = H * torch.linalg.det(H).sign()
-    R, K = ray_fits.factor(H, upper=upper)
-    torch.testing.assert_close(R @ R.mT, torch.eye(3).double())
-    assert torch.linalg.det(R) > 0 and K[2, 2] == 1
-    if upper:
-        product = R @ torch.linalg.inv(K)
-    else:
-        lower = R.mT @ H
-        torch.testing.assert_close(lower, lower.tril())
-        product = R @ lower
-        torch.testing.assert_close(K[:2, 2], lower[2, :2] / lower[2, 2])
-    torch.testing.assert_close(product / product.norm(), H / H.norm())
+    whole = poses_least_squares(batch, size=SIZE)
+    assert whole.world_from_cam.shape == (2, 2, 4, 4) and whole.K.shape == (2, 2, 3, 3)
+    second = poses_least_squares(batch[1], size=SIZE)
+    torch.testing.assert_close(whole.world_from_cam[1], second.world_from_cam)
+    torch.testing.assert_close(whole.K[1], second.K)
 
 
 def test_centres_are_weighted_means_and_pass_gradients():
@@ -201,13 +147,12 @@ def test_rays_that_hold_no_camera():
     ray = ray_map(poses(2), intrinsics(centred=True))
     equal = ray.clone()
     equal[1, ..., :3] = torch.tensor([0.1, 0.2, 1.0]).double()
-    for solve in (poses_least_squares, poses_ransac):
-        with pytest.raises(DegenerateError):
-            solve(equal, size=SIZE)
-        with pytest.raises(DegenerateError, match="NaN"):
-            solve(ray * np.nan, size=SIZE)
-        with pytest.raises(DegenerateError, match="confidences"):
-            solve(ray, torch.zeros(ray.shape[:-1]), size=SIZE)
+    with pytest.raises(DegenerateError):
+        poses_least_squares(equal, size=SIZE)
+    with pytest.raises(DegenerateError, match="NaN"):
+        poses_least_squares(ray * np.nan, size=SIZE)
+    with pytest.raises(DegenerateError, match="confidences"):
+        poses_least_squares(ray, torch.zeros(ray.shape[:-1]), size=SIZE)
     with pytest.raises(DegenerateError, match="negative"):
         camera_centres(ray, -torch.ones(ray.shape[:-1]))
 
