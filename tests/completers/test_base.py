@@ -61,9 +61,8 @@ def painter():
     del _REGISTRY["painter"]
 
 
-def _camera(width: int = 8, height: int = 6) -> Cameras:
-    K = np.array([[[10.0, 0, width / 2], [0, 10, height / 2], [0, 0, 1]]])
-    return Cameras(K, np.eye(4)[None], np.array([width]), np.array([height]), ("a",))
+def _camera(width: int = 8) -> Cameras:
+    return Cameras.pinhole(width, 6, focal=10)
 
 
 # One that reads weights is created with a folder of them, in its own tests.
@@ -178,10 +177,8 @@ def test_a_taken_name_and_a_malformed_reference_are_refused(painter):
 def test_none_passes_valid_pixels_and_leaves_the_rest_empty():
     rng = np.random.default_rng(0)
     valid = rng.random((2, 6, 8)) < 0.5
-    camera = _camera()
-    cameras = camera[[0, 0]]
     guidance = Guidance(
-        cameras,
+        _camera()[[0, 0]],
         rng.random((2, 6, 8, 3), np.float32),
         rng.random((2, 6, 8), np.float32) + 1,
         valid,
@@ -252,11 +249,7 @@ class Hungry(Completer):
 
 
 def guidance(count: int) -> Guidance:
-    one = Cameras.pinhole(8, 6, focal=8.0)
-    cameras = Cameras(
-        np.repeat(one.K, count, 0), np.repeat(one.cam_from_world, count, 0),
-        np.full(count, 8), np.full(count, 6), tuple(f"view {row}" for row in range(count)),
-    )  # fmt: skip
+    cameras = Cameras.pinhole(8, 6, focal=8.0)[[0] * count]
     shape = (count, 6, 8)
     valid = np.zeros(shape, bool)
     depth = np.broadcast_to(np.arange(count, dtype=np.float32)[:, None, None], shape).copy()

@@ -231,26 +231,6 @@ def test_nothing_known_stays_unknown_and_everything_known_stays_as_it_is():
     np.testing.assert_allclose(full.inverse, plane, rtol=1e-6)
 
 
-def test_hits_are_the_first_known_pixels_of_a_plain_march():
-    from gvtools.completers.hole_depth import DIRECTIONS, _first_hits
-
-    rng = np.random.default_rng(2)
-    known = rng.random((20, 26)) < 0.15
-    hits = np.full((16, 20, 26), -1, np.int32)
-    _first_hits(0, 16, known, DIRECTIONS, hits)
-    for k, (dy, dx) in enumerate(DIRECTIONS):
-        if abs(dy) + abs(dx) == 3:
-            continue
-        for y in range(20):
-            for x in range(26):
-                v, u = y + dy, x + dx
-                while 0 <= v < 20 and 0 <= u < 26 and not known[v, u]:
-                    v, u = v + dy, u + dx
-                inside = 0 <= v < 20 and 0 <= u < 26
-                expected = v * 26 + u if inside and not known[y, x] else -1
-                assert hits[k, y, x] == expected
-
-
 def test_a_thin_rim_stops_every_direction():
     # One pixel thin, yet no knight's move may leap over it to the surface behind.
     inverse = np.full((HEIGHT, WIDTH), 0.5)

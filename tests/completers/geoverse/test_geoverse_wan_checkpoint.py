@@ -240,17 +240,12 @@ def without(*starts: str) -> Any:
             without("blocks.2.cross_attn.k.weight", "blocks.3.ffn.0.bias"),
             r"missing: blocks\.2\.attn2\.to_k\.weight and 1 more",
         ),
-        (without("vace"), "vace_patch_embedding"),
-        (
-            lambda t: t.update({"blocks.1.ffn.2.bias": torch.zeros(7)}),
-            r"blocks\.1\.ffn\.net\.2\.bias is \(7,\), expected",
-        ),
         (
             lambda t: t.update({QUANTISED: t[QUANTISED].to(torch.float8_e4m3fn)}),
             "is float8_e4m3fn, expected float32",
         ),
     ],
-    ids=["missing", "no vace branch", "shape", "quantised"],
+    ids=["missing", "quantised"],
 )
 def test_a_source_that_does_not_fit_is_refused_and_nothing_is_left(
     network: Any, tmp_path: Path, change: Any, message: str
@@ -327,19 +322,11 @@ def test_what_fails_half_way_leaves_nothing_and_what_is_there_stays(
 
 
 def test_loading_is_strict(truncated: Path, tmp_path: Path) -> None:
-    file = "transformer/" + FILE
-    for change, message in (
-        (lambda t: t.pop("blocks.1.norm2.bias"), r"missing: blocks\.1\.norm2\.bias"),
-        (lambda t: t.update(extra=torch.zeros(1)), "unexpected: extra"),
-        (lambda t: t.update(scale_shift_table=torch.zeros(3)), r"scale_shift_table is \(3,\)"),
-    ):
-        shutil.rmtree(tmp_path / "prior", ignore_errors=True)
-        folder = Path(shutil.copytree(truncated, tmp_path / "prior"))
-        damage(folder / file, change)
-        with pytest.raises(CheckpointError, match=message):
-            VideoPrior.from_pretrained(folder, config=tiny.CONFIG)
-        with pytest.raises(CheckpointError, match=message):
-            check_folder(folder)
+    folder = Path(shutil.copytree(truncated, tmp_path / "prior"))
+    damage(folder / "transformer" / FILE, lambda t: t.pop("blocks.1.norm2.bias"))
+    for read in (check_folder, lambda f: VideoPrior.from_pretrained(f, config=tiny.CONFIG)):
+        with pytest.raises(CheckpointError, match=r"missing: blocks\.1\.norm2\.bias"):
+            read(folder)
     (folder / "transformer" / "config.json").write_text("{]")
     with pytest.raises(CheckpointError, match="not JSON"):
         check_folder(folder)

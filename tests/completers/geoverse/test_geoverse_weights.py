@@ -223,21 +223,17 @@ LAYER = "blocks.1.attn.qkv.weight"
 DAMAGES: dict[str, tuple[Callable[[dict[str, Tensor]], Any], str]] = {
     "missing": (lambda t: [t.pop(LAYER), t.pop("blocks.1.attn.qkv.bias")], f"missing: {LAYER}"),
     "extra": (lambda t: t.update(extra=torch.zeros(2)), "unexpected: extra"),
-    "renamed": (lambda t: t.update(other=t.pop(LAYER)), f"missing: {LAYER}; unexpected: other"),
     "shape": (
         lambda t: t.update({LAYER: t[LAYER][:, 1:].clone()}),
         rf"of another shape: {LAYER} is \(96, 31\), expected \(96, 32\)",
     ),
-    "transposed": (lambda t: t.update({LAYER: t[LAYER].T.contiguous()}), r"is \(32, 96\)"),
     "nan": (lambda t: t[LAYER].view(-1)[-1:].fill_(float("nan")), f"{LAYER} holds values that"),
-    "infinite": (lambda t: t[LAYER].view(-1)[5:6].fill_(float("-inf")), f"{LAYER} holds values"),
     "integers": (lambda t: t.update({LAYER: t[LAYER].long()}), f"{LAYER} is int64, expected float"),
     "quantised": (
         lambda t: t.update({LAYER: t[LAYER].to(torch.float8_e4m3fn)}),
         "is float8_e4m3fn, expected float32",
     ),
     "sparse": (lambda t: t.update({LAYER: t[LAYER].to_sparse()}), f"{LAYER} is sparse"),
-    "complex": (lambda t: t.update({LAYER: t[LAYER] + 0j}), "is complex64"),
 }
 
 
@@ -273,14 +269,12 @@ class Malicious:
         return os.system, (f"touch '{self.path}'",)
 
 
-@pytest.mark.parametrize("form", ["torch", "beside", "pickle"])
+@pytest.mark.parametrize("form", ["torch", "pickle"])
 def test_code_in_a_file_is_not_run(folder: Path, tmp_path: Path, form: str) -> None:
     trace, file = tmp_path / "trace", folder / LEVEL1
     inner = torch.load(file)["ema"]
     if form == "torch":
         torch.save({"ema": {**inner, "evil": Malicious(trace)}}, file)
-    elif form == "beside":
-        torch.save({"ema": inner, "config": Malicious(trace)}, file)
     else:
         file.write_bytes(pickle.dumps({"ema": inner, "evil": Malicious(trace)}))
     message = "bare pickle, which may hold code" if form == "pickle" else r"asks for \w+\.system"
@@ -301,8 +295,6 @@ def zip_of_text(file: Path) -> None:
     ("damage", "message"),
     [
         (lambda f: f.write_bytes(f.read_bytes()[:-50]), "cannot be read"),
-        (lambda f: f.write_bytes(f.read_bytes()[: f.stat().st_size // 2]), "cannot be read"),
-        (lambda f: f.write_bytes(f.read_bytes()[:3]), "cannot be read|no PyTorch file"),
         (lambda f: f.write_bytes(b""), "is empty"),
         (zip_of_text, "cannot be read"),
         (lambda f: f.write_text("<!DOCTYPE html><p>Sign in</p>"), "cannot be read|no PyTorch file"),
@@ -313,7 +305,7 @@ def zip_of_text(file: Path) -> None:
             "Git LFS's placeholder",
         ),
     ],
-    ids=["torn", "half", "start", "empty", "zip", "html", "lfs"],
+    ids=["torn", "empty", "zip", "html", "lfs"],
 )
 def test_a_file_that_is_no_whole_tensor_file_is_refused(folder, part, file, damage, message):
     damage(folder / file)
@@ -476,29 +468,15 @@ def changed_config(**changes: Any) -> str:
     return json.dumps({**to_json(PLAIN), **changes})
 
 
-def with_level1(**changes: Any) -> str:
-    return changed_config(level1={**to_json(PLAIN)["level1"], **changes})
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", r"config\.json: .*Expecting value"),
         ("{]", r"config\.json: "),
-        ("[1]", r"expected an object"),
         (changed_config(image_sise=96), "no field 'image_sise'; did you mean 'image_size'"),
         (changed_config(image_size="96"), "image_size = '96'; expected int"),
-        (changed_config(image_size=True), "image_size = True; expected int"),
-        (changed_config(level1={"depth": 2.0}), r"level1\.depth = 2\.0; expected int"),
-        (changed_config(flow={"shift": "no"}), r"flow\.shift = 'no'; expected float"),
-        (changed_config(flow={"level1": 3}), r"flow\.level1 = 3; expected a list"),
-        (changed_config(camera={"pixel_offset": [1.0]}), "expected 2 entries"),
         (changed_config(hints={"fill": "all"}), r"hints\.fill = 'all'; expected"),
         (changed_config(flow={"cfg_scale": float("nan")}), "cfg_scale = nan; expected a finite"),
-        (changed_config(geometry=None), r"config\.geometry = None; expected an object"),
-        (changed_config(rgb={"width": 30}), "config.json|expected"),
-        (with_level1(width=-32), "no network comes of"),
-        (with_level1(frequencies=-1), "no network comes of"),
+        (changed_config(level1={**to_json(PLAIN)["level1"], "width": -32}), "no network comes of"),
     ],
 )
 def test_a_damaged_configuration_is_refused(own: Path, text: str, message: str) -> None:
