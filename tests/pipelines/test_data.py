@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import weakref
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +17,7 @@ from scenes_workspace import sevenscenes, workspace
 from tiny_scan import FOCAL, WIDTH, render, world_from_cam, write_scan
 
 from gvtools.errors import ProjectError
-from gvtools.scenes.data_sets.catalogue import DataSetSpec, load_spec, read_scene, spec_names
-from gvtools.scenes.scene import Scene
+from gvtools.scenes.data_sets.catalogue import load_spec, spec_names
 from gvtools.scenes.shards import open_shards
 from pipelines.cli import main
 from pipelines.data_sets import downloads
@@ -249,26 +247,6 @@ def test_percentiles_of_nothing_and_of_zeros():
     zeros.add([0.0, 0.0, 5.0])
     assert zeros.percentile(50) == 0
     assert zeros.percentile(90) == pytest.approx(5, rel=6e-3)
-
-
-@pytest.mark.slow
-def test_one_scene_is_held_at_a_time(root, monkeypatch):
-    import gc
-
-    seen: list[weakref.ref[Scene]] = []
-
-    def read(spec: DataSetSpec, scene: str, at: Path) -> Scene:
-        gc.collect()
-        assert [ref for ref in seen if ref() is not None] == []
-        opened = read_scene(spec, scene, at)
-        seen.append(weakref.ref(opened))
-        return opened
-
-    monkeypatch.setattr("pipelines.data_sets.downloads.read_scene", read)
-    write_scan(root / "wall" / "seq-03")
-    assert data("check", "7-Scenes", root) == 0
-    assert data("stats", "7-Scenes", root) == 0
-    assert len(seen) == 6
 
 
 @pytest.fixture(scope="module")

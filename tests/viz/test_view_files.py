@@ -1,7 +1,10 @@
 from __future__ import annotations
 
+import struct
 import sys
+import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +18,7 @@ from gvtools.glb import join_glb
 from gvtools.memory.thinning import thin
 from gvtools.splat_files import read_splats
 from pipelines.cli import main
+from pipelines.viewing import readers
 from pipelines.viewing.source import ViewSource
 from viz.viewer.render import chosen_camera
 from viz.viewer.run_view import MESH, POINTS, RENDERED, SPLATS, TARGET
@@ -222,3 +226,72 @@ def test_a_picture_of_a_file_shows_it_whole_from_outside(exported, tmp_path, nam
     assert down @ run.up() < 0, "up is upwards in the picture"
     with pytest.raises(OptionError, match="holds no cameras"):
         chosen_camera(run, "a.png")
+
+
+TRIANGLE = """mtllib m.mtl
+usemtl a
+v 0 0 0
+v 1 0 0
+v 0 1 0
+vt 0 0
+vt 1 0
+vt 0 1
+f 1/1 2/2 3/3
+"""
+
+
+def test_a_texture_is_measured_by_its_own_file(tmp_path, monkeypatch):
+    monkeypatch.setattr(readers, "PIXEL_BYTES", 0)
+    noise = np.random.default_rng(0).integers(0, 255, (256, 256, 3), np.uint8)
+    Image.fromarray(noise).save(tmp_path / "t.png")
+    (tmp_path / "m.mtl").write_text("newmtl a\nmap_Kd t.png\n")
+    (tmp_path / "m.obj").write_text(TRIANGLE)
+    before = Image.MAX_IMAGE_PIXELS
+    mesh: Any = readers.load_mesh(tmp_path / "m.obj")
+    assert mesh.visual.material.image.size == (256, 256)
+    assert before == Image.MAX_IMAGE_PIXELS
+
+
+def test_a_glb_of_more_than_a_million_points_opens(tmp_path):
+    import trimesh
+
+    points = np.random.default_rng(0).random((1_200_000, 3), np.float32)
+    trimesh.PointCloud(points).export(tmp_path / "p.glb")
+    assert len(readers.load_mesh(tmp_path / "p.glb").vertices) == 1_200_000
+
+
+NEWER = {
+    "a.spz": b"NGSP" + struct.pack("<II4B", 5, 10, 3, 12, 0, 0) + bytes(99),
+    "a.glb": b"glTF" + struct.pack("<II", 3, 99) + bytes(99),
+    "a.las": b"LASF" + bytes(20) + bytes([1, 5]) + bytes(400),
+}
+
+
+@pytest.mark.parametrize("name", NEWER)
+def test_newer_files_are_named_as_such(tmp_path, capsys, name):
+    (tmp_path / name).write_bytes(NEWER[name])
+    said = refused(capsys, "view", tmp_path / name, "--screenshot", tmp_path / "a.png")
+    assert "version" in said and "newer than this program" in said
+
+
+def test_a_newer_memory_asks_for_a_newer_program(tmp_path, capsys):
+    with zipfile.ZipFile(tmp_path / "memory.npz", "w") as archive:
+        archive.writestr("header.json", '{"format": "gvtools memory", "version": 99}')
+    said = refused(capsys, "view", tmp_path / "memory.npz", "--screenshot", tmp_path / "a.png")
+    assert "99" in said and "update gvtools" in said
+
+
+@pytest.mark.parametrize(
+    ("words", "opened"),
+    [
+        (("view", "{}", "--screenshot", "{}.png"), ".npz, .ply"),
+        (("export", "{}", "--format", "ply", "--out", "{}.ply"), ".npz, .ply"),
+        (("check", "{}"), "transforms.json"),
+        (("reconstruct", "{}", "--out", "{}.out"), "transforms.json"),
+    ],
+)
+def test_unknown_suffixes_list_what_opens(tmp_path, capsys, words, opened):
+    file = tmp_path / "a.rar"
+    file.write_bytes(b"PK\x03\x04" + bytes(99))
+    assert opened in refused(capsys, *(word.format(file) for word in words))
+    assert list(tmp_path.iterdir()) == [file]

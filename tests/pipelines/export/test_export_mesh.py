@@ -12,7 +12,6 @@ from gvtools.errors import DegenerateError, OptionError
 from gvtools.memory.spatial_memory import SpatialMemory
 from pipelines.export import mesh as meshes
 from pipelines.export.mesh import simplify, tsdf_mesh, without_islands
-from pipelines.export.texture import atlas
 
 trimesh = pytest.importorskip("trimesh")
 
@@ -192,29 +191,6 @@ def test_few_triangles_show_the_photographs(scene, reconstructed_run, tmp_path, 
     for row in (1, 4):  # not in the memory as observed
         view = scene.views[row]
         assert error(mesh, view) < 0.7 * error(trimesh.load(plain, process=False), view)
-
-
-@pytest.mark.slow
-def test_triangles_lie_apart_and_larger_ones_have_more_texels():
-    rng = np.random.default_rng(0)
-    scale = rng.choice([0.01, 0.05, 0.2], size=(300, 1, 1))
-    triangles = rng.normal(size=(300, 1, 3)) + scale * rng.normal(size=(300, 3, 3))
-    corners = atlas(triangles, 256)
-    assert corners.min() >= 0.5 and corners.max() <= 255.5
-    y, x = np.mgrid[:1024, :1024] / 4 + 0.125
-    count = np.zeros(x.shape, int)
-    for triangle in corners:
-        sides = []
-        for start, end in zip(triangle, np.roll(triangle, -1, axis=0), strict=True):
-            edge = end - start
-            # Grown by less than half a texel, into which reading between texels reaches.
-            apart = (edge[0] * (y - start[1]) - edge[1] * (x - start[0])) / np.hypot(*edge)
-            sides.append(apart > -0.45)
-        count += np.logical_and.reduce(sides)
-    assert count.max() == 1
-    texels = np.linalg.norm(corners[:, 0] - corners[:, 1], axis=1)
-    large = scale.ravel() == 0.2
-    assert np.median(texels[large]) > 2 * np.median(texels[~large])
 
 
 @pytest.mark.parametrize(
