@@ -264,7 +264,7 @@ def _unpacked(path: Path, time: int) -> Path:
     home = work / path.name
     home.mkdir()
     advice = "expected an archive; copy or export it again, or unpack it and give its folder"
-    with reading(path, advice, also=(tarfile.TarError,)):
+    with reading(path, advice, also=(tarfile.TarError, zipfile.BadZipFile)):
         for name, content in _files_of(path):
             if not name.startswith("__MACOSX/"):
                 file = named_file(home, name.replace("\\", "/"), where=str(path))

@@ -226,6 +226,8 @@ def test_record3d_damaged_files_name_what_is_wrong(tmp_path: Path) -> None:
     path = rewritten(tmp_path / "scan.r3d", dw=17)
     with pytest.raises(ProjectError, match=r"rgbd/0\.depth: unreadable .*expected 24x17 values"):
         open_project(path).views[0].load()
-    path.write_bytes(path.read_bytes()[:-100])
-    with pytest.raises(ProjectError, match=r"unreadable .*expected an archive"):
-        open_project(path)
+    whole = path.read_bytes()
+    for damaged in (whole[:-100], whole[:60] + b"x" + whole[61:]):
+        path.write_bytes(damaged)
+        with pytest.raises(ProjectError, match=r"unreadable .*expected an archive"):
+            open_project(path)
