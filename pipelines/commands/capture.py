@@ -90,14 +90,7 @@ def capture(
         reading: what the user said of RGB-D, see ``RecordingArguments.reading``.
         options: what the user said of photographs and videos, by names of PHOTOGRAPHIC.
     """
-    from gvtools.scenes.project import (
-        BAG,
-        VIDEOS,
-        is_archive,
-        is_project,
-        is_recording,
-        rgbd_options,
-    )
+    from gvtools.scenes import project as projects
     from gvtools.scenes.rgbd import count_unposed
     from gvtools.untrusted import unpacked
 
@@ -106,18 +99,18 @@ def capture(
             f"{source}: no such file or folder; expected photographs, a video, or a folder of "
             "colour and depth"
         )
-    source = unpacked(source) if is_archive(source) else source
-    is_bag = source.is_file() and source.suffix.lower() == BAG
-    if source.is_file() and not is_bag and source.suffix.lower() not in VIDEOS:
+    source = unpacked(source) if projects.is_archive(source) else source
+    is_bag = source.is_file() and source.suffix.lower() == projects.BAG
+    if source.is_file() and not is_bag and source.suffix.lower() not in projects.VIDEOS:
         raise OptionError(
             f"{source}: expected a folder (or .zip) of photographs or of colour and depth, a video "
-            f"({', '.join(VIDEOS)}), or a RealSense recording ({BAG})"
+            f"({', '.join(projects.VIDEOS)}), or a RealSense recording ({projects.BAG})"
         )
     masks = options.get("masks")
     if masks is not None and not masks.is_dir():
         raise ProjectError(f"--masks {masks}: no such folder")
     rgbd = is_bag or (source.is_dir() and count_unposed(source) > 0)
-    if source.is_dir() and (is_project(source) if rgbd else is_recording(source)):
+    if source.is_dir() and (projects.is_project(source) if rgbd else projects.is_recording(source)):
         raise ProjectError(
             f"{source}: has poses already; expected a recording without; give it to gvtools "
             "reconstruct as it is"
@@ -131,7 +124,7 @@ def capture(
                 "all frames are taken and depth tells the metres"
             )
         recording = capture_rgbd(
-            source, out, options=rgbd_options(reading), say=console.line,
+            source, out, options=projects.rgbd_options(reading), say=console.line,
             draw=partial(_draw, title=out.name),
         )  # fmt: skip
         _print_rgbd(recording, console)

@@ -62,14 +62,7 @@ class RenderCommand(LensArguments, LpipsArguments, SceneArguments):
         from gvtools.memory.panoramas import WIDEST_STILL
         from gvtools.runs.layout import file_stems
         from gvtools.runs.run import load_appearance, load_memory
-        from pipelines.rendering import (
-            complete_views,
-            filled,
-            measure,
-            render_view,
-            summary,
-            write_view,
-        )
+        from pipelines import rendering
 
         if self.out is None and not self.against_images:
             raise OptionError("--out: nothing would be left; give a folder, or --against-images")
@@ -86,25 +79,25 @@ class RenderCommand(LensArguments, LpipsArguments, SceneArguments):
         stems = file_stems(cameras.names)
         if self.complete:
             faces = rig.faces_of(cameras) if rig else cameras
-            complete_views(memory, faces, appearance=appearance)
+            rendering.complete_views(memory, faces, appearance=appearance)
         lpips, no_lpips = self.open_lpips() if self.against_images else (None, None)
         # The first projection compiles or loads the kernels and is not timed.
         memory.project(cameras[0], options=options)
         views = []
         for camera in console.track(list(cameras), "rendering"):
             (name,) = camera.names
-            guidance, seconds = render_view(
+            guidance, seconds = rendering.render_view(
                 memory, camera, options, appearance=appearance, rig=rig,
-                fill=filled if self.complete else None,
+                fill=rendering.filled if self.complete else None,
             )  # fmt: skip
             frame = scene[name].load() if scene is not None and self.against_images else None
             if self.out is not None:
                 panorama = self.lens == "equirectangular"
-                write_view(self.out, stems[name], guidance, panorama=panorama)
-            views.append(measure(name, guidance, frame, seconds=seconds, lpips=lpips))
+                rendering.write_view(self.out, stems[name], guidance, panorama=panorama)
+            views.append(rendering.measure(name, guidance, frame, seconds=seconds, lpips=lpips))
             if rig is not None:
                 views[-1]["coverage"] = float(guidance.valid[0][rig.inside].mean())
-        figures = summary(views, compared=self.against_images, no_lpips=no_lpips)
+        figures = rendering.summary(views, compared=self.against_images, no_lpips=no_lpips)
         if poses:
             figures["poses"] = poses
         if self.json_ is not None:
@@ -217,15 +210,9 @@ class FilmCommand(LensArguments):
     def run(self, console: Console) -> None:
         from gvtools.memory.panoramas import WIDEST_FRAME
         from gvtools.runs.run import load_memory
-        from pipelines.rendering import (
-            FilmRenderer,
-            captioned,
-            check_suffix,
-            film_cameras,
-            write_film,
-        )
+        from pipelines import rendering
 
-        check_suffix(self.out)
+        rendering.check_suffix(self.out)
         if self.growth:
             self.refuse(("round",), "--growth shows every one")
         panels = _panels(self)
@@ -233,7 +220,9 @@ class FilmCommand(LensArguments):
         if not len(memory):
             raise OptionError(f"{self.memory}: {EMPTY}")
         width = self.width if self.lens == "perspective" else None
-        cameras = film_cameras(memory, self.path, width=width, run=self.memory, say=console.line)
+        cameras = rendering.film_cameras(
+            memory, self.path, width=width, run=self.memory, say=console.line
+        )
         rig, cameras = self.rig(cameras, memory, widest=WIDEST_FRAME)
         columns, rows = rig.size if rig else (int(cameras.width[0]), int(cameras.height[0]))
         rounds = memory.rounds if self.growth else (self.round,)
@@ -243,17 +232,17 @@ class FilmCommand(LensArguments):
         def frames() -> Iterator[NDArray[np.uint8]]:
             nonlocal projecting
             for number in rounds:
-                renderer = FilmRenderer(self.memory, cameras, up_to=number, rig=rig)
+                renderer = rendering.FilmRenderer(self.memory, cameras, up_to=number, rig=rig)
                 of_round = f" of round {number}" if self.growth else ""
                 for index in console.track(range(len(cameras)), f"drawing frames{of_round}"):
                     frame = renderer.frame(index, panels, captions=len(panels) > 1)
                     if self.growth and len(panels) == 1:
-                        frame = captioned(frame, f"round {number}")
+                        frame = rendering.captioned(frame, f"round {number}")
                     yield frame
                 projecting += renderer.projecting
 
         panorama = self.lens == "equirectangular" and len(panels) == 1
-        write_film(self.out, frames(), fps=self.fps, panorama=panorama)
+        rendering.write_film(self.out, frames(), fps=self.fps, panorama=panorama)
         count = len(cameras) * len(rounds)
         each = (time.perf_counter() - start) / count
         console.line(

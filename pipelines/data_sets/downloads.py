@@ -14,13 +14,7 @@ from numpy.typing import ArrayLike
 
 from gvtools.errors import GvError, OptionError, ProjectError
 from gvtools.files import json_list_written, write_json
-from gvtools.scenes.data_sets.catalogue import (
-    DataSetSpec,
-    chosen_scenes,
-    load_spec,
-    read_scene,
-    spec_names,
-)
+from gvtools.scenes.data_sets import catalogue
 from gvtools.scenes.inspection import SceneReport, inspect, spread, turn_degrees
 
 if TYPE_CHECKING:
@@ -41,8 +35,8 @@ PERCENTILES = (5, 25, 50, 75, 95)
 
 def list_data_sets(args: ListData, console: Console) -> None:
     """Print a table of the data sets, or everything about one."""
-    names = spec_names() if args.name is None else (args.name,)
-    specs = [load_spec(name) for name in names]
+    names = catalogue.spec_names() if args.name is None else (args.name,)
+    specs = [catalogue.load_spec(name) for name in names]
     if args.json_ is not None:
         known = [
             {**spec.model_dump(mode="json"), "weight": spec.weight, "share": share_of(spec)}
@@ -59,13 +53,13 @@ def list_data_sets(args: ListData, console: Console) -> None:
             console.line(f"# {share_of(specs[0]):.1%} of a mixture of all training sets")
 
 
-def all_specs() -> list[DataSetSpec]:
+def all_specs() -> list[catalogue.DataSetSpec]:
     """Training sets first, then by name."""
-    specs = [load_spec(name) for name in spec_names()]
+    specs = [catalogue.load_spec(name) for name in catalogue.spec_names()]
     return sorted(specs, key=lambda spec: ("training" not in spec.roles, spec.name.casefold()))
 
 
-def share_of(spec: DataSetSpec) -> float | None:
+def share_of(spec: catalogue.DataSetSpec) -> float | None:
     """Its weight in a mixture of all training sets, of 1; None for other data sets."""
     if "training" not in spec.roles:
         return None
@@ -91,7 +85,7 @@ def table_rows() -> list[tuple[str | None, ...]]:
     return rows
 
 
-def as_yaml(spec: DataSetSpec) -> str:
+def as_yaml(spec: catalogue.DataSetSpec) -> str:
     """What is known of a data set, in the words of its file."""
     import yaml
 
@@ -123,8 +117,8 @@ class SceneCheck:
 
 def check_data_set(args: DownloadArguments, console: Console) -> None:
     """Report on each scene as soon as it is read."""
-    spec = load_spec(args.name)
-    names = chosen_scenes(args.name, args.root, args.scene)
+    spec = catalogue.load_spec(args.name)
+    names = catalogue.chosen_scenes(args.name, args.root, args.scene)
     counted: Counter[str] = Counter()
     said: set[tuple[str, str]] = set()
     bad: list[str] = []
@@ -155,11 +149,11 @@ def check_data_set(args: DownloadArguments, console: Console) -> None:
         )
 
 
-def checks(spec: DataSetSpec, root: Path, scenes: Iterable[str]) -> Iterator[SceneCheck]:
+def checks(spec: catalogue.DataSetSpec, root: Path, scenes: Iterable[str]) -> Iterator[SceneCheck]:
     """Read scenes one after the other; none is kept."""
     for scene in scenes:
         try:
-            report = inspect(read_scene(spec, scene, root), probes=PROBES)
+            report = inspect(catalogue.read_scene(spec, scene, root), probes=PROBES)
         except OptionError:
             raise
         except GvError as error:
@@ -326,13 +320,13 @@ class DownloadStatistics:
 
 def statistics_of_data_set(args: DownloadArguments, console: Console) -> None:
     """Print figures of all scenes of a download together."""
-    spec = load_spec(args.name)
-    names = chosen_scenes(args.name, args.root, args.scene)
+    spec = catalogue.load_spec(args.name)
+    names = catalogue.chosen_scenes(args.name, args.root, args.scene)
     total = DownloadStatistics()
     first = ""
     for name in console.track(names, "scenes"):
         try:
-            total.add(read_scene(spec, name, args.root))
+            total.add(catalogue.read_scene(spec, name, args.root))
         except OptionError:
             raise
         except GvError as error:

@@ -11,13 +11,7 @@ from scipy.spatial.transform import Rotation
 from gvtools.memory.spatial_memory import SpatialMemory
 from pipelines.viewing.source import ViewSource
 from viz.plots.canvas import COLORS, GREY
-from viz.viewer.colors import (
-    MODES,
-    VIRIDIS,
-    depth_errors,
-    point_colors,
-    view_counts,
-)
+from viz.viewer.colors import MODES, VIRIDIS, depth_errors, point_colors, view_counts
 from viz.viewer.render import RunRenderer, picture_of
 from viz.viewer.run_view import CONTEXT, TARGET, detail
 from viz.viewer.standpoint import guess_up

@@ -10,17 +10,7 @@ from functools import partial
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
-from viz.plots.canvas import (
-    BLACK,
-    COLORS,
-    GREY,
-    HATCHES,
-    LEGEND,
-    LINES,
-    OTHERS,
-    Rounds,
-    figure_of,
-)
+from viz.plots.canvas import BLACK, COLORS, GREY, HATCHES, LEGEND, LINES, OTHERS, Rounds, figure_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

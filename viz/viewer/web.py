@@ -20,13 +20,7 @@ from gvtools.errors import GvError, OptionError
 from gvtools.optional import require
 from viz.viewer.camera_path import CameraPath
 from viz.viewer.colors import MODES, Legend
-from viz.viewer.nodes import (
-    Backdrop,
-    CameraNodes,
-    PointNodes,
-    add_surface,
-    fly_to,
-)
+from viz.viewer.nodes import Backdrop, CameraNodes, PointNodes, add_surface, fly_to
 from viz.viewer.panel import Panel, shown_pictures
 from viz.viewer.run_view import MESH, POINTS, SPLATS, RunView, ShownCamera, detail
 from viz.viewer.standpoint import FIELD_OF_VIEW, PageFrame, home
