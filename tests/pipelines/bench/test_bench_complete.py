@@ -127,22 +127,25 @@ def test_growth_is_noted_by_stage_and_step():
 # The whole benchmark.
 
 
-@pytest.fixture
-def weights(tmp_path):
-    return micro.weights_folder(tmp_path / "weights")
-
-
 def figures(tmp_path, *words: object) -> dict:
     file = tmp_path / "complete.json"
     run(*words, "--json", file)
     return json.loads(file.read_text())
 
 
-def test_json_of_a_run(tmp_path, weights):
-    data = figures(
-        tmp_path, "--weights", weights, "--targets", 2, "--steps", 2, "--repeat", 2,
-        "--device", "cpu", "--size", "24x32",
-    )  # fmt: skip
+def predicted(capsys, tmp_path, *words: object) -> tuple[str, dict]:
+    """What the command says, and its figures."""
+    given = ("--weights", micro.weights_folder(tmp_path / "weights"), *words)
+    run(*given)
+    return capsys.readouterr().out, figures(tmp_path, *given)
+
+
+def test_table_and_figures_of_a_run(tmp_path, capsys):
+    words = ("--targets", 2, "--steps", 2, "--repeat", 2, "--device", "cpu", "--size", "24x32")
+    shown, data = predicted(capsys, tmp_path, *words)
+    assert "2 + 2 views of 24x32, 2 + 1 steps, cpu, float32" in shown
+    for name in (*STAGES, "level-1 denoiser", "first pass", "peak", "TFLOP/s"):
+        assert name in shown
     rows = data["results"]
     assert [row["name"] for row in rows] == STAGES
     for row in rows:
@@ -154,25 +157,10 @@ def test_json_of_a_run(tmp_path, weights):
     assert sum(row["flops"] for row in decoding) == by_name["decoding"]["flops"]
     whole = by_name["pass"]
     assert whole["tflop_per_s"] == pytest.approx(whole["flops"] / whole["ours_s"] / TERA)
-    assert data["config"] == "micro" and data["weights"] == str(weights)
+    assert data["config"] == "micro" and data["weights"] == str(tmp_path / "weights")
     assert data["size"] == [24, 32] and data["precision"] == "float32" and data["video"] is False
     assert data["weights_bytes"] == module_bytes(micro.model())
     assert data["first_pass_s"] > 0
-
-
-def test_the_table_is_printed(capsys):
-    run(
-        "--size", 24, "--context", 1, "--targets", 1, "--steps", 1, "--repeat", 1,
-        "--device", "cpu", "--precision", "bfloat16",
-    )  # fmt: skip
-    out = capsys.readouterr().out
-    for said in (
-        "tiny, random weights, 1 + 1 views of 24x24, 1 + 1 steps, cpu, bfloat16",
-        "first pass",
-    ):
-        assert said in out
-    for name in ("hint encoding", "decoding: RGB head", "level-1 denoiser", "peak", "TFLOP/s"):
-        assert name in out
 
 
 def test_a_video_prior_that_is_not_run_has_a_stand_in(tmp_path):
@@ -286,17 +274,21 @@ def test_what_is_predicted_is_what_is_counted_with_numbers():
     assert all(found.values())
 
 
-def predicted(capsys, tmp_path, *words: object) -> tuple[str, dict]:
-    """What the command says, and its figures."""
-    run("--weights", micro.weights_folder(tmp_path / "weights"), "--size", 32, *words)
-    return capsys.readouterr().out, figures(
-        tmp_path, "--weights", tmp_path / "weights", "--size", 32, *words
-    )
-
-
 @pytest.mark.slow
 def test_the_tables_and_figures_of_memory(tmp_path, capsys):
-    words = ("--memory", "--steps", 1, "--targets", 1, "--precision", "float16", "--card", 24)
+    words = (
+        "--size",
+        32,
+        "--memory",
+        "--steps",
+        1,
+        "--targets",
+        1,
+        "--precision",
+        "float16",
+        "--card",
+        24,
+    )
     shown, found = predicted(capsys, tmp_path, *words)
     for said in (
         "micro, 2 + 1 views of 32x32, 1 + 1 steps, float16: peak memory of a pass, GB",
@@ -399,7 +391,7 @@ def test_the_operations_of_a_pass_are_those_that_torch_counts():
 
 @pytest.mark.slow
 def test_the_table_and_figures_of_predicted_time(tmp_path, capsys):
-    shown, found = predicted(capsys, tmp_path, "--predict", "--steps", 2)
+    shown, found = predicted(capsys, tmp_path, "--size", 32, "--predict", "--steps", 2)
     assert "micro, 2 + 6 views of 32x32, 2 + 1 steps, bfloat16, not compiled" in shown
     assert "RTX 3090" in shown
     *stages, whole = found["results"]

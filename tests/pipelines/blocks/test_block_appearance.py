@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -130,12 +131,20 @@ def across(folder: Path) -> list[str]:
     return [context[row] for row in rows_across(context, blocks)]
 
 
-def unfitted(folder: Path, out: Path, monkeypatch: pytest.MonkeyPatch) -> Fitted:
-    """The same merge without fitting further."""
-    with monkeypatch.context() as patch:
-        patch.setattr(merging, "fit_across", lambda plan, joined, blocks, console: joined)
-        merge(sorted((folder / "runs").iterdir()), out, console=QUIET)
-    return Fitted.load(out / SAVED)
+@pytest.fixture(scope="module")
+def joined(fitted: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Plan, Fitted, Any]:
+    """What the same merge would fit further: its plan, the joined Gaussians and the blocks."""
+    given: list[tuple[Plan, Fitted, Any]] = []
+
+    def note(plan: Plan, joined: Fitted, blocks: Any, *, console: Console) -> Fitted:
+        given.append((plan, joined, blocks))
+        return joined
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(merging, "fit_across", note)
+        out = tmp_path_factory.mktemp("joined") / "merged"
+        merge(sorted((fitted / "runs").iterdir()), out, console=QUIET)
+    return given[0]
 
 
 def error(folder: Path, fit: Fitted) -> float:
@@ -148,8 +157,8 @@ def error(folder: Path, fit: Fitted) -> float:
     ]))  # fmt: skip
 
 
-def test_pictures_across_faces_come_nearer_to_the_photographs(fitted, tmp_path, monkeypatch):
-    before = unfitted(fitted, tmp_path / "joined", monkeypatch)
+def test_pictures_across_faces_come_nearer_to_the_photographs(fitted, joined):
+    before = joined[1]
     after = Fitted.load(fitted / "merged" / SAVED)
     assert error(fitted, after) < 0.95 * error(fitted, before)
     # Half of the steps that a fit of its own would have; at the same poses.
@@ -188,31 +197,19 @@ def test_a_resumed_merge_has_the_same_bytes_and_fits_no_second_time(fitted, tmp_
         assert (out / name).read_bytes() == (fitted / "merged" / name).read_bytes(), name
 
 
-def test_poses_and_brightness_stay_where_the_views_across_are_exposed_unlike_others(
-    fitted: Path, tmp_path: Path
-) -> None:
-    given: list[tuple[Plan, Fitted, list[SceneBlock]]] = []
-
-    def note(plan: Plan, joined: Fitted, blocks: list[SceneBlock], *, console: Console) -> Fitted:
-        given.append((plan, joined, blocks))
-        return joined
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(merging, "fit_across", note)
-        merge(sorted((fitted / "runs").iterdir()), tmp_path / "merged", console=QUIET)
-    (plan, joined, blocks) = given[0]
+def test_poses_and_brightness_stay_where_the_views_across_are_exposed_unlike_others(joined) -> None:
+    plan, fit, blocks = joined
     refine = plan.config.refine.replaced(steps=2)
     plan = replace(plan, config=plan.config.replaced(refine=refine))
     context = plan.scene.subset(plan.context).cameras
     poses = RunPoses(context.cam_from_world, plan.targets.cameras.cam_from_world)
-    exposures = joined.appearance.exposures
+    exposures = fit.appearance.exposures
     assert exposures is not None
     log_gains = np.zeros_like(exposures.log_gains)
     log_gains[rows_across(plan.context, blocks)] = 0.5
-    appearance = replace(joined.appearance, exposures=replace(exposures, log_gains=log_gains))
-    found = fit_across(
-        plan, replace(joined, appearance=appearance, poses=poses), blocks, console=QUIET
-    )
+    appearance = replace(fit.appearance, exposures=replace(exposures, log_gains=log_gains))
+    some = replace(fit, appearance=appearance, poses=poses)
+    found = fit_across(plan, some, blocks, console=QUIET)
     assert found.poses is poses
     # One step changes next to nothing; a change of level would be a factor of 1.6.
     assert found.appearance.exposures is not None

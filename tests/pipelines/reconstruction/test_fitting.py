@@ -66,14 +66,6 @@ def whole(scan, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def fit(scan) -> Fitted:
-    """The fit of ``whole``, made again."""
-    found = fit_appearance(planned(scan), QUIET)
-    assert found is not None
-    return found
-
-
-@pytest.fixture(scope="module")
 def unfitted(scan, tmp_path_factory) -> list[Path]:
     """Runs without steps, or without time, to fit anything."""
     root = tmp_path_factory.mktemp("unfitted")
@@ -114,18 +106,13 @@ def not_to_be_called(*args, **kwargs):
     raise AssertionError("called")
 
 
-def test_a_run_keeps_its_gaussians_beside_round_0(whole, fit):
-    fitted = Fitted.load(whole / FITTED)
-    assert 100 < len(fitted.appearance.gaussians) <= 2000
-    assert fitted.appearance.near > 0
-    assert (whole / "memory.npz").exists()
-    np.testing.assert_array_equal(
-        fit.appearance.gaussians.values, fitted.appearance.gaussians.values
-    )
-
-
 def test_targets_show_the_gaussians_where_the_memory_observed(whole, scan):
     fitted, plan = Fitted.load(whole / FITTED), planned(scan)
+    assert 100 < len(fitted.appearance.gaussians) <= 2000
+    again = fit_appearance(plan, QUIET)
+    assert again is not None
+    values = again.appearance.gaussians.values
+    np.testing.assert_array_equal(values, fitted.appearance.gaussians.values)
     memory = memory_of_round_0(whole)
     camera = fitted.apply(plan).targets.cameras[[0]]
     guidance = project(memory, camera, options=plan.config.splat)
@@ -262,13 +249,6 @@ def test_a_sweep_is_as_large_as_there_is_time(bare, monkeypatch, seconds, side):
     assert (depth > 0).mean() > 0.3
 
 
-def test_recorded_or_named_depth_is_not_replaced(scan, bare):
-    assert Sweep.of(planned(scan)) is None
-    plan = planned(bare, "depth=plane-sweep")
-    assert Fitted(ONE).apply(plan).source is plan.source
-    assert Fitted(ONE).apply(planned(bare)).source.name == "fitted"
-
-
 def test_refined_poses_move_context_and_targets(scan):
     plan = planned(scan)
     context = plan.scene.subset(plan.context).cameras.cam_from_world.copy()
@@ -287,7 +267,7 @@ def test_refined_poses_move_context_and_targets(scan):
     assert kept.scene is plan.scene and kept.source is plan.source
 
 
-def test_photographs_with_fitted_depth_enter_the_memory_smaller(bare, monkeypatch):
+def test_photographs_with_fitted_depth_enter_the_memory_smaller(bare, scan, monkeypatch):
     monkeypatch.setattr(fitting, "SWEPT_SIDE", 64)
     plan = planned(bare)
     changed = Fitted(ONE).apply(plan)
@@ -297,6 +277,10 @@ def test_photographs_with_fitted_depth_enter_the_memory_smaller(bare, monkeypatc
     assert changed.config.voxel == pytest.approx(1.5 * plan.config.voxel)
     assert changed.scene is plan.scene
     assert changed.source.name == "fitted"
+    # Recorded depth is not replaced, nor a source that the user named.
+    named = planned(bare, "depth=plane-sweep")
+    assert Fitted(ONE).apply(named).source is named.source
+    assert Sweep.of(planned(scan)) is None
 
 
 def test_a_fit_comes_back_from_its_file_as_it_was(tmp_path):
