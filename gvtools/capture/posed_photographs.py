@@ -14,12 +14,15 @@ from pathlib import Path, PurePosixPath
 
 import cv2
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from torch import Tensor
 
-from gvtools.cameras import Cameras, Float64
+from gvtools.cameras import Cameras, Float64, invert_rigid, rigid_poses
 from gvtools.capture.mapping import Say, shared_points
 from gvtools.capture.photographs import CapturedPhotograph, copy_upright, find_photographs
-from gvtools.capture.predictions import Predictions, read_predictions
+from gvtools.capture.predictions import Predictions, read_predictions, sample_points
 from gvtools.capture.project import (
     IMAGES,
     MODEL,
@@ -29,8 +32,12 @@ from gvtools.capture.project import (
     place,
     replaced_folder,
 )
+from gvtools.completers.geoverse.views import model_size, resample
+from gvtools.depth.options import FoundationOptions
 from gvtools.errors import OptionError, ProjectError
 from gvtools.files import write_json
+from gvtools.networks.compute import autocast, inference_type
+from gvtools.networks.depth_anything.network import load_depth_anything
 from gvtools.poses.bundle_adjustment import MOST_VIEWS, Tracks, adjusted_poses, refine_focals
 from gvtools.scenes.colmap import read_colmap
 from gvtools.scenes.colmap_writer import build_reconstruction, write_colmap
@@ -43,6 +50,8 @@ from gvtools.scenes.scene import Finding, Scene
 Pictures = NDArray[np.uint8]
 Size = tuple[int, int]  # width and height [px]
 
+# Memory of Depth Anything 3 grows with the square of the pictures in a pass.
+MOST_PICTURES = 64
 # Longer side of the pictures in which features are found for the adjustment [px].
 SIDE = 800
 # Networks round sides to patches of 14 or 16 [px].
@@ -93,10 +102,8 @@ def capture_posed(
                 "and run the network on these"
             )
         if predictions is None:
-            from gvtools.capture.depth_anything_poses import predict
-
             say(f"running Depth Anything 3 on {len(photographs)} photographs")
-            predictions = predict(photographs, poses)
+            predictions = _predict(photographs, poses)
         rows, met = _rows(predictions, photographs, source=source, poses=poses)
         kept = [item for item in photographs if item.name in rows]
         copy_upright(kept, work / IMAGES)
@@ -145,6 +152,50 @@ def capture_posed(
         write_json(work / REPORT, asdict(report))
         draw(work, report)
     return report
+
+
+@torch.no_grad()
+def _predict(photographs: Sequence[CapturedPhotograph], weights: Path) -> Predictions:
+    """Cameras and depth by Depth Anything 3, of photographs of about one aspect, in one pass."""
+    if len(photographs) > MOST_PICTURES:
+        raise OptionError(
+            f"--poses {weights}: {len(photographs)} pictures; one pass takes at most "
+            f"{MOST_PICTURES}; give fewer, or what the network's own program saved"
+        )
+    place = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    dtype = inference_type("auto", place)
+    network = load_depth_anything(weights, device=place, dtype=dtype)
+    width, height = np.median([item.size for item in photographs], axis=0)
+    size = model_size(
+        int(height), int(width), longest=FoundationOptions().longest,
+        patch=network.config.encoder.patch,
+    )  # fmt: skip
+    pictures = [torch.from_numpy(read_image(item.path).rgb) for item in photographs]
+    small = torch.cat([
+        resample(rgb.permute(2, 0, 1)[None].float() / 255, size) for rgb in pictures
+    ]).clamp(0, 1)  # fmt: skip
+    with autocast(place, dtype):
+        levels = network.encode(small[None].to(place))
+        geometry = network.geometry(levels, network.encoder.grid(*size))
+        encoding = network.cam_dec(levels[-1][:, :, 0])
+    names = tuple(item.name for item in photographs)
+    depth, sure = (
+        array[0].float().cpu().numpy() for array in (geometry.depth, geometry.depth_confidence)
+    )
+    cameras = decode_cameras(encoding[0], size, names=names)
+    shown = (small.permute(0, 2, 3, 1) * 255).byte().numpy()
+    return Predictions(cameras, True, shown, True, *sample_points(depth, sure))
+
+
+def decode_cameras(encoding: Tensor, size: tuple[int, int], *, names: tuple[str, ...]) -> Cameras:
+    """Cameras of (V, 9) encodings, see ``encode_cameras``; ``size`` is height and width [px]."""
+    values = encoding.double().cpu().numpy()
+    pose = rigid_poses(Rotation.from_quat(values[:, 3:7]).as_matrix(), values[:, :3])
+    K = np.tile(np.eye(3), (len(values), 1, 1))
+    half = np.array(size[::-1]) / 2
+    K[:, :2, 2] = half
+    K[:, [0, 1], [0, 1]] = half / np.tan(np.clip(values[:, [8, 7]], 0.05, 3.0) / 2)
+    return Cameras(K, invert_rigid(pose), np.array(size[1]), np.array(size[0]), names)
 
 
 def _rows(

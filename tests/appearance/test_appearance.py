@@ -20,6 +20,7 @@ from gvtools.appearance.appearance import (
     blend_colors,
     recolor,
 )
+from gvtools.appearance.camera_corrections import Exposures
 from gvtools.appearance.fit import Fit
 from gvtools.appearance.fit_options import FitOptions
 from gvtools.appearance.free_space import SHARE, UNKNOWN_SHARE, floaters, free_depth
@@ -28,6 +29,7 @@ from gvtools.appearance.splat.project_kernels import LOG_SCALE, LOGIT, VALUES
 from gvtools.appearance.splat.splat import Lens
 from gvtools.cameras import Cameras
 from gvtools.depth.shown import LEAST_CONFIDENCE, OPAQUE, FittedDepth
+from gvtools.errors import MemoryFileError
 from gvtools.guidance import Guidance
 from gvtools.memory.store.local_frame import LocalFrame
 from gvtools.scenes.scene import Frame
@@ -322,13 +324,21 @@ def test_a_fit_clears_free_space_and_a_picture_does_not_show_it():
     assert near[0] > 100 and near[1] == 0
 
 
-def test_surfaces_come_back_from_the_file(tmp_path):
+def test_surfaces_and_exposures_come_back_from_the_file(tmp_path):
     surface = np.array([[1, 2, 3]], np.float32)
-    appearance = Appearance(fog(), 0.1, surface=surface)
-    with (tmp_path / "a.npz").open("wb") as file:
-        np.savez(file, **appearance.arrays())
-    np.testing.assert_array_equal(Appearance.load(tmp_path / "a.npz").surface, surface)
-    without = {name: array for name, array in appearance.arrays().items() if name != "surface"}
-    with (tmp_path / "b.npz").open("wb") as file:
-        np.savez(file, **without)
-    assert Appearance.load(tmp_path / "b.npz").surface is None
+    exposures = Exposures(np.stack([pose(0.0), pose(0.05)]), np.full((2, 3), [-0.2, 0.1, 0]), 2.0)
+    kept = Appearance(fog(), 0.1, surface=surface, exposures=exposures)
+
+    def again(**changed):
+        arrays = {**kept.arrays(), **changed}
+        np.savez(
+            tmp_path / "a.npz", **{n: array for n, array in arrays.items() if array is not None}
+        )
+        return Appearance.load(tmp_path / "a.npz")
+
+    np.testing.assert_array_equal(again().surface, surface)
+    np.testing.assert_array_equal(again().picture(CAMERA).rgb, kept.picture(CAMERA).rgb)
+    # Earlier versions knew none.
+    assert again(surface=None).surface is None
+    with pytest.raises(MemoryFileError, match="log_gains"):
+        again(log_gains=np.zeros((1, 3)))

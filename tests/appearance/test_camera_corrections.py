@@ -24,7 +24,6 @@ from gvtools.appearance.fit import VALIDATION_ENDS, Fit, validation_rows
 from gvtools.appearance.fit_options import FitOptions
 from gvtools.appearance.population import from_depth
 from gvtools.cameras import Cameras
-from gvtools.errors import MemoryFileError
 from gvtools.memory.store.local_frame import LocalFrame
 from gvtools.poses.motions import move_pose
 from gvtools.poses.refinement import comparable, prediction_error
@@ -187,7 +186,7 @@ def test_exposures_that_neighbours_do_not_share_tell_nothing():
     np.testing.assert_array_equal(exposures.at(along(0.5)[0]), 1)
 
 
-def test_pictures_are_exposed_and_kept_so(tmp_path):
+def test_pictures_are_exposed():
     camera = Cameras(K[None], pose(0.0)[None], np.array([WIDTH]), np.array([HEIGHT]), ("one",))
     exposures = Exposures(np.stack([pose(0.0), pose(0.05)]), np.full((2, 3), [-0.2, 0.1, 0]), 2.0)
     # Two alike photographs predict each other.
@@ -199,16 +198,3 @@ def test_pictures_are_exposed_and_kept_so(tmp_path):
     np.testing.assert_allclose(dark.rgb[..., 1], np.minimum(usual.rgb[..., 1] * np.exp(0.1), 1),
                                rtol=1e-5)  # fmt: skip
     np.testing.assert_array_equal(dark.alpha, usual.alpha)
-    with (tmp_path / "a.npz").open("wb") as file:
-        np.savez(file, **exposed.arrays())
-    again = Appearance.load(tmp_path / "a.npz")
-    np.testing.assert_array_equal(again.picture(camera).rgb, dark.rgb)
-
-
-def test_a_file_with_exposures_of_other_views_is_refused(tmp_path):
-    exposures = Exposures(np.stack([pose(0.0), pose(0.05)]), np.zeros((1, 3)), 2.0)
-    wrong = Appearance(rough_gaussians(), 0.05, exposures=exposures)
-    with (tmp_path / "a.npz").open("wb") as file:
-        np.savez(file, **wrong.arrays())
-    with pytest.raises(MemoryFileError, match="log_gains"):
-        Appearance.load(tmp_path / "a.npz")

@@ -273,7 +273,7 @@ def test_other_files_are_refused(arrays, reason, room, tmp_path, capsys):
 def test_cameras_of_depth_anything_are_decoded(truth):
     import torch
 
-    from gvtools.capture.depth_anything_poses import decode_cameras
+    from gvtools.capture.posed_photographs import decode_cameras
     from gvtools.networks.depth_anything.encoder import encode_cameras
 
     cameras = truth[0]
