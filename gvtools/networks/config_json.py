@@ -7,9 +7,11 @@ import math
 import types
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
+from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from gvtools.errors import OptionError
+from gvtools.errors import CheckpointError, OptionError
+from gvtools.untrusted import read_json
 
 T = TypeVar("T")
 
@@ -21,19 +23,15 @@ def check_range(
     ge: float | None = None,  # lower end, included
     gt: float | None = None,  # lower end, not included
     le: float | None = None,  # upper end, included
-    lt: float | None = None,  # upper end, not included
 ) -> None:
     """Refuse a number outside its range; None, for fields that may be left open, passes."""
     if value is None:
         return
     inside = (
-        (ge is None or value >= ge)
-        and (gt is None or value > gt)
-        and (le is None or value <= le)
-        and (lt is None or value < lt)
+        (ge is None or value >= ge) and (gt is None or value > gt) and (le is None or value <= le)
     )
     if not inside or value != value:
-        ends = {"at least": ge, "more than": gt, "at most": le, "less than": lt}
+        ends = {"at least": ge, "more than": gt, "at most": le}
         wanted = " and ".join(f"{word} {end:g}" for word, end in ends.items() if end is not None)
         raise OptionError(f"{name} {value}; expected {wanted or 'a number'}")
 
@@ -59,6 +57,21 @@ def from_json(kind: type[T], data: Any, *, where: str = "config") -> T:
             hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(names)}"
             raise OptionError(f"{where}: no field {key!r}; {hint}")
     return kind(**{key: _value(hints[key], data[key], f"{where}.{key}") for key in data})
+
+
+def read_model_config(kind: type[T], path: Path, *, field: str | None = None) -> T:
+    """A model's configuration, or the one ``field`` of it, from the JSON file in its folder."""
+    try:
+        stored = read_json(path)
+        if field is not None:
+            return from_json(kind, stored.get(field, {}), where=field)
+        return from_json(kind, stored)
+    except FileNotFoundError:
+        raise CheckpointError(
+            f"no {path}; expected the config.json of a GeoVerse folder (gvtools weights list)"
+        ) from None
+    except (OSError, ValueError, AttributeError, OptionError) as error:
+        raise CheckpointError(f"{path}: {error}; expected a GeoVerse configuration") from None
 
 
 def _value(kind: Any, data: Any, where: str) -> Any:

@@ -129,7 +129,7 @@ def batches(
         _ArraySamples(data),  # type: ignore[arg-type]
         batch_sampler=parts,  # type: ignore[arg-type]
         num_workers=workers,
-        collate_fn=_identity,
+        collate_fn=list,
         worker_init_fn=_start_worker,
         # Threads of a compiled kernel do not survive a fork.
         multiprocessing_context="spawn",
@@ -173,10 +173,6 @@ class _ArraySamples:
         except GvError as error:
             # Raised in this process it would reach the user as a traceback.
             return error
-
-
-def _identity(item: Any) -> Any:
-    return item
 
 
 def _start_worker(worker: int) -> None:

@@ -233,7 +233,7 @@ class TrainCommand(TuneArguments):
     def _with_scenes(self, config: TrainingSettings, console: Console) -> TrainingSettings:
         """The training on the scenes that were asked for; base does not begin without any."""
         if self.data is not None:
-            from gvtools.training.mixture import with_data
+            from gvtools.training.data import with_data
 
             if self.rooms or config.data.scenes:
                 given = "--rooms" if self.rooms else "data.scenes"

@@ -26,8 +26,7 @@ from gvtools.networks.config_json import to_json
 from gvtools.scenes.data_sets.catalogue import load_spec, spec_names
 from gvtools.scenes.project import open_collection
 from gvtools.scenes.shard_writer import write_shards
-from gvtools.training.data import TrainingSamples
-from gvtools.training.mixture import MIXTURE, with_data
+from gvtools.training.data import MIXTURE, TrainingSamples, with_data
 from gvtools.training.options import SHIPPED, TrainingSettings, shipped_or_read
 from gvtools.training.records import read_log
 from pipelines.cli import main

@@ -20,10 +20,9 @@ from gvtools.completers.geoverse.rgb_head import RGBHeadConfig
 from gvtools.completers.geoverse.video_injection import ControlConfig, SharedAttentionConfig
 from gvtools.completers.geoverse.video_prior import VideoPriorConfig
 from gvtools.completers.geoverse.wan import MOST_BLOCKS
-from gvtools.errors import CheckpointError, OptionError
-from gvtools.networks.config_json import check_range, from_json, to_json
+from gvtools.errors import OptionError
+from gvtools.networks.config_json import check_range, from_json, read_model_config, to_json
 from gvtools.networks.depth_anything.network import DepthAnythingConfig
-from gvtools.untrusted import read_json
 
 NAMES = ("base", "gld", "tiny")
 MOST_PIXELS = 4096  # see ``MOST_BLOCKS``
@@ -196,14 +195,7 @@ def named(name: str) -> GeoVerseConfig:
 
 def read(path: Path) -> GeoVerseConfig:
     """A configuration from its JSON file."""
-    try:
-        return from_json(GeoVerseConfig, read_json(path))
-    except FileNotFoundError:
-        raise CheckpointError(
-            f"no {path}; expected the config.json of a GeoVerse folder (gvtools weights list)"
-        ) from None
-    except (OSError, ValueError, OptionError) as error:
-        raise CheckpointError(f"{path}: {error}; expected a GeoVerse configuration") from None
+    return read_model_config(GeoVerseConfig, path)
 
 
 def write(config: GeoVerseConfig, path: Path) -> None:

@@ -302,16 +302,14 @@ def read_config(folder: Path) -> dict[str, Any]:
     path = folder / "config.json"
     try:
         config = read_json(path)
-    except OSError as error:
+        if not isinstance(config, dict):
+            raise ValueError(f"a {type(config).__name__} instead of an object")
+        return config
+    except (OSError, ValueError) as error:
         raise CheckpointError(
-            f"{path}: cannot be read ({error.strerror or error}); expected the config.json of a "
-            "network in diffusers' form"
+            f"{path}: cannot be read ({error}); expected the config.json of a network in "
+            "diffusers' form"
         ) from error
-    except ValueError as error:
-        raise CheckpointError(f"{path}: not JSON ({error}); download it again") from error
-    if not isinstance(config, dict):
-        raise CheckpointError(f"{path}: a {type(config).__name__}; expected a JSON object")
-    return config
 
 
 @contextmanager

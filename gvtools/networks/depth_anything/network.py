@@ -8,14 +8,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from gvtools.errors import CheckpointError, OptionError
+from gvtools.errors import CheckpointError
 from gvtools.networks.compute import hold_in
-from gvtools.networks.config_json import from_json
+from gvtools.networks.config_json import read_model_config
 from gvtools.networks.depth_anything.encoder import (
     CameraDecoder,
     CameraEncoder,
@@ -37,7 +36,6 @@ from gvtools.networks.tensors import (
     shapes_alone,
     share_tied,
 )
-from gvtools.untrusted import read_json
 
 
 @dataclass(frozen=True)
@@ -210,7 +208,8 @@ def load_depth_anything(
     """The network, strictly loaded, frozen, in evaluation mode."""
     path = find_weights(folder)
     if path.name == GEOVERSE_FILE:
-        config = _geoverse_config(path.with_name(GEOVERSE_CONFIG))
+        place = path.with_name(GEOVERSE_CONFIG)
+        config = read_model_config(DepthAnythingConfig, place, field="geometry")
         files = TensorFiles.find(path)
         tensors = {
             name.removeprefix(GEOVERSE_PREFIX): files.read(name)
@@ -238,15 +237,3 @@ def load_depth_anything(
     load(network, tensors, where=path)
     network.hold_in(dtype)
     return network.requires_grad_(False).eval().to(device)
-
-
-def _geoverse_config(path: Path) -> DepthAnythingConfig:
-    try:
-        stored: Any = read_json(path)
-        return from_json(DepthAnythingConfig, stored.get("geometry", {}), where="geometry")
-    except FileNotFoundError:
-        raise CheckpointError(
-            f"no {path}; expected the config.json of a GeoVerse folder (gvtools weights list)"
-        ) from None
-    except (OSError, ValueError, AttributeError, OptionError) as error:
-        raise CheckpointError(f"{path}: {error}; expected a GeoVerse configuration") from None
