@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import concatenate
 from gvtools.completers.geoverse.camera_encoding import normalised_poses
+from gvtools.completers.geoverse.objective import center_similarity
 from gvtools.completers.geoverse.views import model_size, resample, resample_depth
 from gvtools.depth.options import FoundationOptions
 from gvtools.depth.source import DepthMap, depth_of_points
@@ -38,7 +39,7 @@ from gvtools.similarity import align_depth_scale
 MIN_POINTS_IN_ALL = 50
 # Fewer centres fit each other by chance: of four at random, one set in a hundred correlates by more
 # than 0.956, of three by 0.998, of two by 1.
-MIN_CENTRES, MIN_CORRELATION = 4, 0.97
+MIN_CORRELATION = 0.97
 # So many passes of fewer views count together where their scales agree within this factor.
 MIN_PASSES, PASSES_AGREE = 3, 1.35
 
@@ -71,23 +72,10 @@ class Pass:
     unit: float  # scene units a unit of the known cameras that the network saw; 1 without them
 
 
-def fit_scale(
-    scene: Scene, passes: Sequence[Pass], *, min_centres: int = MIN_CENTRES
-) -> FoundationScale:
+def _fit_scale(scene: Scene, passes: Sequence[Pass], *, min_centres: int) -> FoundationScale:
     """One scale for some passes: by their sparse points, or by their cameras' centres."""
-    by_points = _fit_points(scene, passes)
-    # Points that fit no scale refuse the depth itself; what the centres say does not mend it.
-    if by_points.ok or by_points.count >= MIN_POINTS_IN_ALL:
-        return by_points
-    by_cameras = _fit_cameras(scene, passes, min_centres=min_centres)
-    if by_cameras.ok or scene.points is None:
-        return by_cameras
-    return by_points
-
-
-def _fit_points(scene: Scene, passes: Sequence[Pass]) -> FoundationScale:
     if scene.points is None:
-        return FoundationScale("unsupported: no sparse points", "points", np.nan, 0)
+        return _fit_cameras(scene, passes, min_centres=min_centres)
     pairs = [
         (measured.astype(np.float64) * part.unit, known)
         for part in passes
@@ -98,15 +86,16 @@ def _fit_points(scene: Scene, passes: Sequence[Pass]) -> FoundationScale:
     fitted = align_depth_scale(
         depth, reference, valid=depth > 0, min_support=MIN_POINTS_IN_ALL, inlier_band=0.1
     )
-    return FoundationScale(fitted.status, "points", fitted.scale, fitted.support)
+    by_points = FoundationScale(fitted.status, "points", fitted.scale, fitted.support)
+    # Points that fit no scale refuse the depth itself; what the centres say does not mend it.
+    if by_points.ok or by_points.count >= MIN_POINTS_IN_ALL:
+        return by_points
+    by_cameras = _fit_cameras(scene, passes, min_centres=min_centres)
+    return by_cameras if by_cameras.ok else by_points
 
 
 def _fit_cameras(scene: Scene, passes: Sequence[Pass], *, min_centres: int) -> FoundationScale:
-    """The median of the passes' own fits, weighted by their views; see ``MIN_CENTRES``."""
-    import torch
-
-    from gvtools.completers.geoverse.objective import center_similarity
-
+    """The median of the passes' own fits, weighted by their views."""
     scales, weights, reason = [], [], "no pass"
     for part in passes:
         known = np.concatenate([scene[name].camera.centers for name in part.names])
@@ -170,9 +159,7 @@ class FoundationDepth:
 
     def depth(self, scene: Scene, view: View, frame: Frame) -> DepthMap:
         """The depth of ``view``, whose pixels are ``frame``."""
-        if not self._passes:
-            self._compute()
-        fitted = self._scales[view.name]
+        fitted = self.scale(view.name)
         if not fitted.ok:
             raise DegenerateError(
                 f"depth da3: no scale for {view.name}: {fitted.status}; give a project with sparse "
@@ -215,7 +202,7 @@ class FoundationDepth:
             self._passes |= dict.fromkeys(made.names, made)
         sharing = [passes] if self.options.cameras else [[made] for made in passes]
         for together in sharing:
-            fitted = fit_scale(self._scene, together, min_centres=self.options.min_centres)
+            fitted = _fit_scale(self._scene, together, min_centres=self.options.min_centres)
             for made in together:
                 self._scales |= dict.fromkeys(made.names, fitted)
 
