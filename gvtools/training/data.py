@@ -216,9 +216,13 @@ NOTE_PREFIXES = tuple(f"{kind}/" for kind in (DRAWN, RESAMPLED, GEOMETRY_OF))
 def sampling_report(counts: Mapping[str, int]) -> Iterator[str]:
     """One line for each source: how many samples, whose geometry, what was invalid and why.
 
-    >>> counts = {"drawn/rooms": 30, "drawn/kitchen": 10, "resampled/kitchen/overlap": 2}
-    >>> list(sampling_report(counts))
-    ['10 samples (25 %) of kitchen; drawn again: 2 overlap', '30 samples (75 %) of rooms']
+    >>> counts = {"drawn/rooms": 30, "drawn/kitchen": 10, "geometry/kitchen/own": 10}
+    >>> counts["resampled/attic/overlap"] = 2
+    >>> for line in sampling_report(counts):
+    ...     print(line)
+    0 samples (0 %) of attic; drawn again: 2 overlap
+    10 samples (25 %) of kitchen; geometry: 10 own
+    30 samples (75 %) of rooms
     """
     parts = [(name.split("/", 2), count) for name, count in sorted(counts.items())]
     samples = {part[1]: count for part, count in parts if part[0] == DRAWN}

@@ -26,7 +26,6 @@ from gvtools.training.data import (
     OwnOrEstimated,
     SampleSource,
     TrainingSamples,
-    sampling_report,
     stratified_at,
 )
 from gvtools.training.distributed import Processes
@@ -464,20 +463,3 @@ def test_geometry_falls_back_and_every_fall_is_noted():
     assert notes(OwnOrEstimated(unread, plain, 1.0)) == {"unreadable": 300}
     named = Mixture((SampleSource("kitchen", 1, OwnOrEstimated(own, plain, 1.0)),)).sample(1)
     assert named.notes == ("drawn/kitchen", "geometry/kitchen/own")
-
-
-def test_lines_tell_each_source():
-    counts = {
-        "drawn/rooms": 30,
-        "drawn/kitchen": 10,
-        "geometry/kitchen/own": 8,
-        "geometry/kitchen/own (no estimate)": 2,
-        "resampled/kitchen/overlap": 3,
-        "resampled/attic/unreadable": 20,
-    }
-    assert list(sampling_report(counts)) == [
-        "0 samples (0 %) of attic; drawn again: 20 unreadable",
-        "10 samples (25 %) of kitchen; geometry: 8 own, 2 own (no estimate); drawn again: "
-        "3 overlap",
-        "30 samples (75 %) of rooms",
-    ]

@@ -199,11 +199,9 @@ def test_views_without_holes_come_back_and_are_not_computed(weights, monkeypatch
 TURN = micro.rotation((0.3, 1.0, -0.4), 2.0)
 
 WORLDS: dict[str, dict[str, Any]] = {
-    "kilometres": {"scale": 1e-3},
     "millimetres": {"scale": 1e3},
     "tiny": {"scale": 1e-7},
     "turned": {"turn": TURN},
-    "far": {"shift": (3e5, -5e5, 1e5)},
     "far, turned, in millimetres": {"turn": TURN, "shift": (40.0, 1e3, -2e3), "scale": 1e3},
 }
 
