@@ -102,20 +102,18 @@ class ScanTable:
 
 def _numbers(path: Path, file: IO[bytes], names: tuple[str, ...], rows: int) -> NDArray[np.float64]:
     """(columns, rows) of the next lines of a text."""
+    table, wrong = np.zeros((0, 0)), ""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             lines = _lines(file, rows, MOST_TEXT * len(names))
             table = np.loadtxt(lines, ndmin=2, comments=None)
     except ValueError as error:
+        wrong = f" ({error})"
+    if wrong or table.shape != (rows, len(names)):
         raise MemoryFileError(
-            f"{path}: a point is not {len(names)} numbers with decimal points ({error}); save it "
-            "again"
-        ) from None
-    if table.shape != (rows, len(names)):
-        raise MemoryFileError(
-            f"{path}: {table.shape} numbers; expected {rows} lines of {len(names)}; the file is "
-            "truncated or damaged; save it again"
+            f"{path}: expected {rows} lines of {len(names)} numbers with decimal points{wrong}; "
+            "the file is truncated or damaged; save it again"
         )
     return table.T
 
@@ -244,12 +242,11 @@ def _pcd_header(path: Path) -> tuple[ScanTable, list[str]]:
         words = head[offset:end].decode("ascii", "replace").split()
         if words[:1] == ["COLUMNS"]:  # of PCD before 0.7
             words[0] = "FIELDS"
-        if end < 0 or (words and not words[0].startswith("#") and words[0] not in KEYS):
-            raise MemoryFileError(f"{path}: no PCD header; expected a PCD point cloud")
+        told = bool(words) and not words[0].startswith("#")
+        if end < 0 or (told and (words[0] not in KEYS or words[0] in given)):
+            raise MemoryFileError(f"{path}: no PCD header; expected each of its lines once")
         offset = end + 1
-        if words and not words[0].startswith("#"):
-            if words[0] in given:
-                raise MemoryFileError(f"{path}: PCD header with two lines {words[0]}")
+        if told:
             given[words[0]] = words[1:]
     try:
         viewpoint = given.get("VIEWPOINT", [])

@@ -72,12 +72,6 @@ def csv_rows(path: Path, *, again: str = "copy it again") -> list[dict[str, str]
         return list(csv.DictReader(read_text(path).splitlines(), skipinitialspace=True))
 
 
-def json_file(path: Path) -> Any:
-    """The value in a JSON file that has to be there."""
-    with reading(path, "download it again"):
-        return read_json(path)
-
-
 def json_object(path: Path) -> Mapping[str, Any]:
     """The JSON object in a file; empty where it is absent or damaged, as if it had no key."""
     try:

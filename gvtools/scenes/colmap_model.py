@@ -125,14 +125,6 @@ def checked_suffix(folder: Path) -> str:
     return suffix
 
 
-def check_cameras(folder: Path, model: pycolmap.Reconstruction) -> None:
-    """Compare the size of cameras.bin with the cameras that a reader got from it."""
-    path = folder / "cameras.bin"
-    expected = 8 + sum(24 + 8 * len(camera.params) for camera in model.cameras.values())
-    if path.stat().st_size != expected:
-        raise _damaged(path, f"its cameras take {expected}")
-
-
 def _check_records(path: Path) -> None:
     """Walk a file by the counts in each record."""
     data = read_bytes(path)
@@ -489,7 +481,10 @@ def _parsed(folder: Path, suffix: str) -> pycolmap.Reconstruction:
     try:
         if suffix == ".bin":
             reconstruction.read_binary(folder)
-            check_cameras(folder, reconstruction)
+            cameras = reconstruction.cameras.values()
+            expected = 8 + sum(24 + 8 * len(camera.params) for camera in cameras)
+            if (folder / CAMERAS).stat().st_size != expected:
+                raise _damaged(folder / CAMERAS, f"its cameras take {expected}")
         else:
             reconstruction.read_text(folder)
         _ = [image.name for image in reconstruction.images.values()]  # decoded when asked for

@@ -58,7 +58,8 @@ def unit_findings(scene: Scene) -> list[Finding]:
     telling = np.argsort(ratios)[:2]
     fits = agreeing[telling, mean.argmax()] > SHARE * most[telling]
     wrong_unit = fits.all() and (ratios[telling] < SHARES[: len(telling)]).all()
-    shares = _nearly(compared)
+    agreed, shared = (part[:, 0] for part in _agreeing(compared, np.ones(1), same=NEARLY))
+    shares = np.where(shared * PIXELS < LEAST, np.nan, agreed / np.maximum(shared, 1e-9))
     straight = [(_of_rays(one, a), _of_rays(other, b), (a, b)) for one, other, (a, b) in compared]
     by_rays = SHARE * _agreeing(straight, np.ones(1))[0].mean() > max(best, AGREE)
     if not by_rays and wrong_unit and best >= AGREE and max(factor, 1 / factor) > FAR:
@@ -96,12 +97,6 @@ def frame_there(scene: Scene, number: int) -> Frame | None:
 def _of_rays(depth: Depth, camera: Cameras) -> Depth:
     """(H, W) z-depth of distances along the rays."""
     return np.asarray(depth / np.linalg.norm(camera.rays(), axis=-1), np.float32)
-
-
-def _nearly(pairs: Sequence[Pair]) -> Float64:
-    """(P,) of what the second view of a pair shows, what agrees nearly; NaN of too little."""
-    agreed, shared = (part[:, 0] for part in _agreeing(pairs, np.ones(1), same=NEARLY))
-    return np.where(shared * PIXELS < LEAST, np.nan, agreed / np.maximum(shared, 1e-9))
 
 
 def _agreeing(

@@ -18,7 +18,6 @@ from gvtools.cameras import rigid_poses
 from gvtools.errors import ProjectError
 from gvtools.scenes.calibration import (
     Float64,
-    json_file,
     number_table,
     pinhole_lens,
     quaternion_pose,
@@ -382,8 +381,8 @@ def _read_omniworld(root: Path, scene: str) -> Scene:
     expected = f"expected quats, trans, focals, cx and cy of the split's frames in {info.name}"
     with reading(path, f"{expected}; download both again"):
         number = int(split.removeprefix("split_"))
-        numbers = [int(frame) for frame in json_file(info)["split"][number]]
-        values, count = json_file(path), len(numbers)
+        numbers = [int(frame) for frame in read_json(info)["split"][number]]
+        values, count = read_json(path), len(numbers)
         turns = np.array(values["quats"], np.float64).reshape(count, 4)[:, [1, 2, 3, 0]]
         centres = np.array(values["trans"], np.float64).reshape(count, 3)
         poses = rigid_poses(Rotation.from_quat(turns).as_matrix(), centres)
