@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from pydantic import Field
 
 from gvtools.errors import OptionError
+from gvtools.files import write_json
 from pipelines.bench.options import CompleteOptions
 from pipelines.machine import load_average
 from pipelines.options import Arguments, add_settings
@@ -98,7 +99,6 @@ def _run_complete(args: BenchCommand, given: dict[str, Any], console: Console) -
     if args.json_ is None:
         tables(figures, console)
         return
-    from gvtools.files import write_json
 
     write_json(args.json_, figures)
     console.line(f"{rows} rows written to {args.json_}")
@@ -111,8 +111,6 @@ def report(
     results = [row.to_dict() for row in rows]
     if path is not None:
         import os
-
-        from gvtools.files import write_json
 
         write_json(path, {**conditions, "cpus": os.cpu_count(), "results": results})
         console.line(f"{len(rows)} comparisons written to {path}")

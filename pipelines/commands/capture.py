@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import BeforeValidator
 
 from gvtools.errors import OptionError, ProjectError, UnposedError
+from gvtools.files import replaced_when_written
 from pipelines.commands.arguments import RecordingArguments
 
 if TYPE_CHECKING:
@@ -283,7 +284,6 @@ def _draw(out: Path, report: CaptureReport | RgbdCaptureReport, *, title: str) -
     import numpy as np
 
     from gvtools.capture.rgbd_project import RgbdCaptureReport, points_from_above
-    from gvtools.files import replaced_when_written
     from gvtools.scenes.project import open_project
     from viz.plots.trajectories import draw_capture
 

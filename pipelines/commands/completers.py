@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from gvtools.files import write_json
 from pipelines.options import Arguments
 
 if TYPE_CHECKING:
@@ -21,7 +22,6 @@ class CompletersCommand(Arguments):
 
     def run(self, console: Console) -> None:
         from gvtools.completers.base import available, completer_type
-        from gvtools.files import write_json
 
         listed = [(name, variant) for name in available() for variant in completer_type(name).facts]
         unsaid = [name for name in available() if not completer_type(name).facts]

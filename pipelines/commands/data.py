@@ -6,6 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from gvtools.errors import GvError, OptionError, ProjectError
+from gvtools.files import write_json
+from gvtools.specs import name_key
 from pipelines.commands.arguments import SceneArguments
 from pipelines.options import Arguments
 
@@ -35,7 +37,6 @@ class CheckCommand(SceneArguments):
     """Write the report there. [FILE]"""
 
     def run(self, console: Console) -> None:
-        from gvtools.files import write_json
         from gvtools.scenes.inspection import inspect
 
         try:
@@ -188,7 +189,6 @@ class WriteShards(Arguments):
         from gvtools.scenes.layout import SPEC
         from gvtools.scenes.project import open_collection
         from gvtools.scenes.shard_writer import MEGABYTE, ShardOptions, write_shards
-        from gvtools.specs import name_key
 
         address = self.scenes_of
         if self.root is not None and not address.startswith(SPEC):

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any, Literal
 from pydantic import Field
 
 from gvtools.errors import DegenerateError, OptionError
+from gvtools.files import folder_for_results, write_json
+from gvtools.runs.layout import RECORD
 from pipelines.commands.arguments import (
     MeasurementArguments,
     RootArguments,
@@ -66,7 +68,6 @@ class EvaluateCommand(MeasurementArguments, ProtocolArguments, SceneArguments):
 
     def run(self, console: Console) -> None:
         from gvtools.evaluation.published import benchmark_names
-        from gvtools.files import folder_for_results, write_json
         from pipelines.scoring import evaluation
 
         shown = benchmark_names() if "all" in self.against else self.against
@@ -151,7 +152,6 @@ class JudgeCommand(MeasurementArguments, SceneArguments):
     """Views on contact sheets. [N]"""
 
     def run(self, console: Console) -> None:
-        from gvtools.files import folder_for_results, write_json
         from pipelines.scoring.judging import judge, method_names
 
         names = method_names(self.pictures, self.name)
@@ -174,15 +174,12 @@ class JudgeCommand(MeasurementArguments, SceneArguments):
 
 def _check_apart(pictures: Sequence[Path], out: Path) -> None:
     """Refuse results among the pictures, where the next call would take sheets for pictures."""
-    from gvtools.runs.layout import RECORD
-
     for path in pictures:
         if out.resolve().is_relative_to(path.resolve()) and not (path / RECORD).is_file():
             raise OptionError(f"--out {out}: lies in the pictures {path}; give a folder elsewhere")
 
 
 def _reference(args: JudgeCommand, console: Console) -> JudgeReference:
-    from gvtools.runs.layout import RECORD
     from pipelines.scoring.judging import open_reference, reference_from_context
 
     if (args.against / RECORD).is_file():
@@ -240,7 +237,6 @@ class TrajectoryCommand(RootArguments):
     def run(self, console: Console) -> None:
         from gvtools.evaluation.conventions import wrong_conventions
         from gvtools.evaluation.trajectories import absolute_errors, pose_auc, relative_errors
-        from gvtools.files import write_json
         from pipelines.inputs.trajectory_source import associate, open_trajectory
         from pipelines.scoring.measurement import pose_figures
 

@@ -12,12 +12,13 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field
 
+from gvtools.files import write_text
+from gvtools.settings import Settings, with_file, with_texts, with_values
 from pipelines.commands.arguments import SceneArguments
 from pipelines.console import Console
 from pipelines.options import Arguments, HelpSettings, add_settings, given_settings
 
 if TYPE_CHECKING:
-    from gvtools.settings import Settings
     from pipelines.reconstruction.settings import RunSettings
 
 
@@ -122,8 +123,6 @@ def _settings(args: argparse.Namespace) -> list[Settings]:
 def copy_figures(args: RunArguments, out: Path) -> None:
     """Write a run's metrics.json where ``--json`` wants it."""
     if args.json_ is not None and not args.dry_run:
-        from gvtools.files import write_text
-
         write_text(args.json_, (out / "metrics.json").read_text(encoding="utf-8"))
 
 
@@ -134,7 +133,6 @@ def run_settings(
 
     ``--set profile=NAME`` stands for ``--profile NAME``.
     """
-    from gvtools.settings import with_file, with_texts, with_values
     from pipelines.reconstruction.settings import RunSettings
 
     config, others = RunSettings(), []

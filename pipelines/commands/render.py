@@ -10,6 +10,9 @@ from typing import TYPE_CHECKING
 from pydantic import Field
 
 from gvtools.errors import OptionError
+from gvtools.files import write_json
+from gvtools.runs.layout import file_stems
+from gvtools.settings import with_texts
 from pipelines.commands.arguments import EMPTY, LensArguments, LpipsArguments, SceneArguments
 
 if TYPE_CHECKING:
@@ -58,9 +61,7 @@ class RenderCommand(LensArguments, LpipsArguments, SceneArguments):
     """Write the figures there. [FILE]"""
 
     def run(self, console: Console) -> None:
-        from gvtools.files import write_json
         from gvtools.memory.panoramas import WIDEST_STILL
-        from gvtools.runs.layout import file_stems
         from gvtools.runs.run import load_appearance, load_memory
         from pipelines import rendering
 
@@ -165,7 +166,6 @@ class RenderCommand(LensArguments, LpipsArguments, SceneArguments):
 
 def splat_options(texts: Sequence[str]) -> SplatOptions:
     """The projection's options, changed by ``splat.KEY=VALUE`` texts."""
-    from gvtools.settings import with_texts
     from pipelines.reconstruction.settings import RunSettings
 
     for text in texts:

@@ -11,6 +11,9 @@ from typing import TYPE_CHECKING, Literal
 from pydantic import Field
 
 from gvtools.errors import OptionError, ProjectError
+from gvtools.files import write_json
+from gvtools.settings import changes
+from gvtools.specs import unknown
 from gvtools.untrusted import read_json
 from pipelines.commands.arguments import LpipsArguments, SceneArguments
 from pipelines.commands.reconstruct import run_settings
@@ -147,7 +150,6 @@ def _chosen_views(text: str | None, benchmark: Benchmark) -> tuple[int, ...]:
 
 
 def _chosen_scenes(text: str | None, known: tuple[str, ...]) -> tuple[str, ...]:
-    from gvtools.specs import unknown
 
     if text is None:
         return known
@@ -194,9 +196,7 @@ class TradeoffCommand(SceneArguments):
     most 15m, its default). [TIME]"""
 
     def run(self, console: Console) -> None:
-        from gvtools.files import write_json
         from gvtools.runs.folder import folder_lock
-        from gvtools.settings import changes
         from pipelines.reconstruction.plan import run_identity
         from pipelines.reconstruction.settings import RunSettings
         from pipelines.scoring import tradeoff
@@ -273,7 +273,6 @@ def asked_for(args: TradeoffCommand, profile: str | None = None) -> RunSettings:
 
     A profile finds its own voxel edge, unless one is given.
     """
-    from gvtools.settings import changes
     from pipelines.reconstruction.settings import RunSettings
 
     texts: Sequence[str] = args.set

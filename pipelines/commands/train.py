@@ -16,12 +16,13 @@ from typing import TYPE_CHECKING, Literal
 from pydantic import Field
 
 from gvtools.errors import OptionError
+from gvtools.files import check_parent, make_folder, write_json, write_text
+from gvtools.settings import Settings, with_texts, with_values
 from pipelines.commands.arguments import RootArguments
 from pipelines.options import HelpSettings
 
 if TYPE_CHECKING:
     from gvtools.scenes.scene import Scene
-    from gvtools.settings import Settings
     from gvtools.training.options import TrainingSettings
     from pipelines.console import Console
     from pipelines.reconstruction.settings import RunSettings
@@ -59,7 +60,6 @@ class TuneArguments(RootArguments):
 def run_tune(args: TrainCommand, console: Console) -> None:
     """Tune, and write the weights."""
     from gvtools.completers.geoverse.completer import SHIPPED
-    from gvtools.files import check_parent, write_json
     from gvtools.scenes.project import open_project
     from pipelines.tuning.tune import check_tunable, tune
 
@@ -91,7 +91,6 @@ def run_tune(args: TrainCommand, console: Console) -> None:
 
 def _checked(args: TrainCommand) -> RunSettings:
     """Settings of a run that would read the scene likewise."""
-    from gvtools.settings import with_values
     from pipelines.reconstruction.settings import RunSettings
 
     args.refuse(STAGE_OPTIONS, "train tune does not look at it")
@@ -116,7 +115,6 @@ def context_of(scene: Scene, config: RunSettings, folder: Path, *, console: Cons
     Targets of ``config`` are not looked at; computed depth goes into ``folder``.
     """
     from gvtools.runs.context_depth import DepthCache
-    from gvtools.settings import with_values
     from pipelines.reconstruction.prepare import make_plan, with_depth
 
     # The context stands for the targets, and an edge that nothing is fused with is not sought.
@@ -181,9 +179,7 @@ class TrainCommand(TuneArguments):
 
     def run(self, console: Console) -> None:
         from gvtools.completers.geoverse.weights import WHOLE_FILE
-        from gvtools.files import check_parent, make_folder, write_text
         from gvtools.runs.folder import folder_lock
-        from gvtools.settings import with_texts
         from gvtools.training.distributed import join_processes
         from gvtools.training.options import shipped_or_read
         from gvtools.training.records import STAGES
@@ -253,7 +249,6 @@ class TrainCommand(TuneArguments):
 
 
 def _settings(args: argparse.Namespace) -> list[Settings]:
-    from gvtools.settings import with_texts
     from gvtools.training.options import TrainingSettings, shipped_or_read
 
     known = TrainingSettings() if args.config is None else shipped_or_read(args.config)[0]

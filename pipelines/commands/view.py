@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
 
-from gvtools.errors import ProjectError
+from gvtools.errors import OptionError, ProjectError
+from gvtools.files import replaced_when_written, write_text
 from pipelines.options import Arguments, check_ending
 
 if TYPE_CHECKING:
@@ -54,22 +55,22 @@ class ViewCommand(Arguments):
     """Where the run's project lies now, if moved. [PATH]"""
 
     def run(self, console: Console) -> None:
-        from pipelines.viewing.serve import RECORDING, open_recording, read_round, serve
+        from pipelines.viewing import serve as serving
         from pipelines.viewing.source import ViewSource
 
         if self.live:
             self.refuse(("open3d", "screenshot"), "the web page alone follows a run (--live)")
         if self.screenshot is not None:
             check_ending(self.screenshot, (".png",), option="--screenshot")
-        if self.folder.suffix.lower() == RECORDING:
+        if self.folder.suffix.lower() == serving.RECORDING:
             why = f"{self.folder}, a recording, opens in rerun's own viewer"
             self.refuse(("open3d", "screenshot"), why)
-            open_recording(self.folder, host=self.host, port=self.port)
+            serving.open_recording(self.folder, host=self.host, port=self.port)
             return
         source, mode = ViewSource(self.folder, project=self.project), self.color
         if self.live or not (self.open3d or self.screenshot):
             try:
-                serve(
+                serving.serve(
                     source,
                     host=self.host,
                     port=self.port,
@@ -82,7 +83,9 @@ class ViewCommand(Arguments):
             except KeyboardInterrupt:
                 console.line("viewer ended")
             return
-        shown, number = read_round(source, self.round)
+        if self.open3d and not serving.has_display():
+            raise OptionError("--open3d: no display; expected X or Wayland; use --screenshot FILE")
+        shown, number = serving.read_round(source, self.round)
         if self.screenshot is not None:
             from viz.viewer.render import chosen_camera, write_screenshot
 
@@ -114,7 +117,6 @@ class ReportCommand(Arguments):
     """Where the run's project lies, if it was moved. [DIR]"""
 
     def run(self, console: Console) -> None:
-        from gvtools.files import write_text
         from pipelines.report import PAGE, collect
         from viz.report.page import report_html
 
@@ -154,7 +156,6 @@ class PlotCommand(Arguments):
     """Ends with .png, .svg or .pdf. [FILE]"""
 
     def run(self, console: Console) -> None:
-        from gvtools.files import replaced_when_written
 
         ending = check_ending(self.out, FORMATS)
         figure = _figure(self.what, self.folder)

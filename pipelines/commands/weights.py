@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from gvtools.errors import CheckpointError, GvError, OptionError, ProjectError
+from gvtools.files import write_json
 from pipelines.options import Arguments
 
 if TYPE_CHECKING:
@@ -101,7 +102,6 @@ class CheckWeights(Arguments):
 
     def run(self, console: Console) -> None:
         from gvtools.completers.geoverse.weights import check_folder, check_is_folder, config_of
-        from gvtools.files import write_json
         from pipelines.weights import other_revisions, print_parts, self_check
 
         folder = self.folder

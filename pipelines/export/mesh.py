@@ -10,7 +10,7 @@ import io
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,7 @@ from gvtools.files import replaced_when_written, write_text
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.store.local_frame import LocalFrame
 from gvtools.memory.thinning import thin
+from gvtools.o3d import o3d
 from gvtools.optional import require
 from gvtools.ply import up_comment, write_ply
 from gvtools.runs.layout import RECORD
@@ -31,9 +32,6 @@ from pipelines.export.formats import ExportOptions
 from pipelines.export.points import UNLIT, axes_of, linear, save_glb, unlit
 from pipelines.export.source import ExportSource
 from pipelines.export.texture import TEXELS, Texture, texture_of
-
-if TYPE_CHECKING:
-    import open3d as o3d
 
 Up = NDArray[np.float64] | None
 # The edge of a mesh's voxels is at least PER_VOXEL edges of the memory's finest voxels, and
@@ -77,8 +75,6 @@ def tsdf_mesh(
 
     ``voxel`` is the edge, scene units; ``observed`` leaves out generated points and views.
     """
-    from gvtools.o3d import o3d
-
     kind = o3d.core.float32
     blocks_held = _blocks(memory, BLOCK_SIDE * voxel)
     if blocks_held > MOST_BLOCKS:
@@ -127,8 +123,6 @@ def _blocks(memory: SpatialMemory, edge: float) -> int:
 
 def _ordered(mesh: o3d.t.geometry.TriangleMesh) -> o3d.t.geometry.TriangleMesh:
     """The mesh with vertices and triangles sorted: Open3D's threads give them in any order."""
-    from gvtools.o3d import o3d
-
     positions, colors = mesh.vertex.positions.numpy(), mesh.vertex.colors.numpy()
     order = np.lexsort(positions.T)
     rank = np.empty(len(order), np.int64)
@@ -171,8 +165,6 @@ def poisson_mesh(
     Normals are those of the nearest points, turned to the view that saw the point. ``voxel`` is
     the edge of the finest cells, scene units; ``observed`` leaves out what a completer made.
     """
-    from gvtools.o3d import o3d
-
     chosen = ~memory.generated if observed else np.ones(len(memory), np.bool_)
     if not chosen.any():
         raise DegenerateError("the memory holds nothing that was observed; leave out --observed")
@@ -265,8 +257,6 @@ def without_islands(
     mesh: o3d.t.geometry.TriangleMesh, least: float
 ) -> tuple[o3d.t.geometry.TriangleMesh, int]:
     """The mesh without pieces below a share of the largest one's area, and how many these were."""
-    from gvtools.o3d import o3d
-
     labels, _, areas = mesh.to_legacy().cluster_connected_triangles()
     small = np.asarray(areas) < least * max(areas)
     if not small.any():
@@ -363,8 +353,6 @@ def simplify(mesh: o3d.t.geometry.TriangleMesh, max_triangles: int) -> o3d.t.geo
 
     VTK, which decimates it, leaves no colours: each vertex takes that of the nearest place before.
     """
-    from gvtools.o3d import o3d
-
     count = len(mesh.triangle.indices)
     if count <= max_triangles:
         return mesh

@@ -9,10 +9,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+import rerun
 from numpy.typing import NDArray
+from PIL import Image
 
 from gvtools.cameras import Cameras
 from gvtools.files import replaced_when_written
@@ -21,9 +22,6 @@ from gvtools.runs.run import load_run
 from gvtools.splats import TERMS
 from pipelines.export.formats import ExportOptions
 from pipelines.export.source import ExportSource
-
-if TYPE_CHECKING:
-    import rerun
 
 # The viewer is slow beyond it.
 MAX_POINTS = 1_000_000
@@ -48,8 +46,6 @@ class RecordedCamera:
 
 def write_rrd(source: ExportSource, path: Path, options: ExportOptions) -> str:
     """Write the recording."""
-    import rerun
-
     memory = source.memory
     points = source.points(options, most=MAX_POINTS)
     reach = float(np.abs(points.positions).max())
@@ -97,8 +93,6 @@ def _log_fit(
     recording: rerun.RecordingStream, source: ExportSource, origin: NDArray[np.float64]
 ) -> None:
     """The fitted Gaussians, where this version of rerun has them."""
-    import rerun
-
     if source.appearance is None or not hasattr(rerun, "GaussianSplats3D"):
         return
     splats = source.splats(ExportOptions(observed=True))
@@ -127,9 +121,6 @@ def _log(
     origin: NDArray[np.float64],
     distance: float,
 ) -> None:
-    import rerun
-    from PIL import Image
-
     camera, picture = shot.camera, shot.picture
     if picture is not None:
         image = Image.fromarray(picture)

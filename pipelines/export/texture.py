@@ -9,16 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
+from gvtools.capture.photographs import sharpness
 from gvtools.errors import OptionError
-
-if TYPE_CHECKING:
-    import open3d as o3d
+from gvtools.o3d import o3d
 
 Float32 = NDArray[np.float32]
 Shot = tuple[Cameras, NDArray[np.uint8]]
@@ -193,11 +192,6 @@ def _add_photographs(
 
     ``sums`` (N, 4) holds the weighted sum of colours and the sum of weights.
     """
-    import cv2
-
-    from gvtools.capture.photographs import sharpness
-    from gvtools.o3d import o3d
-
     rays = o3d.t.geometry.RaycastingScene()
     rays.add_triangles(
         mesh.vertex.positions.to(o3d.core.float32), mesh.triangle.indices.to(o3d.core.uint32)
@@ -239,8 +233,6 @@ def _add_photographs(
 
 def _trust(depth: Float32) -> Float32:
     """(H, W) weights of pixels, 0.05 to 1, by the distance to the border and to depth edges."""
-    import cv2
-
     known = np.where(np.isfinite(depth), depth, 0).astype(np.float32)
     kernel = np.ones((3, 3), np.uint8)
     smooth = cv2.dilate(known, kernel) - cv2.erode(known, kernel) <= 0.05 * known

@@ -17,7 +17,6 @@ from gvtools.errors import GvError, OptionError, ProjectError
 from pipelines.console import Console
 from pipelines.viewing.source import ViewSource
 from viz.viewer.run_view import RunView
-from viz.viewer.window import has_display
 
 POLL_SECONDS = 1.0
 RECORDING = ".rrd"
@@ -143,6 +142,12 @@ def live_viewer(out: Path, console: Console, *options: str) -> Iterator[None]:
 def _relay(lines: IO[str] | None, console: Console) -> None:
     for line in lines or ():
         console.line(line.rstrip("\n"))
+
+
+def has_display() -> bool:
+    """Whether a window can be opened here."""
+    named = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    return os.name != "posix" or bool(named)
 
 
 def open_recording(path: Path, *, host: str, port: int) -> None:

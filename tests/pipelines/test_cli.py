@@ -20,6 +20,7 @@ import gvtools
 from gvtools.errors import GvError
 from pipelines import cli
 from pipelines.cli import COMMANDS, build_parser, main
+from pipelines.commands.weights import WeightsCommand
 
 pytestmark = pytest.mark.usefixtures("unpainted")
 
@@ -35,10 +36,12 @@ def reconstruct(*arguments: object) -> tuple[object, ...]:
     return ("reconstruct", *arguments, "--refine", "0", "--set", "refine.poses=false", *RUN)
 
 
-@pytest.mark.parametrize("command", list(COMMANDS))
+@pytest.mark.parametrize(
+    "command", [*COMMANDS, *(f"weights {action}" for action in WeightsCommand.actions)]
+)
 def test_every_help_starts_with_two_examples(command, capsys):
     with pytest.raises(SystemExit) as stop:
-        main([command, "--help"])
+        main([*command.split(), "--help"])
     assert stop.value.code == 0
     text = capsys.readouterr().out
     assert text.count(f"  gvtools {command}") >= 2

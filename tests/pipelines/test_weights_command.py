@@ -16,13 +16,12 @@ from safetensors.torch import load_file, save_file
 from gvtools.completers.geoverse import from_pretrained
 from gvtools.completers.geoverse.weights import WHOLE_FILE, save_pretrained
 from gvtools.networks.config_json import to_json
-from pipelines.cli import build_parser, main
+from pipelines.cli import main
 from pipelines.published import MODELS, Published, sha256_of
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 PLAIN = micro.config()
-ACTIONS = ("list", "fetch", "check", "create", "pack", "truncate-wan", "empty-prompt")
 
 
 def weights(*arguments: object) -> int:
@@ -298,14 +297,3 @@ def test_the_video_prior_is_cut_and_completed(capsys, tmp_path):
     assert from_pretrained(folder, video=True).video is not None
     shutil.rmtree(video / "vae")
     assert "vae" in refused(capsys, "weights", "check", folder, "--quiet")
-
-
-@pytest.mark.parametrize("action", ACTIONS)
-def test_every_help_of_an_action_starts_with_two_examples(action, capsys):
-    with pytest.raises(SystemExit) as stop:
-        weights(action, "--help")
-    assert stop.value.code == 0
-    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("  gvtools")]
-    assert len(lines) == 2
-    for line in lines:
-        build_parser().parse_args(line.split()[1:])

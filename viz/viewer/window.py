@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from gvtools.errors import OptionError
+from gvtools.o3d import o3d
 from viz.plots.canvas import rgb_of
 from viz.viewer.colors import KINDS, MODES, point_colors
 from viz.viewer.run_view import RunView, detail
 from viz.viewer.standpoint import PageFrame, home
-
-if TYPE_CHECKING:
-    import open3d as o3d
 
 BUDGET = 4_000_000
 WIDTH, HEIGHT = 1280, 800
@@ -44,8 +40,6 @@ class Open3dViewer:
         mode: str = "color",
         say: Callable[[str], None] = print,
     ) -> None:
-        from gvtools.o3d import o3d
-
         self.run = run
         self.round = run.last_round if round is None else round
         self.mode = mode
@@ -59,12 +53,10 @@ class Open3dViewer:
         self._rgb = np.zeros((0, 3))
         self._fill()
         self.window = o3d.visualization.VisualizerWithKeyCallback()
-        if not has_display():
-            raise OptionError("--open3d: no display; expected X or Wayland; use --screenshot FILE")
         if not self.window.create_window(f"gvtools: {run.title}", WIDTH, HEIGHT):
             raise OptionError("--open3d: no window could be opened; use --screenshot FILE")
         self.window.add_geometry(self._cloud)
-        self._pyramids = [self._pyramid(o3d, k) for k in range(len(run.cameras))]
+        self._pyramids = [self._pyramid(k) for k in range(len(run.cameras))]
         self._add_pyramids()
         self._bind()
         self.look_from(0)
@@ -96,8 +88,6 @@ class Open3dViewer:
             view.set_front(turn @ (position - look_at))
             view.set_up(turn @ self.run.up())
             return
-        from gvtools.o3d import o3d
-
         self._camera = number % len(self.run.cameras)
         shown = self.run.cameras[self._camera]
         view = self.window.get_view_control()
@@ -121,8 +111,6 @@ class Open3dViewer:
         self._refresh()
 
     def _fill(self) -> None:
-        from gvtools.o3d import o3d
-
         memory, rows = self.run.memory, self._detail.rows
         if not len(self._rgb):
             colors = point_colors(memory, self.mode, rows=rows, true_depth=self.run.recorded_depth)
@@ -144,7 +132,7 @@ class Open3dViewer:
             if self._with_cameras and number <= self.round:
                 self.window.add_geometry(pyramid, reset_bounding_box=False)
 
-    def _pyramid(self, o3d: Any, index: int) -> tuple[int, o3d.geometry.LineSet]:
+    def _pyramid(self, index: int) -> tuple[int, o3d.geometry.LineSet]:
         shown = self.run.cameras[index]
         local = self.run.memory.frame.seen_from(shown.camera)
         lines = o3d.geometry.LineSet.create_camera_visualization(
@@ -179,9 +167,3 @@ class Open3dViewer:
             f"round {self.round} of {self.run.last_round}: {counts.summary()}; "
             f"{MODES[self.mode]}: {self._legend.text}{scale}"
         )
-
-
-def has_display() -> bool:
-    """Whether a window can be opened here."""
-    named = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-    return os.name != "posix" or bool(named)
