@@ -168,14 +168,14 @@ def test_rendering_goes_back_and_forth_between_rounds_exactly(run, small_run):
     assert (tinted != pictures[2]).any()
 
 
-def room(rng, *, wide=5.0, deep=4.0, high=2.5, noise=0.01):
+def room(rng):
     """Points on the floor, two walls and a table, z up."""
     at = rng.uniform(0, 1, (4, 5000, 3))
-    at[0] *= (wide, deep, 0)
-    at[1] *= (wide, 0, high)
-    at[2] *= (0, deep, high)
+    at[0] *= (5, 4, 0)
+    at[1] *= (5, 0, 2.5)
+    at[2] *= (0, 4, 2.5)
     at[3] = at[3] * (1.5, 1.0, 0) + (2.0, 2.0, 0.7)
-    return at.reshape(-1, 3) + rng.normal(0, noise, (20000, 3))
+    return at.reshape(-1, 3) + rng.normal(0, 0.01, (20000, 3))
 
 
 def degrees(one, other):
