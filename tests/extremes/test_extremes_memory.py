@@ -4,13 +4,13 @@ import dataclasses
 
 import numpy as np
 import pytest
-from extreme_scenes import SIZE, finite, focal
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from memory_scenes import camera, plane_view, points, saved_bytes
+from memory_scenes import SIZE, camera, focal, plane_view, points, saved_bytes
 from reference_splat import reference_project
 
 from gvtools.errors import MemoryFileError
+from gvtools.guidance import Guidance
 from gvtools.memory.ply import export_memory_ply
 from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory
 from gvtools.memory.splat.api import SplatOptions
@@ -24,6 +24,12 @@ BACKENDS = (*BLENDING, "nearest")
 LARGEST = float(np.finfo(np.float32).max)
 MILLION = 1_000_000
 COLOR = (0, 99, 200)
+
+
+def finite(guidance: Guidance) -> bool:
+    """Whether no picture holds NaN or infinity, and colours stay in [0, 1] but for rounding."""
+    values = (guidance.rgb, guidance.depth, guidance.confidence)
+    return all(np.isfinite(v).all() for v in values) and bool((guidance.rgb <= 1 + 1e-6).all())
 
 
 def _wall(confidence, **more) -> SpatialMemory:
