@@ -415,8 +415,6 @@ def split(
     of what it sees lies in that block's cell. ``max_side``: longer side of pictures for that,
     pixels; that of the runs. None: as they are. Returns the blocks in order of their names.
     """
-    if not 0 <= overlap <= 1:
-        raise OptionError(f"overlap {overlap:g}; expected 0 to 1")
     names = tuple(sorted(select(scene.names, context)))
     others = tuple(sorted(set(scene.names) - set(names)))
     # Views belong to cells by their given poses, even if refinement moves them across a face.

@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from pydantic import Field
+
 from gvtools.errors import OptionError
 from pipelines.commands.arguments import SceneArguments
 from pipelines.options import Arguments
@@ -28,7 +30,7 @@ class SplitCommand(SceneArguments):
     """For the blocks. [FOLDER]"""
     blocks: str = "auto"
     """How many (auto: 150 views a block). [N|auto]"""
-    overlap: float = 0.8
+    overlap: float = Field(0.8, ge=0, le=1)
     """0 to 1: a view joins every block whose part of space holds at least 1 - X of what it sees.
     [X]"""
     context: str = "all"
