@@ -54,14 +54,6 @@ class Features:
     width: int
     height: int
 
-    def __post_init__(self) -> None:
-        count = len(self.xy)
-        if self.xy.shape != (count, 2) or len(self.descriptors) != count:
-            raise ShapeError(
-                f"features: xy {self.xy.shape} and descriptors {self.descriptors.shape}; "
-                "expected (N, 2) and (N, D)"
-            )
-
     def __len__(self) -> int:
         return len(self.xy)
 

@@ -60,7 +60,9 @@ def replaced_when_written(path: Path, *, suffix: str = "", flush: bool = True) -
             "was there before is intact"
         ) from error
     finally:
-        _discard(temporary)
+        # Where even this fails, the first error is the one to tell.
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
         if stream:
             shutil.rmtree(folder, ignore_errors=True)
 
@@ -87,7 +89,7 @@ def flush_file(path: Path) -> None:
 
 @contextmanager
 def folder_replaced_when_written(path: Path) -> Iterator[Path]:
-    """Gives an empty folder of the same name; on success it takes the place of ``path``.
+    """Gives an empty folder of the same name; on success it takes the place of ``path``, if any.
 
     What only the earlier folder holds moves over into the new one. A kill leaves one of both
     complete; ``recover_folder`` finds it.
@@ -97,7 +99,8 @@ def folder_replaced_when_written(path: Path) -> Iterator[Path]:
         _settle(path)
         new.mkdir(parents=True)
         yield new
-        os.rename(path, old)
+        if path.exists():
+            os.rename(path, old)
         os.rename(new, path)
     except (OSError, ProjectError) as error:
         cause = error.__cause__ if isinstance(error, ProjectError) else error
@@ -148,12 +151,6 @@ def _settle(path: Path) -> None:
         for name in only_in(old, path):
             os.rename(old / name, path / name)
     shutil.rmtree(_work(path), ignore_errors=True)
-
-
-def _discard(path: Path) -> None:
-    # Where even this fails, the first error is the one to tell.
-    with suppress(OSError):
-        path.unlink(missing_ok=True)
 
 
 def link_or_copy(source: Path, target: Path) -> None:

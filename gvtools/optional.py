@@ -10,14 +10,8 @@ from typing import Any
 from gvtools.errors import GvError, OptionError
 
 
-def require(
-    module: str, *, extra: str, purpose: str, instead: str = "", error: type[GvError] = OptionError
-) -> Any:
-    """A module of an optional package.
-
-    Args:
-        purpose: what it is needed for, for the message.
-        error: raised where it is absent.
+def require(module: str, *, extra: str, purpose: str, instead: str = "") -> Any:
+    """A module of an optional package; ``purpose``: what it is needed for, for the message.
 
     >>> require("lasso", extra="scan", purpose="reading knots", instead="or untie them")
     Traceback (most recent call last):
@@ -32,7 +26,7 @@ def require(
         why = "is not installed" if absent else f"cannot be imported ({found})"
     except AttributeError as found:  # of packages whose parts do not fit each other
         why = f"cannot be imported ({found})"
-    raise error(_advice(module, why, extra=extra, purpose=purpose, instead=instead))
+    raise OptionError(_advice(module, why, extra=extra, purpose=purpose, instead=instead))
 
 
 def package_folder(

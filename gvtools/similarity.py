@@ -18,6 +18,8 @@ COLLINEAR = 1e-3
 COINCIDENT = 1e-13
 # Squares below this share of the spread's are sums of cancelling terms.
 ROUNDING = 1e-12
+# Fewer inliers of a depth scale are refused, as a share.
+MIN_INLIER_SHARE = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,9 +35,9 @@ class SimilarityFit:
     rotation: Float64  # (3, 3) float64, determinant 1
     translation: Float64  # (3,) float64, target units
     residuals: Float64  # (N,) float64, distances after alignment, target units
-    rmse: float  # weighted root mean square of the residuals, target units
-    source_center: Float64  # (3,) float64, weighted centroid of the source
-    target_center: Float64  # (3,) float64, weighted centroid of the target
+    rmse: float  # root mean square of the residuals, target units
+    source_center: Float64  # (3,) float64, centroid of the source
+    target_center: Float64  # (3,) float64, centroid of the target
     # whether a reflection would leave less than half of the rmse: no rotation makes one
     # handedness of the other
     mirrored: bool = False
@@ -52,53 +54,48 @@ class SimilarityFit:
 
 
 def fit_similarity(
-    source: ArrayLike,
-    target: ArrayLike,
-    *,
-    with_scale: bool = True,
-    weights: ArrayLike | None = None,
+    source: ArrayLike, target: ArrayLike, *, with_scale: bool = True
 ) -> SimilarityFit:
     """The least-squares similarity between paired points, in closed form.
 
     Follows S. Umeyama, "Least-squares estimation of transformation parameters between two point
-    patterns", PAMI 13(4), 1991; equation numbers are its own. Without weights the solution is
-    pycolmap's, about the centroids, wherever it gives one; whether the points determine a solution
-    is found out here. Camera centres on a line (a straight dolly) leave the rotation about that
-    line open and are reported as degenerate; so are mirror images that several rotations fit alike.
-    The unit of the coordinates changes no digit.
+    patterns", PAMI 13(4), 1991; equation numbers are its own. Camera centres on a line (a straight
+    dolly) leave the rotation about that line open and are reported as degenerate; so are mirror
+    images that several rotations fit alike. The unit of the coordinates changes no digit.
 
     Args:
         source: (N, 3).
         target: (N, 3), row by row the same points.
         with_scale: False fits a rigid motion.
-        weights: (N,) >= 0; rows of weight 0 count for nothing.
     """
-    source, target, weight = _check(source, target, weights)
-    row = weight > 0
-    if row.sum() < 3:
-        return _degenerate(len(source), f"{row.sum()} point pair(s), at least 3 are needed")
-    weight = weight[row] / weight.sum()
-    x, x_unit, source_center, x_defect = _center(source, row, weight)  # (34)
-    y, y_unit, target_center, y_defect = _center(target, row, weight)  # (35)
+    source, target = np.asarray(source, np.float64), np.asarray(target, np.float64)
+    paired = source.ndim == 2 and source.shape[1:] == (3,) and source.shape == target.shape
+    if not paired or not (np.isfinite(source) & np.isfinite(target)).all():
+        raise ShapeError(
+            f"similarity: source {source.shape} and target {target.shape}; expected both (N, 3), "
+            "without NaN or infinity"
+        )
+    count = len(source)
+    if count < 3:
+        return _degenerate(count, f"{count} point pair(s), at least 3 are needed")
+    x, x_unit, source_center, x_defect = _center(source)  # (34)
+    y, y_unit, target_center, y_defect = _center(target)  # (35)
     if x_defect or y_defect:
         defect = f"{x_defect} source" if x_defect else f"{y_defect} target"
-        return _degenerate(len(source), f"{defect} points")
-    variance, size = (float(weight @ (part[row] ** 2).sum(axis=1)) for part in (x, y))  # (36)
-    covariance = (y[row] * weight[:, None]).T @ x[row]  # (38)
+        return _degenerate(count, f"{defect} points")
+    variance, size = (float((part**2).sum() / count) for part in (x, y))  # (36)
+    covariance = y.T @ x / count  # (38)
     u, d, vt = np.linalg.svd(covariance)
     if d[1] < COLLINEAR**2 * d[0] or d[0] <= ROUNDING * np.sqrt(variance * size):
-        return _degenerate(len(source), "source and target do not correspond in two directions")
+        return _degenerate(count, "source and target do not correspond in two directions")
     sign = np.array([1, 1, np.sign(np.linalg.det(u) * np.linalg.det(vt)) or 1.0])  # (39), (43)
     if d[1] + sign[2] * d[2] < COLLINEAR**2 * d[0]:
-        return _degenerate(len(source), "a mirror image, which several rotations fit alike")
+        return _degenerate(count, "a mirror image, which several rotations fit alike")
     rotation = (u * sign) @ vt  # (40)
     kept = x_unit / y_unit
     scale = float((d * sign).sum() / variance) if with_scale else kept  # (42)
-    if weights is None:
-        rotation, free = _by_pycolmap(x, y, with_scale=with_scale) or (rotation, scale)
-        scale = free if with_scale else kept
     residuals = np.linalg.norm(y - scale * x @ rotation.T, axis=1)
-    square = float(weight @ residuals[row] ** 2)
+    square = float(np.mean(residuals**2))
     best = d.sum() / variance if with_scale else kept
     other = size - 2 * best * d.sum() + best**2 * variance  # (33), of the reflection
     mirrored = bool(sign[2] < 0 and other < square / 4 and square > ROUNDING * size)
@@ -131,75 +128,33 @@ def fit_line(source: ArrayLike, target: ArrayLike, *, with_scale: bool) -> Simil
     )  # fmt: skip
 
 
-def _check(
-    source: ArrayLike, target: ArrayLike, weights: ArrayLike | None
-) -> tuple[Float64, Float64, Float64]:
-    """Points and weights as float64; raises as ``fit_similarity`` says."""
-    source, target = np.asarray(source, np.float64), np.asarray(target, np.float64)
-    if source.ndim != 2 or source.shape[1:] != (3,) or source.shape != target.shape:
-        raise ShapeError(
-            f"similarity: source {source.shape} and target {target.shape}; expected both (N, 3)"
-        )
-    weight = np.ones(len(source)) if weights is None else np.asarray(weights, np.float64)
-    if weight.shape != (len(source),) or not (np.isfinite(weight) & (weight >= 0)).all():
-        raise ShapeError(f"similarity: weights {weight.shape}; expected ({len(source)},), >= 0")
-    if not (np.isfinite(source).all() and np.isfinite(target).all()):
-        raise ShapeError("similarity: points hold NaN or infinity; leave those rows out")
-    return source, target, weight
-
-
-def _center(
-    points: Float64, row: NDArray[np.bool_], weight: Float64
-) -> tuple[Float64, float, Float64, str]:
+def _center(points: Float64) -> tuple[Float64, float, Float64, str]:
     """Points about their centroid, in a power of two near their extent.
 
     Returns:
         The points (N, 3), the unit, the centroid in the points' own unit, and what is wrong with
-        the spread of those in ``row``, see ``_spread_defect``.
+        their spread, see ``_spread_defect``.
     """
     # About the first point, so that large offsets keep their digits.
-    center = points[row][0] + weight @ (points[row] - points[row][0])
+    center = points[0] + (points - points[0]).mean(axis=0)
     moved = points - center
-    unit = 2.0 ** int(np.frexp(np.abs(moved[row]).max())[1])
-    magnitude = float(np.abs(points[row]).max()) / unit
-    return moved / unit, unit, center, _spread_defect(moved[row] / unit, weight, magnitude)
+    unit = 2.0 ** int(np.frexp(np.abs(moved).max())[1])
+    magnitude = float(np.abs(points).max()) / unit
+    return moved / unit, unit, center, _spread_defect(moved / unit, magnitude)
 
 
-def _by_pycolmap(
-    source: Float64, target: Float64, *, with_scale: bool
-) -> tuple[Float64, float] | None:
-    """Rotation and scale between centred points; None where pycolmap refuses.
-
-    It refuses some sets that determine the motion, such as many of three points.
-    """
-    from gvtools.colmap import pycolmap
-
-    solve = pycolmap.estimate_sim3d if with_scale else pycolmap.estimate_rigid3d
-    fit = solve(source, target)
-    if fit is None:
-        return None
-    return np.asarray(fit.rotation.matrix()), float(getattr(fit, "scale", 1.0))
-
-
-def _spread_defect(centered: Float64, weight: Float64, magnitude: float) -> str:
+def _spread_defect(centered: Float64, magnitude: float) -> str:
     """Why points do not determine a rotation: "coincident", "collinear", or ""."""
-    spread = np.linalg.svd(centered * np.sqrt(weight)[:, None], compute_uv=False)
+    spread = np.linalg.svd(centered / np.sqrt(len(centered)), compute_uv=False)
     if spread[0] <= COINCIDENT * magnitude:
         return "coincident"
     return "collinear" if spread[1] < COLLINEAR * spread[0] else ""
 
 
 def _degenerate(count: int, reason: str) -> SimilarityFit:
-    nan3 = np.full(3, np.nan)
+    nan = np.full((3, 3), np.nan)
     return SimilarityFit(
-        f"degenerate: {reason}",
-        np.nan,
-        np.full((3, 3), np.nan),
-        nan3,
-        np.full(count, np.nan),
-        np.nan,
-        nan3,
-        nan3,
+        f"degenerate: {reason}", np.nan, nan, nan[0], np.full(count, np.nan), np.nan, nan[0], nan[0]
     )
 
 
@@ -251,7 +206,6 @@ def align_depth_scale(
     valid: ArrayLike,
     confidence: ArrayLike | None = None,
     min_support: int = 200,
-    min_inlier_share: float = 0.3,
     max_residual: float = 0.1,
     inlier_band: float = 0.05,
 ) -> ScaleFit:
@@ -267,8 +221,7 @@ def align_depth_scale(
         valid: the same shape, bool, the pixels to compare.
         confidence: the same shape, >= 0, weights; None means equal.
         min_support: fewer common pixels are refused.
-        min_inlier_share: so is a smaller share of inliers,
-        max_residual: and a larger median relative deviation.
+        max_residual: so is a larger median relative deviation.
         inlier_band: largest relative deviation of an inlier.
     """
     ratio, weight = _log_ratios(depth, reference_depth, valid, confidence=confidence)
@@ -287,9 +240,9 @@ def align_depth_scale(
     share = float(weight[inlier].sum())
     residual = 0.0 if equal else _weighted_median(deviation, weight)
     reason = ""
-    if share < min_inlier_share:
+    if share < MIN_INLIER_SHARE:
         reason = f"{share:.0%} of the pixels agree within {inlier_band:.0%}, " + (
-            f"at least {min_inlier_share:.0%} are needed"
+            f"at least {MIN_INLIER_SHARE:.0%} are needed"
         )
     elif residual > max_residual:
         reason = f"median deviation {residual:.1%}, at most {max_residual:.1%} is accepted"

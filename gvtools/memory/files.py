@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import io
 import json
-import os
-import shutil
 import zipfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -16,11 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras, check_usable
-from gvtools.errors import GvError, MemoryFileError, ProjectError
+from gvtools.errors import GvError, MemoryFileError
 from gvtools.files import (
     ZIP_EPOCH,
     flush_file,
     folder_replaced_when_written,
+    link_or_copy,
     recover_folder,
     replaced_when_written,
 )
@@ -41,7 +39,6 @@ S = TypeVar("S", bound=Store)
 
 FORMAT = "gvtools memory"
 VERSION = 4
-AGAIN = "run the reconstruction again"
 CONVENTION = "OpenCV axes (x right, y down, z forward); first pixel's centre at (0.5, 0.5)"
 
 
@@ -175,12 +172,7 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
             header = parse_json(archive.read("header.json"))
             if not isinstance(header, dict) or header.get("format") != FORMAT:
                 raise MemoryFileError(f"{path}: not a gvtools memory")
-            version = header.get("version")
-            if version != VERSION:
-                raise MemoryFileError(
-                    f"{path}: memory format version {version}; this gvtools reads version "
-                    f"{VERSION}; {other_version(version, VERSION, AGAIN)}"
-                )
+            _check_version(path, header.get("version"))
             arrays = {}
             for name, (dtype, shape) in header["arrays"].items():
                 data = archive.read(f"{name}.npy")
@@ -198,23 +190,29 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     return header, arrays
 
 
+def _check_version(path: Path, version: Any) -> None:
+    if version != VERSION:
+        raise MemoryFileError(
+            f"{path}: memory format version {version}; this gvtools reads version {VERSION}; "
+            f"{other_version(version, VERSION, 'run the reconstruction again')}"
+        )
+
+
 def _check_views(arrays: dict[str, NDArray[Any]], views: int) -> None:
     shapes = {
         "view_K": (views, 3, 3), "view_cam_from_world": (views, 4, 4), "view_size": (views, 2),
         "view_round": (views,), "view_generated": (views,), "view_scanned": (views,),
         "grid_shape": (views, 2),
     }  # fmt: skip
+    if "view_scanned" not in arrays:
+        del shapes["view_scanned"]
     for name, shape in shapes.items():
-        if name in arrays or name != "view_scanned":
-            if arrays[name].shape != shape:
-                raise ValueError(f"{name} has shape {arrays[name].shape}, not {shape}")
-            if not np.isfinite(arrays[name]).all():
-                raise ValueError(f"{name} holds numbers that are not finite")
+        if arrays[name].shape != shape or not np.isfinite(arrays[name]).all():
+            raise ValueError(f"{name} of shape {arrays[name].shape}; expected {shape}, finite")
     # Depth of free space may be infinite.
-    if np.isnan(arrays["grid_depth"]).any():
-        raise ValueError("grid_depth holds numbers that are not finite")
-    if int(arrays["grid_shape"].prod(axis=1).sum()) != len(arrays["grid_depth"]):
-        raise ValueError("the free-space grids do not fill their array")
+    grids = arrays["grid_depth"]
+    if np.isnan(grids).any() or int(arrays["grid_shape"].prod(axis=1).sum()) != len(grids):
+        raise ValueError("the free-space grids do not fill their array, or are not finite")
 
 
 INDEX, SUFFIX = "memory.index", ".tiles"
@@ -228,14 +226,14 @@ def tile_folder(path: Path) -> Path:
 def save_tiles(memory: Store, folder: Path) -> Path:
     """Write a memory in tiles."""
     tiles = memory.tiles
-    with tiles.lock, _replace_folder(folder) as new:
+    with tiles.lock, folder_replaced_when_written(folder) as new:
         table = []
         for number, tile in tiles:
             if tile.file is None or tile.dirty:
                 tiles.write(number)
             assert tile.file is not None
             flush_file(tile.file)
-            link(tile.file, new / tile.file.name)
+            link_or_copy(tile.file, new / tile.file.name)
             checksum = ArrayFile(tile.file).checksum
             table.append(
                 [list(tile.node), tile.file.name, checksum, tile.size, tile.count, tile.voxels,
@@ -278,11 +276,7 @@ def load_tiles(
     recover_folder(folder)
     index = ArrayFile(folder / INDEX)
     meta = index.meta
-    if meta.get("version") != VERSION:
-        raise MemoryFileError(
-            f"{folder}: memory format version {meta.get('version')}; this gvtools reads version "
-            f"{VERSION}; {other_version(meta.get('version'), VERSION, AGAIN)}"
-        )
+    _check_version(folder, meta.get("version"))
     try:
         memory = create_empty(
             meta, kind, budget=meta["budget"] if budget is None else budget, scratch=scratch
@@ -329,7 +323,7 @@ def _add_tiles(
             )
         if scratch is not None:
             path = tiles.folder / path.name
-            link(file.path, path)
+            link_or_copy(file.path, path)
         rows = order[ends[i] : ends[i + 1]].astype(np.int32)
         segments = read_segments(file, len(memory.views))
         fits = len(rows) == segments.count and file.meta.get("count") == count
@@ -348,40 +342,6 @@ def _add_tiles(
 
 def copy_tiles(source: Path, target: Path) -> None:
     """Make the tiles in a folder those of another, too, by links where there are any."""
-    with _replace_folder(target) as new:
+    with folder_replaced_when_written(target) as new:
         for path in sorted(source.iterdir()):
-            link(path, new / path.name)
-
-
-def link(source: Path, target: Path) -> None:
-    """Give a file a second name, or a copy where the file system has no links."""
-    if target.exists() and target.samefile(source):
-        return
-    try:
-        os.link(source, target)
-    except OSError:
-        shutil.copyfile(source, target)
-
-
-@contextmanager
-def _replace_folder(folder: Path) -> Iterator[Path]:
-    """An empty folder that takes the place of ``folder``, which may be absent."""
-    recover_folder(folder)
-    if folder.exists():
-        with folder_replaced_when_written(folder) as new:
-            yield new
-        return
-    part = folder.with_name(f".{folder.name}.part")
-    try:
-        shutil.rmtree(part, ignore_errors=True)
-        part.mkdir(parents=True)
-        yield part
-        os.rename(part, folder)
-    except OSError as error:
-        raise ProjectError(
-            f"{folder}: cannot be written ({error.strerror or error}); free some space or choose "
-            "another folder"
-        ) from error
-    finally:
-        with suppress(OSError):
-            shutil.rmtree(part)
+            link_or_copy(path, new / path.name)

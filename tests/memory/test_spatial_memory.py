@@ -234,12 +234,9 @@ def test_a_turned_memory_is_saved_exported_and_undone(tmp_path):
     assert not loaded.generated.any() and 0 < len(loaded) < len(memory)
 
 
-@pytest.mark.parametrize(
-    ("axes", "said"),
-    [(np.eye(2), "rotation"), (2 * np.eye(3), "rotation"), (np.diag([1, 1, -1.0]), "mirror")],
-)
-def test_axes_that_are_no_rotation_are_refused(axes, said):
-    with pytest.raises(ShapeError, match=said):
+@pytest.mark.parametrize("axes", [np.eye(2), 2 * np.eye(3), np.diag([1, 1, -1.0])])
+def test_axes_that_are_no_rotation_are_refused(axes):
+    with pytest.raises(ShapeError, match="rotation"):
         SpatialMemory(0.1, axes=axes)
 
 

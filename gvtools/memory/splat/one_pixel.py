@@ -159,11 +159,7 @@ def project_nearest(
 
 
 def project_open3d(
-    positions: NDArray[np.float32],
-    colors: NDArray[np.float32],
-    camera: Cameras,
-    *,
-    depth_max: float = FARTHEST,
+    positions: NDArray[np.float32], colors: NDArray[np.float32], camera: Cameras
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """(depth, rgb) of the same through Open3D's ``project_to_rgbd_image``.
 
@@ -184,7 +180,7 @@ def project_open3d(
     K[:2, 2] -= 0.5
     pose = camera.cam_from_world[0].copy()
     image = cloud.project_to_rgbd_image(
-        int(camera.width[0]), int(camera.height[0]), tensor(K), tensor(pose), 1.0, depth_max
+        int(camera.width[0]), int(camera.height[0]), tensor(K), tensor(pose), 1.0, FARTHEST
     )
     depth = image.depth.as_tensor().numpy()[..., 0].copy()
     return depth, image.color.as_tensor().numpy().copy()

@@ -93,14 +93,6 @@ class ArrayFile:
         """The arrays."""
         return tuple(self._table)
 
-    def shape(self, name: str) -> tuple[int, ...]:
-        """Of an array, as the header has it; () where there is none of that name."""
-        return tuple(self._table[name][1]) if name in self._table else ()
-
-    def kind(self, name: str) -> np.dtype[Any] | None:
-        """Type of an array's numbers; None where there is none of that name."""
-        return np.dtype(self._table[name][0]) if name in self._table else None
-
     def array(self, name: str) -> NDArray[Any]:
         """An array in the file's own pages."""
         if name not in self._table:

@@ -35,10 +35,9 @@ class LocalFrame:
         if point.shape != (3,) or not np.isfinite(point).all():
             raise ShapeError(f"memory origin {point.tolist()}; expected three finite numbers")
         turn = np.eye(3) if axes is None else np.array(axes, np.float64)
-        if turn.shape != (3, 3) or not np.allclose(turn.T @ turn, np.eye(3), atol=ORTHONORMAL):
+        square = turn.shape == (3, 3) and np.allclose(turn.T @ turn, np.eye(3), atol=ORTHONORMAL)
+        if not square or np.linalg.det(turn) < 0:
             raise ShapeError(f"memory axes {turn.tolist()}; expected a (3, 3) rotation")
-        if np.linalg.det(turn) < 0:
-            raise ShapeError(f"memory axes {turn.tolist()} mirror; expected a (3, 3) rotation")
         return cls(point, turn)
 
     @classmethod

@@ -176,7 +176,7 @@ class Tile:
         """All observations, as splatting reads them."""
         if self.store is not None:
             return self.store.columns.splat
-        return _splat_columns(self._open())
+        return _splat_columns(self._open(), rows=self.count)
 
     def thinned(self, doublings: int) -> ThinnedCopy:
         """The thinned copy whose cubes are 2**doublings voxels wide."""
@@ -184,8 +184,7 @@ class Tile:
             file, head = self._open(), f"thinned{doublings}_"
             start = file.array(f"{head}start")
             rows = _splat_columns(file, head, rows=len(file.array(f"{head}spacing")))
-            ends = len(start) == len(self.segments) + 1 and start[-1] == len(rows.spacing)
-            if not ends or start[0] != 0 or not (np.diff(start) >= 0).all():
+            if len(start) != len(self.segments) + 1 or not _covers(start, len(rows.spacing)):
                 raise _misfit(file, f"{head}start")
             return ThinnedCopy(start, rows)
         if doublings not in self._copies:
@@ -196,11 +195,7 @@ class Tile:
         """A column of all observations."""
         if self.store is not None:
             return np.asarray(getattr(self.store.columns, name))
-        file = self._open()
-        column = file.array(name)
-        if column.dtype.kind == "f" and not np.isfinite(column).all():
-            raise _misfit(file, name)
-        return column
+        return _column(self._open(), name, self.count)
 
     def agreements(self) -> list[tuple[int, AgreementEntry]]:
         """(round, (rows, confidence added, confidence before)) of each view that agreed here."""
@@ -245,13 +240,7 @@ class Tile:
     def _open(self) -> ArrayFile:
         assert self.file is not None
         if self.mapped is None:
-            self.mapped = file = ArrayFile(self.file)
-            count = file.meta.get("count")
-            for name in COLUMNS:
-                kind, width = LAYOUT[name]
-                shape = (count, width) if width > 1 else (count,)
-                if file.shape(name) != shape or file.kind(name) != np.dtype(kind):
-                    raise _misfit(file, name)
+            self.mapped = ArrayFile(self.file)
         return self.mapped
 
 
@@ -327,8 +316,8 @@ def check_observations(arrays: Mapping[str, NDArray[Any]], views: int) -> None:
     _check_segments(arrays, views, count)
     start = arrays["agreement_start"]
     _require(_within(row, count), "an agreement names an observation that is not there")
-    cover = len(start) == len(arrays["agreement_round"]) + 1 and (np.diff(start) >= 0).all()
-    _require(cover and start[0] == 0 and start[-1] == len(row), "agreements do not fill their log")
+    log = len(start) == len(arrays["agreement_round"]) + 1 and _covers(start, len(row))
+    _require(log, "agreements do not fill their log")
     for name, array in arrays.items():
         if name in ("agreement_weight", "agreement_before"):
             _require(array.shape == row.shape, f"{name} has shape {array.shape}, not {row.shape}")
@@ -352,6 +341,11 @@ def _within(numbers: NDArray[Any], end: int) -> bool:
     return not len(numbers) or bool(0 <= numbers.min() <= numbers.max() < end)
 
 
+def _covers(start: NDArray[Any], count: int) -> bool:
+    """Whether parts that begin at ``start`` follow each other from 0 to ``count``."""
+    return bool(start[0] == 0 and start[-1] == count and (np.diff(start) >= 0).all())
+
+
 def _require(fits: Any, fault: str) -> None:
     if not fits:
         raise ValueError(fault)
@@ -363,13 +357,14 @@ def _misfit(file: ArrayFile, fault: Exception | str) -> MemoryFileError:
     )
 
 
-def _splat_columns(file: ArrayFile, head: str = "", *, rows: int | None = None) -> SplatColumns:
-    """The columns of a file that splatting reads; ``rows`` that each must have."""
-    columns = SplatColumns(*(file.array(f"{head}{name}") for name in SplatColumns._fields))
-    for name, column in columns._asdict().items():
-        kind, width = LAYOUT[name]
-        count = len(column) if rows is None else rows
-        fits = column.shape == ((count, width) if width > 1 else (count,)) and column.dtype == kind
-        if not fits or (column.dtype.kind == "f" and not np.isfinite(column).all()):
-            raise _misfit(file, f"{head}{name}")
-    return columns
+def _splat_columns(file: ArrayFile, head: str = "", *, rows: int) -> SplatColumns:
+    return SplatColumns(*(_column(file, name, rows, head) for name in SplatColumns._fields))
+
+
+def _column(file: ArrayFile, name: str, rows: int, head: str = "") -> NDArray[Any]:
+    """A column of so many observations, or of their thinned copy."""
+    column, (kind, width) = file.array(f"{head}{name}"), LAYOUT[name]
+    fits = column.shape == ((rows, width) if width > 1 else (rows,)) and column.dtype == kind
+    if not fits or (column.dtype.kind == "f" and not np.isfinite(column).all()):
+        raise _misfit(file, f"{head}{name}")
+    return column

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras, concatenate
-from gvtools.errors import ShapeError
 from gvtools.memory.store.local_frame import LocalFrame
 
 # K (3, 3), cam_from_world (4, 4) and free-space grid (h, w) of one view (see PointSet).
@@ -33,17 +32,6 @@ class PointSet:
     free_depth: NDArray[np.float32] | None
     # How many pixels gave no point, by reason.
     dropped: dict[str, int]
-
-    def __post_init__(self) -> None:
-        count = len(self.positions)
-        for name, array, shape in (
-            ("positions", self.positions, (count, 3)),
-            ("colors", self.colors, (count, 3)),
-            ("confidence", self.confidence, (count,)),
-            ("spacing", self.spacing, (count,)),
-        ):
-            if array.shape != shape:
-                raise ShapeError(f"points: {name} has shape {array.shape}; expected {shape}")
 
     def __len__(self) -> int:
         return len(self.positions)
