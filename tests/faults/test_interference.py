@@ -117,22 +117,3 @@ def test_a_colmap_export_that_stops_at_any_rename_can_be_made_again(
     assert not (model / CAMERAS).exists() or moment == 1
     assert main(words) == 0
     assert {path.name: path.read_bytes() for path in model.iterdir()} == whole
-
-
-def test_a_colmap_export_that_was_killed_before_its_first_file_can_be_made_again(run, tmp_path):
-    model = tmp_path / "project" / "sparse" / "0"
-    model.mkdir(parents=True)
-    (model / ".generated.txt.part").write_text("# hal")
-    words = ["export", str(run), "--format", "colmap", "--out", str(tmp_path / "project")]
-    assert main([*words, "--quiet"]) == 0
-    assert not list(model.glob(".*"))
-
-
-def test_a_model_of_ones_own_is_never_taken_for_an_export(run, tmp_path, capsys):
-    model = tmp_path / "project" / "sparse" / "0"
-    model.mkdir(parents=True)
-    (model / "points3D.bin").write_bytes(b"mine")
-    words = ["export", str(run), "--format", "colmap", "--out", str(tmp_path / "project")]
-    assert main([*words, "--quiet"]) == 2
-    assert "was not written by gvtools export" in capsys.readouterr().err
-    assert [path.name for path in model.iterdir()] == ["points3D.bin"]

@@ -171,15 +171,6 @@ def test_pictures_across_faces_come_nearer_to_the_photographs(fitted, joined):
         assert (old == new).all() == (name not in fitted_to)
 
 
-def test_the_blocks_exposures_stand_in_the_order_of_the_context(fitted: Path) -> None:
-    exposures = Fitted.load(fitted / "merged" / SAVED).appearance
-    assert exposures.exposures is not None
-    frame = exposures.gaussians.frame
-    cameras = open_project(fitted / "scan").subset(load_run(fitted / "merged").context).cameras
-    given = frame.cam_from_local(cameras.cam_from_world)
-    assert np.allclose(exposures.exposures.poses, given, atol=1e-9)
-
-
 def test_a_resumed_merge_has_the_same_bytes_and_fits_no_second_time(fitted, tmp_path, monkeypatch):
     runs, out = sorted((fitted / "runs").iterdir()), tmp_path / "merged"
 

@@ -14,7 +14,6 @@ from tiny_scan import ExactDepth, render, world_from_cam, write_colmap_scan, wri
 from gvtools.depth import choice
 from gvtools.depth.source import DepthMap
 from gvtools.errors import DegenerateError
-from gvtools.runs.context_depth import off_scale
 from gvtools.scenes.scene import Frame, Scene, View
 from pipelines.cli import main
 
@@ -164,12 +163,3 @@ def test_views_off_the_sparse_points_scale_are_reported_and_named(tmp_path, monk
     # A run that is taken up again says it as well.
     assert main([*words, "--quiet", "--resume"]) == 0
     assert "view_1.png, view_4.png;" in capsys.readouterr().err
-
-
-def test_a_long_list_of_views_is_cut():
-    reports = [{"view": f"v{i}", "scale": {"disagrees": True}} for i in range(12)]
-    told = off_scale([*reports, {"view": "good", "scale": None}])
-    assert told is not None
-    assert told.endswith("v9 and 2 more")
-    assert "12 of 13" in told
-    assert off_scale([{"view": "good", "scale": None}]) is None

@@ -5,7 +5,6 @@ The pictures are of the tiny scan and the depth comes from the plane sweep itsel
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -101,25 +100,6 @@ def test_another_run_computes_its_own(scan, tmp_path, monkeypatch, asked, other)
     alone = tmp_path / "alone"
     assert reconstruct(scan, alone, *other) == 0
     assert results(out) == results(alone)
-
-
-@pytest.mark.slow
-def test_changed_pictures_and_versions_compute_anew(scan, tmp_path, monkeypatch, asked):
-    mine, out = write_scan(tmp_path / "scan", views=2 * VIEWS), tmp_path / "run"
-    interrupted(mine, out)
-    asked.clear()
-    picture = mine / "frame-000002.color.png"
-    picture.write_bytes(picture.read_bytes())
-    with monkeypatch.context() as patch:
-        stop_before(patch, 6, KeyboardInterrupt())
-        assert reconstruct(mine, out) == 1
-    assert len(asked) == 3
-    asked.clear()
-    record = json.loads((out / "run.json").read_text())
-    record["versions"]["numba"] = "0.1"
-    (out / "run.json").write_text(json.dumps(record))
-    assert reconstruct(mine, out) == 0
-    assert len(asked) == VIEWS
 
 
 def test_a_damaged_file_of_an_unfinished_round_is_computed_anew(

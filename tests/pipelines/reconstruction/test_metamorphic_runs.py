@@ -124,40 +124,6 @@ def test_a_moved_world_gives_the_same_memory_moved_and_the_same_pictures(
         np.testing.assert_allclose(there, wanted, atol=0.05 * edge)
 
 
-@pytest.fixture(scope="module")
-def busy(tmp_path_factory) -> Scene:
-    """The scan with colours of a pixel's size, and more views, so that its edge is measured.
-
-    Its wall must not lie on the borders of voxels, where rounding decides.
-    """
-    scene = open_project(write_scan(tmp_path_factory.mktemp("busy"), views=12))
-
-    def painted(row: int, view: View) -> View:
-        noise = np.random.default_rng(row).integers(-40, 40, view.load().rgb.shape)
-
-        def load() -> Frame:
-            frame = view.load()
-            return replace(frame, rgb=np.clip(frame.rgb + noise, 0, 255).astype(np.uint8))
-
-        return replace(view, load=load)
-
-    return replace(scene, views=tuple(painted(i, view) for i, view in enumerate(scene.views)))
-
-
-def test_so_does_one_whose_edge_is_measured_and_whose_pixels_are_joined(busy, tmp_path):
-    more = "fusion.voxel_scale=1.07"
-    world = World(scale=41.0, rotation=(-0.7, 0.2, 2.0))
-    names = busy.names
-    context = f"context={','.join([*names[::2], names[1]])}"
-    targets = [names[3], names[5], names[7], names[9]]
-    still = run(busy, tmp_path / "still", context, more, targets=targets)
-    moved = replace(busy, views=tuple(world.view(view) for view in busy.views))
-    found = run(moved, tmp_path / "moved", context, more, targets=targets)
-    assert found.memory.voxel == pytest.approx(world.scale * still.memory.voxel, rel=1e-6)
-    assert worst(still, found) >= SAME
-    assert len(found.memory) == pytest.approx(len(still.memory), rel=1e-3)
-
-
 def test_views_listed_in_another_order_give_the_same_run(scene, plain, tmp_path):
     order = np.random.default_rng(0).permutation(len(scene.views))
     listed = replace(scene, views=tuple(scene.views[i] for i in order))

@@ -2,16 +2,30 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+from types import SimpleNamespace
+from typing import cast
+
 import numpy as np
 import pytest
+from memory_scenes import camera as view_from
+from memory_scenes import random_memory
 
 from gvtools.cameras import Cameras
+from gvtools.cameras import concatenate as all_of
 from gvtools.completers.base import Completer, Completion, ScaleAlignment, ScaleStatus
 from gvtools.errors import ShapeError
 from gvtools.guidance import Guidance, concatenate
+from gvtools.kernels import parallel_kernels_may_overlap
 from gvtools.memory.spatial_memory import FuseReport, SpatialMemory
 from gvtools.settings import with_texts
-from pipelines.reconstruction.rounds import CachedProjection, Clock, complete_targets
+from pipelines.reconstruction.plan import Plan
+from pipelines.reconstruction.rounds import (
+    CachedProjection,
+    Clock,
+    RoundTargets,
+    complete_targets,
+)
 from pipelines.reconstruction.settings import RunSettings
 
 
@@ -162,3 +176,43 @@ def test_guidance_of_one_size_makes_a_batch_and_of_two_sizes_is_refused(memory):
         concatenate([*views, memory.project(camera("t2", (32, 24)))])
     with pytest.raises(ShapeError, match="0 picture sizes"):
         concatenate([])
+
+
+# Targets that are looked at ahead.
+
+
+@pytest.fixture
+def seen() -> SpatialMemory:
+    memory = random_memory(5)
+    # With it, numba chooses how kernels run.
+    memory.project(view_from())
+    if not parallel_kernels_may_overlap():
+        pytest.skip("no OpenMP and no TBB: rounds are not looked at ahead")
+    return memory
+
+
+def plan(*rounds: int) -> Plan:
+    """Of so many targets a round."""
+    cuts = np.cumsum([0, *rounds])
+    at = [view_from(center=(0.1 * i, 0, 0), name=f"t{i}") for i in range(int(cuts[-1]))]
+    return cast(
+        Plan,
+        SimpleNamespace(
+            config=RunSettings(),
+            schedule=tuple(tuple(range(a, b)) for a, b in pairwise(cuts)),
+            targets=SimpleNamespace(cameras=all_of(at)),
+        ),
+    )
+
+
+def test_rounds_are_the_plans_whether_looked_at_ahead_or_not(seen):
+    with RoundTargets(plan(1, 2), seen) as targets:
+        assert [t.camera.names for t in targets.of(1)] == [("t0",)]
+        targets.prefetch_round(2)
+        ahead = targets.of(2)
+        again = targets.of(2)
+        targets.prefetch_round(3)
+    assert [t.camera.names for t in ahead] == [t.camera.names for t in again] == [("t1",), ("t2",)]
+    for one, two in zip(ahead, again, strict=True):
+        np.testing.assert_array_equal(one.guidance().rgb, two.guidance().rgb)
+        np.testing.assert_array_equal(one.guidance().depth, two.guidance().depth)

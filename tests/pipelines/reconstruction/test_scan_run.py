@@ -85,17 +85,6 @@ def test_pages_and_pictures_name_what_is_scanned(runs):
     assert 192 in levels
 
 
-def test_exports_keep_it_apart_and_make_no_camera_of_a_station(runs, tmp_path):
-    laspy, pycolmap = pytest.importorskip("laspy"), pytest.importorskip("pycolmap")
-    for form, name in (("las", "a.las"), ("colmap", "model"), ("splat", "a.splat.ply")):
-        out = tmp_path / name
-        assert main(["export", str(runs / "with"), "--format", form, "--out", str(out)]) == 0
-    cloud = laspy.read(tmp_path / "a.las")
-    assert 0 < int(np.asarray(cloud["scanned"]).sum()) < len(cloud)
-    model = pycolmap.Reconstruction(str(tmp_path / "model" / "sparse" / "0"))
-    assert not [image.name for image in model.images.values() if "scan" in image.name]
-
-
 @pytest.mark.parametrize(
     ("options", "said"),
     [

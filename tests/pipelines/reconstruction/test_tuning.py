@@ -10,7 +10,6 @@ from command_line import refused
 from micro_weights import write_micro_weights
 from tiny_scan import write_scan
 
-from gvtools.completers.geoverse import from_pretrained
 from pipelines.cli import main
 from pipelines.tuning import tune as tuning
 
@@ -105,16 +104,3 @@ def test_what_cannot_be_tuned_and_another_tuning_are_refused(run, scan, weights,
     few = ("--tune", "1", "--context", "first:3")
     assert "expected at least 4" in refused(capsys, *words(scan, out, weights, *few))
     assert not out.exists()
-
-
-@pytest.mark.slow
-def test_weights_that_are_no_better_leave_the_run_as_it_is(scan, weights, tmp_path):
-    out, plain = tmp_path / "run", tmp_path / "plain"
-    figures = iter([9.0, 1.0, 1.0])
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tuning, "generated_psnr", lambda *_: next(figures))
-        assert main([*words(scan, out, weights, *STEPS), "--quiet"]) == 0
-    assert main([*words(scan, plain, weights), "--quiet"]) == 0
-    assert json.loads((out / "run.json").read_text())["tuning"]["kept"] is False
-    assert pictures(out) == pictures(plain)
-    assert from_pretrained(out / "tuned").config.trained

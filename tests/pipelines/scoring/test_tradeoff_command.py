@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import csv
 import json
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -134,21 +133,6 @@ def test_a_project_that_is_read_otherwise_is_tried_anew(scan, swept, capsys):
 def test_what_cannot_be_swept_is_one_line(scan, tmp_path, capsys, more, said):
     assert said in refused(capsys, "tradeoff", scan, "--out", tmp_path / "x", *more)
     assert not (tmp_path / "x").exists()
-
-
-def test_a_damaged_trial_is_made_anew(scan, swept, tmp_path):
-    out = tmp_path / "out"
-    shutil.copytree(swept, out)
-    files = {path: json.loads(path.read_text()) for path in (out / "trials").iterdir()}
-    # Sweeps of the same project that was read otherwise may lie there, too.
-    damaged = [path for path, outcome in files.items() if not outcome["settings"]]
-    for path in damaged:
-        path.write_text("{")
-    command = ["tradeoff", str(scan), "--out", str(out), "--budget", "1h", "--quiet"]
-    assert main([*command, *WIDER]) == 0
-    whole = [path for path in damaged if path.read_text() != "{"]
-    again = [json.loads(path.read_text()) for path in whole]
-    assert again == [files[path] | {"seconds": again[0]["seconds"]} for path in whole] != []
 
 
 def test_a_folder_takes_one_sweep_at_a_time(scan, tmp_path, capsys):
