@@ -28,8 +28,7 @@ def camera(x: float, turn: float = 0.0) -> Cameras:
     c, s = np.cos(turn), np.sin(turn)
     pose[:3, :3] = [[c, 0, -s], [0, 1, 0], [s, 0, c]]
     pose[:3, 3] = pose[:3, :3] @ [-x, 0, 0]
-    K = np.array([[60.0, 0, 32], [0, 60.0, 24], [0, 0, 1]])
-    return Cameras(K[None], pose[None], np.array([64]), np.array([48]), names=(f"{x}",))
+    return Cameras.pinhole(64, 48, focal=60, cam_from_world=pose, name=f"{x}")
 
 
 def fuse(memory: SpatialMemory, at: Cameras, seed: int, *, generated: bool, round: int = 0) -> None:

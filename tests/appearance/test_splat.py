@@ -12,8 +12,6 @@ from gvtools.appearance.gaussians import Gaussians
 from gvtools.appearance.splat import gsplat_splatter, project_kernels
 from gvtools.appearance.splat.gsplat_splatter import (
     GsplatSplat,
-    camera_arguments,
-    gaussian_arguments,
     gradient_rows,
     image_of,
     splatter_on,
@@ -239,30 +237,6 @@ def test_without_gsplat_cuda_is_refused_unless_nothing_is_fitted(monkeypatch):
     assert prepare._on_device(with_values(config, {"refine.seconds": 0})).splat.device == "cuda"
     monkeypatch.setattr(gsplat_splatter, "gsplat_installed", lambda: True)
     assert prepare._on_device(config).device == "cuda"
-
-
-@pytest.mark.parametrize("degree", [0, 1, 2])
-def test_gsplats_plain_torch_projects_as_splat_does(degree):
-    reference = pytest.importorskip("gsplat.cuda._torch_impl", reason="gsplat is not installed")
-    values = flat_gaussians()
-    ours = Splat(values, lens(), degree=degree)
-    given = gaussian_arguments(torch.from_numpy(values))
-    viewmats, Ks = camera_arguments(lens(), "cpu")
-    covars, _ = reference._quat_scale_to_covar_preci(given["quats"], given["scales"])
-    _, centers, depths, conics, _ = reference._fully_fused_projection(
-        given["means"], covars, viewmats, Ks, *PICTURE, eps2d=project_kernels.BLUR, near_plane=0.1
-    )
-    directions = given["means"] - torch.inverse(viewmats)[0, :3, 3]
-    colors = reference._spherical_harmonics(degree, directions, given["colors"])
-    theirs = torch.cat(
-        [centers[0], conics[0], given["opacities"][:, None], (colors + 0.5).clamp(min=0),
-         depths[0][:, None]], dim=1,
-    )  # fmt: skip
-    assert 10 < len(ours.seen) < len(values)
-    columns = slice(project_kernels.X, project_kernels.DEPTH + 1)
-    np.testing.assert_allclose(
-        ours.projected[ours.seen, columns], theirs.numpy()[ours.seen], rtol=2e-4, atol=2e-4
-    )
 
 
 @pytest.mark.gpu

@@ -20,8 +20,7 @@ CELLS = np.random.default_rng(3).integers(40, 200, (64, 64, 3), dtype=np.uint8)
 def camera(x: float = 0.0) -> Cameras:
     pose = np.eye(4)
     pose[0, 3] = -x
-    K = np.array([[80.0, 0, 40], [0, 80.0, 30], [0, 0, 1]])
-    return Cameras(K[None], pose[None], np.array([80]), np.array([60]), names=("c",))
+    return Cameras.pinhole(80, 60, focal=80, cam_from_world=pose, name="c")
 
 
 def wall(x: float = 0.0) -> tuple[np.ndarray, np.ndarray]:

@@ -33,13 +33,12 @@ from gvtools.scenes.scene import Frame, Scene, SparsePoints, View
 from pipelines.cli import main
 
 HEIGHT, WIDTH, FAR = 40, 60, 3.0
-K = np.array([[50.0, 0, 30], [0, 50, 20], [0, 0, 1]])
 
 
 def camera(x: float = 0.0, name: str = "one") -> Cameras:
     pose = np.eye(4)
     pose[0, 3] = -x
-    return Cameras(K[None], pose[None], np.array([WIDTH]), np.array([HEIGHT]), (name,))
+    return Cameras.pinhole(WIDTH, HEIGHT, focal=50, cam_from_world=pose, name=name)
 
 
 def wall(depth: float = FAR) -> np.ndarray:
