@@ -36,7 +36,7 @@ COMMANDS = {
     "trajectory": "pipelines.commands.evaluate",
     "report": "pipelines.commands.view",
     "plot": "pipelines.commands.view",
-    "completers": "pipelines.commands.completers",
+    "completers": "pipelines.commands.weights",
     "weights": "pipelines.commands.weights",
     "data": "pipelines.commands.data",
     "train": "pipelines.commands.train",

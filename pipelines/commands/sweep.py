@@ -154,11 +154,9 @@ def _chosen_scenes(text: str | None, known: tuple[str, ...]) -> tuple[str, ...]:
     if text is None:
         return known
     names = tuple(dict.fromkeys(part.strip() for part in text.split(",") if part.strip()))
-    for name in names:
+    for name in names or [text]:
         if name not in known:
             raise OptionError(unknown("scene", name, known))
-    if not names:
-        raise OptionError(f"--scenes {text!r}; expected at least one of {', '.join(known)}")
     return names
 
 

@@ -1,7 +1,4 @@
-"""``gvtools weights``: which checkpoints a configuration needs, whether a folder fits, making one.
-
-The actions: list, fetch, check, create, pack, truncate-wan, empty-prompt.
-"""
+"""``gvtools completers`` and ``weights``: what fills holes, and its checkpoints."""
 
 from __future__ import annotations
 
@@ -23,6 +20,33 @@ if TYPE_CHECKING:
 DEPTH = "depth"
 # Seconds between two lines of progress.
 _INTERVAL = 10.0
+
+
+class CompletersCommand(Arguments):
+    """List the completers: what each needs, its cost a view, what it was measured to give."""
+
+    examples = ("gvtools completers", "gvtools completers --json completers.json")
+
+    json_: Path | None = None
+    """Write the list there. [FILE]"""
+
+    def run(self, console: Console) -> None:
+        from gvtools.completers.base import available, completer_type
+
+        listed = [(name, variant) for name in available() for variant in completer_type(name).facts]
+        unsaid = [name for name in available() if not completer_type(name).facts]
+        if self.json_ is not None:
+            found = [{"name": name, **variant._asdict()} for name, variant in listed]
+            write_json(self.json_, {"completers": found, "without_figures": unsaid})
+        for name, variant in listed:
+            console.line(f"{name}{variant.of and f', {variant.of}'}: {variant.what}")
+            for field in ("needs", "cost", "gives"):
+                console.line(f"  {field.ljust(5)}  {getattr(variant, field)}")
+            if variant.source:
+                console.line(f"  from   {variant.source}")
+        for name in unsaid:
+            console.line(f"{name}: of your own; it says nothing of itself (Completer.facts)")
+        console.line("gvtools reconstruct PROJECT --completer NAME takes one")
 
 
 class ListWeights(Arguments):

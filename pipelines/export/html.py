@@ -18,8 +18,7 @@ from gvtools.files import write_text
 from gvtools.splats import SH, Splats
 from pipelines.export.formats import ExportOptions
 from pipelines.export.source import ExportSource
-from viz.page.packing import pack_gaussians
-from viz.page.page import PageCamera, PageGroup, SharedPage, page_html
+from viz.page.page import PageCamera, PageGroup, SharedPage, pack_gaussians, page_html
 from viz.report.pictures import thumbnail
 from viz.viewer.run_view import RunView, cameras_of
 from viz.viewer.standpoint import camera_outside

@@ -23,8 +23,7 @@ from gvtools.errors import OptionError
 from gvtools.memory.store.local_frame import LocalFrame
 from pipelines.export.formats import ExportOptions
 from pipelines.export.source import ExportSource
-from viz.page.packing import pack_gaussians
-from viz.page.page import PageCamera, PageGroup, SharedPage, page_html
+from viz.page.page import PageCamera, PageGroup, SharedPage, pack_gaussians, page_html
 
 PATIENCE = 60.0
 
