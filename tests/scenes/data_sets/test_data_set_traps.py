@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import shutil
 import sys
 from pathlib import Path
@@ -35,16 +34,6 @@ def messages(scene: Scene) -> str:
 
 
 # --- RealEstate10K ----------------------------------------------------------------------------
-
-
-def test_realestate10k_intrinsics_are_shares_of_whatever_size_frames_have(tmp_path: Path) -> None:
-    expected = mini_captures.write_frames(tmp_path)
-    for path in tmp_path.glob("frames/*/*/*.png"):
-        Image.open(path).resize((32, 24)).save(path)
-    scene = read("realestate10k", tmp_path, expected.scene)
-    np.testing.assert_allclose(
-        scene.cameras.K, expected.cameras.resized(32, 24).K, rtol=0, atol=1e-12
-    )
 
 
 def test_realestate10k_takes_the_video_frame_nearest_to_a_time_stamp(tmp_path: Path) -> None:
@@ -192,16 +181,6 @@ def test_hypersim_tables_that_were_cut_off_are_named(tmp_path: Path) -> None:
     table.unlink()
     with pytest.raises(ProjectError, match="no meters_per_asset_unit"):
         read("hypersim", tmp_path, expected.scene)
-
-
-@pytest.mark.parametrize("value", ["-inf", "nan", "2"])
-def test_scannet_frames_that_the_tracker_lost_are_left_out(tmp_path: Path, value: str) -> None:
-    expected = mini_captures.write_exported(tmp_path)
-    pose = tmp_path / expected.scene / "pose" / "1.txt"
-    pose.write_text("\n".join([" ".join([value] * 4)] * 4))
-    scene = read("scannet", tmp_path, expected.scene)
-    assert scene.names == ("0.jpg", "2.jpg", "3.jpg")
-    assert re.search("1 of 4 frames (have an? |have no pose|were lost)", messages(scene))
 
 
 def test_scannet_stream_that_ends_early_gives_its_whole_frames(tmp_path: Path) -> None:
