@@ -263,11 +263,6 @@ def _log_ratios(
     depth, reference = np.asarray(depth, np.float64), np.asarray(reference_depth, np.float64)
     mask = np.asarray(valid, bool)
     weight = np.ones(depth.shape) if confidence is None else np.asarray(confidence, np.float64)
-    if not depth.shape == reference.shape == mask.shape == weight.shape:
-        raise ShapeError(
-            f"depth scale: depth {depth.shape}, reference {reference.shape}, valid {mask.shape}, "
-            f"confidence {weight.shape}; expected one shape"
-        )
     with np.errstate(invalid="ignore"):
         mask = mask & np.isfinite(depth) & np.isfinite(reference) & (depth > 0) & (reference > 0)
         mask &= np.isfinite(weight) & (weight > 0)

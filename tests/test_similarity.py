@@ -107,8 +107,6 @@ def test_too_little_overlap_and_too_much_spread_are_refused():
     scattered = depth * np.random.default_rng(2).uniform(0.3, 3, depth.shape)
     fit = align_depth_scale(scattered, reference, valid=np.ones(depth.shape, bool))
     assert fit.status.startswith("unsupported: ") and np.isnan(fit.scale)
-    with pytest.raises(ShapeError, match="one shape"):
-        align_depth_scale(depth, reference[1:], valid=few)
 
 
 def test_poses_are_aligned_by_the_motion_of_their_world():

@@ -84,7 +84,7 @@ def image_figures(
     similarity = ssim_map(first, second) if min(first.shape[:2]) >= SIDE else None
     out = {}
     for name, mask in regions.items():
-        where = _mask(mask, first.shape[:2])
+        where = None if mask is None else np.asarray(mask, np.bool_)
         out[name] = {
             "psnr": _decibels(square if where is None else square[where]),
             "ssim": None if similarity is None else _mean(similarity, where),
@@ -121,13 +121,10 @@ def relative_depth_error(
     Depth maps are (H, W) z-depth in one unit, 0 = none; the mask is as of ``psnr``.
     """
     first, second = np.asarray(depth, np.float64), np.asarray(truth, np.float64)
-    if first.shape != second.shape or first.ndim != 2:
-        raise ShapeError(f"depth maps of {first.shape} and {second.shape}; expected equal (H, W)")
     with np.errstate(invalid="ignore"):
         both = (first > 0) & (second > 0) & np.isfinite(first) & np.isfinite(second)
-    where = _mask(mask, first.shape)
-    if where is not None:
-        both &= where
+    if mask is not None:
+        both &= np.asarray(mask, np.bool_)
     return median_of(np.abs(first[both] - second[both]) / second[both])
 
 
@@ -189,7 +186,7 @@ def _pair(
     first, second = _unit(image), _unit(truth)
     if first.ndim != 3 or first.shape != second.shape:
         raise ShapeError(f"images of {first.shape} and {second.shape}; expected equal (H, W, C)")
-    return first, second, _mask(mask, first.shape[:2])
+    return first, second, None if mask is None else np.asarray(mask, np.bool_)
 
 
 def _unit(image: ArrayLike) -> NDArray[np.float64]:
@@ -203,12 +200,3 @@ def _unit(image: ArrayLike) -> NDArray[np.float64]:
     if not (low >= LOWEST and high <= HIGHEST):
         raise ShapeError(f"an image of values from {low:g} to {high:g}; expected floats in [0, 1]")
     return array.astype(np.float64)
-
-
-def _mask(mask: ArrayLike | None, shape: tuple[int, ...]) -> NDArray[np.bool_] | None:
-    if mask is None:
-        return None
-    array = np.asarray(mask)
-    if array.shape != shape or array.dtype != np.bool_:
-        raise ShapeError(f"a mask of {array.dtype} {array.shape}; expected bool {shape}")
-    return array

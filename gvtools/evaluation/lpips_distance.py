@@ -127,12 +127,11 @@ class Lpips:
         import torch
         from torch.nn.functional import conv2d, interpolate
 
-        if image.shape != truth.shape or image.ndim != 3 or image.shape[2] != 3:
-            raise ShapeError(f"LPIPS of {image.shape} and {truth.shape}; expected equal (H, W, 3)")
-        if min(image.shape[:2]) < SMALLEST or image.dtype != np.uint8 or truth.dtype != np.uint8:
+        alike = image.shape == truth.shape and image.dtype == truth.dtype == np.uint8
+        if not alike or image.shape[2:] != (3,) or min(image.shape[:2]) < SMALLEST:
             raise ShapeError(
-                f"LPIPS of {image.dtype} {image.shape}; expected uint8, at least "
-                f"{SMALLEST}x{SMALLEST} pixels"
+                f"LPIPS of {image.dtype} {image.shape} and {truth.dtype} {truth.shape}; expected "
+                f"equal uint8 (H, W, 3), at least {SMALLEST}x{SMALLEST} pixels"
             )
         with torch.inference_mode():
             features = zip(self._heads, self._features(image), self._features(truth), strict=True)

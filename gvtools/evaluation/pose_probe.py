@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from gvtools.cameras import Cameras, Float64, concatenate
-from gvtools.errors import DegenerateError, OptionError
+from gvtools.errors import DegenerateError
 from gvtools.evaluation.posed_picture import PosedPicture
 from gvtools.evaluation.statistics import ErrorStatistics, share
 from gvtools.evaluation.trajectories import AUC_THRESHOLDS, area_under_recall, center_extent
@@ -328,8 +328,6 @@ class PoseProbe:
         self.seed = seed
         self._matcher = matcher or SiftMatcher()
         self._context = tuple(context)
-        if len({picture.name for picture in self._context}) != len(self._context):
-            raise OptionError("pose probe: two context views have one name; names must differ")
         self._views = [self._lifted(picture) for picture in self._context]
         if not any(len(view.points) for view in self._views):
             raise DegenerateError(

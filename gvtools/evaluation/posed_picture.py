@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras, Float64, invert_rigid
-from gvtools.errors import ShapeError
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,20 +21,6 @@ class PosedPicture:
     # (H, W) float32 z-depth, scene units, 0 = none; None when there is none.
     depth: NDArray[np.float32] | None = None
     mask: NDArray[np.bool_] | None = None  # (H, W) bool, True = use; None means all
-
-    def __post_init__(self) -> None:
-        size = (int(self.camera.height[0]), int(self.camera.width[0]))
-        if len(self.camera) != 1 or self.rgb.shape != (*size, 3) or self.rgb.dtype != np.uint8:
-            raise ShapeError(
-                f"picture {self.name}: rgb {self.rgb.dtype} {self.rgb.shape} with "
-                f"{len(self.camera)} camera(s) of {size[1]}x{size[0]} pixels; expected one camera "
-                "and uint8 rgb of its size"
-            )
-        for what, value in (("depth", self.depth), ("mask", self.mask)):
-            if value is not None and value.shape != size:
-                raise ShapeError(
-                    f"picture {self.name}: {what} {value.shape}; expected {size} like rgb"
-                )
 
 
 class Seen(IntEnum):

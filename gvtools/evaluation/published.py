@@ -159,9 +159,7 @@ def parse_benchmark(text: str) -> Benchmark:
     """A benchmark from its YAML."""
     try:
         return _benchmark(parse_yaml(text))
-    except KeyError as error:
-        raise OptionError(f"benchmark: no key {error}; expected protocol, figures ...") from None
-    except (ValueError, TypeError, AttributeError, IndexError) as error:
+    except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
         raise OptionError(f"benchmark: {error}") from None
 
 

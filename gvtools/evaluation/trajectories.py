@@ -210,8 +210,6 @@ def pose_auc(reference: ArrayLike, estimate: ArrayLike) -> PoseAuc:
 
 def area_under_recall(errors: ArrayLike, threshold: float) -> float:
     """Area under the share of errors below x, for x from 0 to ``threshold``, over the threshold."""
-    if not np.size(errors):
-        raise DegenerateError("area under recall: no errors; give at least one")
     edges = np.linspace(0, threshold, AUC_BINS + 1)
     values = np.sort(np.asarray(errors, np.float64))
     share = np.searchsorted(values, edges, side="left") / len(values)
@@ -220,12 +218,12 @@ def area_under_recall(errors: ArrayLike, threshold: float) -> float:
 
 def _poses(reference: ArrayLike, estimate: ArrayLike) -> tuple[Float64, Float64]:
     first, second = np.asarray(reference, np.float64), np.asarray(estimate, np.float64)
-    if first.ndim != 3 or first.shape[1:] != (4, 4) or first.shape != second.shape:
+    fit = first.ndim == 3 and first.shape[1:] == (4, 4) and first.shape == second.shape
+    if not fit or not (np.isfinite(first) & np.isfinite(second)).all():
         raise ShapeError(
-            f"poses: reference {first.shape} and estimate {second.shape}; expected both (N, 4, 4)"
+            f"poses: reference {first.shape} and estimate {second.shape}; expected both (N, 4, 4), "
+            "without NaN or infinity: leave those frames out and say so"
         )
-    if not (np.isfinite(first).all() and np.isfinite(second).all()):
-        raise ShapeError("poses: NaN or infinity; leave those frames out and say so")
     for name, poses in (("reference", first), ("estimate", second)):
         rotation = poses[:, :3, :3]
         with np.errstate(over="ignore", invalid="ignore"):
@@ -336,9 +334,6 @@ def by_time(
     (K,) of both are in the order of the shorter one.
     """
     first, second = np.asarray(reference, np.float64), np.asarray(estimate, np.float64) + offset
-    for name, stamps in (("reference", first), ("estimate", second)):
-        if stamps.ndim != 1 or not np.isfinite(stamps).all():
-            raise ShapeError(f"{name} stamps {stamps.shape}; expected (N,) finite seconds")
     if not (first.size and second.size):
         raise DegenerateError("association by time: a trajectory without poses")
     swapped = len(second) < len(first)

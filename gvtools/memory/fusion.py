@@ -419,12 +419,11 @@ def fuse(
             f"points are relative to {points.frame.origin}, the memory to {store.origin}, or "
             "their axes differ; back-project with the memory's frame"
         )
-    if store.rounds and round < store.rounds[-1]:
+    least = store.rounds[-1] if store.rounds else 0
+    if not least <= round <= LAST_ROUND:
         raise OptionError(
-            f"fusing into round {round} after round {store.rounds[-1]}; rounds only go forward"
+            f"round {round}; expected {least} to {LAST_ROUND}, as rounds only go forward"
         )
-    if not 0 <= round <= LAST_ROUND:
-        raise OptionError(f"round {round}; expected 0 to {LAST_ROUND}")
     arrived = len(points)
     keep = np.isfinite(points.positions).all(axis=1)
     keep &= (points.confidence > 0) & np.isfinite(points.confidence)

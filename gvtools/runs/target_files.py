@@ -100,18 +100,13 @@ def read_target(folder: Path, entry: Mapping[str, Any]) -> TargetFiles:
         depth, confidence = stored["completion"], stored.get("confidence")
         scale = entry["scale"]["scale"]
         scale = np.float32(1 if scale is None or scale != scale else scale)
-        shapes = {depth.shape, support.shape, picture.shape[:2]}
+        maps = [depth] if confidence is None else [depth, confidence]
+        shapes = {support.shape, picture.shape[:2], *(array.shape for array in maps)}
         if shapes != {(int(camera.height[0]), int(camera.width[0]))} or picture.shape[2:] != (3,):
             raise ValueError(f"pictures and depth of shapes {sorted(shapes)}")
-        if depth.dtype != np.float32 or not np.isfinite(depth).all() or (depth < 0).any():
-            raise ValueError(f"depth of type {depth.dtype}, or not finite, or negative")
-        if confidence is not None:
-            if confidence.shape != depth.shape or confidence.dtype.kind != "f":
-                raise ValueError(f"confidence of shape {confidence.shape}, {confidence.dtype}")
-            if not np.isfinite(confidence).all():
-                raise ValueError("confidence that is not finite")
-        if not 0 < scale < np.inf:
-            raise ValueError(f"a scale of {scale}")
+        sound = all(array.dtype.kind == "f" and np.isfinite(array).all() for array in maps)
+        if not sound or depth.dtype != np.float32 or (depth < 0).any() or not 0 < scale < np.inf:
+            raise ValueError(f"depth or confidence not finite, depth negative, or scale {scale}")
     except (*UNREADABLE, ShapeError) as error:
         raise ProjectError(
             f"{folder}: the target {entry.get('name', '?')} cannot be read ({error!r}); expected a "

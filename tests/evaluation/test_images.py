@@ -70,12 +70,8 @@ def test_what_does_not_fit_is_refused():
         psnr(image, image[:-1])
     with pytest.raises(ShapeError, match="int64"):
         psnr(image.astype(np.int64), image)
-    with pytest.raises(ShapeError, match="a mask of float64"):
-        psnr(image, image, mask=np.ones((20, 20)))
     with pytest.raises(ShapeError, match="at least 11x11"):
         ssim(image[:10], image[:10])
-    with pytest.raises(ShapeError, match=r"expected equal \(H, W\)"):
-        relative_depth_error(image, image)
 
 
 @pytest.mark.parametrize("sample", [False, True])

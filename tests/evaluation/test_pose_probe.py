@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from walls import HEIGHT, WALLS, WIDTH, blotches, camera_at, photograph
 
 from gvtools.cameras import Cameras
-from gvtools.errors import CheckpointError, DegenerateError, OptionError, ShapeError
+from gvtools.errors import CheckpointError, DegenerateError, ShapeError
 from gvtools.evaluation.pose_probe import (
     Located,
     PoseProbe,
@@ -115,11 +115,9 @@ def test_a_picture_that_two_poses_explain_is_ambiguous_unless_a_mask_leaves_one_
     assert masked.status.startswith("failed") and masked.keypoints == 0
 
 
-def test_a_context_without_depth_or_with_equal_names_is_refused(context):
+def test_a_context_without_depth_is_refused(context):
     with pytest.raises(DegenerateError, match="none of 1 context views"):
         PoseProbe([dataclasses.replace(context[0], depth=None)])
-    with pytest.raises(OptionError, match="one name"):
-        PoseProbe([context[0], context[0]])
 
 
 def test_leave_one_out_measures_the_probe_itself(probe):

@@ -187,9 +187,6 @@ def test_a_split_reads_as_two_selections_in_its_order():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"targets": 0}, "targets 0; expected at least 1"),
-        ({"context": 0}, "context 0; expected at least 1"),
-        ({"rounds": 0}, "rounds 0; expected at least 1"),
         ({"stride": 0}, "stride 0; expected at least 1"),
         ({"stride": 15}, "100 views; expected at least 106 for 2 context and 1 x 6 target views"),
     ],
