@@ -1,6 +1,9 @@
+"""``gvtools weights`` and ``completers``, whose figures stand in the pages that they name."""
+
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +16,8 @@ from command_line import refused
 from PIL import Image
 from safetensors.torch import load_file, save_file
 
+from gvtools.completers import base
+from gvtools.completers.base import Completer, available, completer_type
 from gvtools.completers.geoverse import from_pretrained
 from gvtools.completers.geoverse.weights import WHOLE_FILE, save_pretrained
 from gvtools.networks.config_json import to_json
@@ -297,3 +302,50 @@ def test_the_video_prior_is_cut_and_completed(capsys, tmp_path):
     assert from_pretrained(folder, video=True).video is not None
     shutil.rmtree(video / "vae")
     assert "vae" in refused(capsys, "weights", "check", folder, "--quiet")
+
+
+ROOT = Path(__file__).parents[2]
+FACTS = [(name, facts) for name in available() for facts in completer_type(name).facts]
+# Rows of the table "Four domains", by the completer that they are of; seconds of the core alone.
+ROWS = {"inpaint": ("inpaint", "inpaint"), "geoverse": ("geoverse", "without its refiner")}
+
+
+@pytest.mark.parametrize(("name", "facts"), FACTS, ids=[f"{n} {f.of}" for n, f in FACTS])
+def test_figures_are_those_of_their_page(name, facts):
+    if not facts.source:
+        assert not re.search(r"\d", facts.cost + facts.gives)
+        return
+    file, section = facts.source.partition(" (")[0].split(", ")
+    text = (ROOT / file).read_text(encoding="utf-8").split(f"## {section}\n")[1].split("\n## ")[0]
+    if section != "Four domains":
+        assert "1,034" in facts.cost and "**1,034**" in text and "Peak memory 20.4 GiB" in text
+        return
+    lines = [line for line in text.split("\nDifferences")[0].splitlines() if line[:2] == "| "]
+    rows = [[cell.strip() for cell in line.strip("|").split(" | ")] for line in lines]
+    judged, timed = ROWS[name]
+    sets = ("procedural rooms", "hand-made levels", "recorded depth", "photographs: fern")
+    found = [
+        next(row for row in rows if row[0].startswith(one) and row[1] == judged) for one in sets
+    ]
+    time = [
+        next(row for row in rows if row[0].startswith(sets[at]) and row[1] == timed)
+        for at in (0, 2)
+    ]
+    assert re.findall(r"(\d\.\d+) s", facts.cost) == [row[9].strip(" |") for row in time]
+    psnr, depth = facts.gives.split(";")
+    assert re.findall(r"\d+\.\d+", psnr) == [row[3] for row in found]
+    assert re.findall(r"\d+\.\d+", depth) == [row[5] for row in found[:3]]
+
+
+def test_the_list_has_each_completer_and_ones_own(capsys, monkeypatch, tmp_path):
+    class Mine(Completer):
+        name = "mine"
+
+    monkeypatch.setattr(base, "_REGISTRY", {**base._REGISTRY, "mine": Mine})
+    assert main(["completers", "--json", str(tmp_path / "list.json")]) == 0
+    said = capsys.readouterr().out
+    for name in ("none: ", "inpaint: ", "geoverse, the model that ships: ", "mine: of your own"):
+        assert f"\n{name}" in f"\n{said}"
+    written = json.loads((tmp_path / "list.json").read_text())
+    assert [entry["name"] for entry in written["completers"]] == [name for name, _ in FACTS]
+    assert written["without_figures"] == ["mine"]
