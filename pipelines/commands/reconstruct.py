@@ -1,4 +1,4 @@
-"""``gvtools reconstruct``, ``demo``, ``refine``; of a project in blocks, ``split`` and ``merge``."""
+"""``gvtools reconstruct``, ``demo``, ``refine``; ``split`` and ``merge`` a project in blocks."""
 
 from __future__ import annotations
 
