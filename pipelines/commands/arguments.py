@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
 
 from gvtools.errors import CheckpointError, OptionError
-from gvtools.scenes.layout import FORM, is_address
 from pipelines.options import Arguments
 
 if TYPE_CHECKING:
@@ -80,12 +78,6 @@ class RootArguments(Arguments):
 
     root: Path | None = None
     """The data set's download, for a project given as spec:NAME:SCENE (gvtools data list). [DIR]"""
-
-
-def refuse_root(root: Path | None, paths: Iterable[Path | None]) -> None:
-    """Refuse --root where none of the given paths is a scene of a data set."""
-    if root is not None and not any(path is not None and is_address(path) for path in paths):
-        raise OptionError(f"--root {root}: belongs to {FORM}; expected that, or no --root")
 
 
 class SceneArguments(RecordingArguments, RootArguments):

@@ -12,12 +12,8 @@ from pydantic import Field
 from gvtools.errors import DegenerateError, OptionError
 from gvtools.files import folder_for_results, write_json
 from gvtools.runs.layout import RECORD
-from pipelines.commands.arguments import (
-    MeasurementArguments,
-    RootArguments,
-    SceneArguments,
-    refuse_root,
-)
+from gvtools.scenes.layout import FORM, is_address
+from pipelines.commands.arguments import MeasurementArguments, RootArguments, SceneArguments
 from pipelines.options import Arguments
 
 if TYPE_CHECKING:
@@ -243,7 +239,8 @@ class TrajectoryCommand(RootArguments):
         if self.metric == "ate":
             self.refuse(("delta", "all_pairs"), "belongs to rpe")
         paths = (self.reference, self.estimate)
-        refuse_root(self.root, paths)
+        if not any(map(is_address, paths)):
+            self.refuse(("root",), f"belongs to {FORM}")
         reference, estimate = (
             open_trajectory(path, layout=self.layout, root=self.root) for path in paths
         )
