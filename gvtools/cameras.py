@@ -80,14 +80,9 @@ class Cameras:
         cam_from_world: ArrayLike | None = None,
         name: str = "",
     ) -> Cameras:
-        """One camera with square pixels and its principal point in the middle of the picture.
+        """One camera with square pixels and its principal point in the middle; lengths in pixels.
 
-        Args:
-            width: pixels.
-            height: pixels.
-            focal: focal length, pixels.
-            cam_from_world: (4, 4) rigid, scene units; None is the identity.
-            name: the view's name.
+        ``cam_from_world`` is (4, 4), rigid, in scene units; None is the identity.
         """
         K = np.array([[[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]], np.float64)
         pose = np.eye(4) if cam_from_world is None else np.asarray(cam_from_world, np.float64)

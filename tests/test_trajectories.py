@@ -74,15 +74,6 @@ def test_interpolation_goes_through_its_keys():
         np.testing.assert_allclose(path.centers[end], keys.centers[end], atol=1e-8)
 
 
-def test_a_turn_on_the_spot_and_repeated_keys_are_interpolated():
-    pose = np.tile(np.eye(4), (4, 1, 1))
-    angles = [[0], [0], [40], [80]]
-    pose[:, :3, :3] = Rotation.from_euler("y", angles, degrees=True).as_matrix()
-    path = interpolate(_cameras(pose), 9)
-    turned = Rotation.from_matrix(path.world_from_cam[:, :3, :3]).as_euler("YXZ", degrees=True)
-    np.testing.assert_allclose(turned[:, 0], np.linspace(0, 80, 9), atol=1e-9)
-
-
 def test_intrinsics_are_interpolated_and_sizes_are_the_nearest_keys():
     keys = _ring(2)
     K = keys.K.copy()

@@ -59,14 +59,6 @@ def test_the_scenes_cameras_tell_the_order_of_quaternions(tmp_path):
         np.testing.assert_allclose(read.world_from_cam, cameras.world_from_cam, atol=1e-9)
 
 
-def test_comments_and_blank_lines_are_passed_over(tmp_path):
-    path = tmp_path / "path.txt"
-    path.write_text("# timestamp tx ty tz qx qy qz qw\n\n1.0 1 2 3 0 0 0 1\n", encoding="ascii")
-    read = read_trajectory(path, _cameras(1))
-    np.testing.assert_allclose(read.centers, [[1, 2, 3]])
-    assert read.names == ("1.0",)
-
-
 @pytest.mark.parametrize(("unit", "metres"), [("mm", 0.001), ("cm", 0.01), ("m", 1.0)])
 def test_places_in_the_unit_that_the_head_names(tmp_path, unit, metres):
     file = tmp_path / "path.csv"
@@ -102,8 +94,3 @@ def test_wrong_files_are_refused_with_the_line(tmp_path, text, words):
     path.write_text(text, encoding="ascii")
     with pytest.raises(ProjectError, match=words):
         read_trajectory(path, _cameras(1))
-
-
-def test_absent_files_are_refused(tmp_path):
-    with pytest.raises(ProjectError, match="cannot be read"):
-        read_trajectory(tmp_path / "absent.txt", _cameras(1))

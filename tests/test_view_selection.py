@@ -63,14 +63,6 @@ def test_the_nearest_views_stand_and_look_like_the_targets(scale, shift):
     assert everything[0] == "beside" and everything[-1] == "behind"
 
 
-@pytest.mark.parametrize("shift", [0.0, 3e6])
-def test_from_one_place_the_nearest_view_is_the_one_that_looks_the_same_way(shift):
-    centre = (shift, -shift, shift / 3)
-    context = views(*(looking(centre, angle, f"{angle}") for angle in (0.0, 1.0, 2.0, 3.0)))
-    for angle in (0.1, 1.1, 2.1, 2.9):
-        assert nearest(context, looking(centre, angle, "target"), 1) == [f"{round(angle)}.0"]
-
-
 def wall(distance: float) -> np.ndarray:
     return np.full((30, 40), distance, np.float32)
 

@@ -8,7 +8,7 @@ compared with where it started.
 
 What the figures do not see: colours; along the line of sight, what the parallax between the views
 does not show (without any, the distance is 0 whatever the depth; the relative depth is not); and
-whatever differs by more than ``occlusion``, which leaves the co-visible set and raises the
+whatever differs by more than OCCLUSION, which leaves the co-visible set and raises the
 contradicting and occluded shares instead. So a pose that goes ever more wrong raises the two
 figures up to a point only, while the contradicting share keeps growing. Read them together.
 """
@@ -87,21 +87,14 @@ class DepthReprojectionOfViews(_Figures):
     without_overlap: tuple[tuple[str, str], ...]  # names of the pairs without a co-visible pixel
 
 
-def depth_reprojection(
-    first: PosedPicture, second: PosedPicture, *, occlusion: float = 0.05
-) -> DepthReprojection:
-    """Follow first's pixels by their depth into second, and back by second's depth.
-
-    Both see one surface up to ``occlusion``, a relative difference of depth.
-    """
-    return _compare(first, second, occlusion)[0]
+def depth_reprojection(first: PosedPicture, second: PosedPicture) -> DepthReprojection:
+    """Follow first's pixels by their depth into second, and back by second's depth."""
+    return _compare(first, second)[0]
 
 
-def depth_reprojection_of_views(
-    pictures: Sequence[PosedPicture], *, occlusion: float = 0.05
-) -> DepthReprojectionOfViews:
+def depth_reprojection_of_views(pictures: Sequence[PosedPicture]) -> DepthReprojectionOfViews:
     """Depth reprojection of each view into its successor along the path."""
-    compared = [_compare(first, second, occlusion) for first, second in pairwise(pictures)]
+    compared = [_compare(first, second) for first, second in pairwise(pictures)]
     pairs = [pair for pair, _, _ in compared]
     covisible = np.array([pair.covisible for pair in pairs], np.int64)
     inside = np.array([pair.inside for pair in pairs], np.int64)
@@ -130,10 +123,10 @@ def depth_reprojection_of_views(
 
 
 def _compare(
-    first: PosedPicture, second: PosedPicture, occlusion: float
+    first: PosedPicture, second: PosedPicture
 ) -> tuple[DepthReprojection, Float64, Float64]:
     """The figures of a pair, and quantiles of its distances and of its relative differences."""
-    seen = correspond(first, second, occlusion=occlusion)
+    seen = correspond(first, second)
     on = seen.seen == Seen.COVISIBLE
     inside = len(seen.seen) - seen.count(Seen.OUTSIDE)
     pixels = np.linalg.norm(seen.back[on] - seen.start[on], axis=-1)

@@ -149,7 +149,6 @@ def feature_consistency(
     second: PosedPicture,
     *,
     network: FeatureNetwork | None = None,
-    occlusion: float = 0.05,
 ) -> FeatureConsistency:
     """Compare second's features, carried into first by depth and cameras, with first's.
 
@@ -159,7 +158,7 @@ def feature_consistency(
     network = network or DenseGradient()
     ours, theirs = network.features(first.rgb), network.features(second.rgb)
     where = _places(first, ours)
-    found = correspond(first, second, occlusion=occlusion, where=where)
+    found = correspond(first, second, where=where)
     on = found.seen == Seen.COVISIBLE
     here = found.start[on] / (first.camera.width[0], first.camera.height[0])
     there = found.xy[on] / (second.camera.width[0], second.camera.height[0])

@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras, Float64, invert_rigid
 
+# Relative difference of depth up to which two depths are of one surface.
+OCCLUSION = 0.05
+
 
 @dataclass(frozen=True, eq=False)
 class PosedPicture:
@@ -61,14 +64,13 @@ def correspond(
     first: PosedPicture,
     second: PosedPicture,
     *,
-    occlusion: float = 0.05,
     where: NDArray[np.bool_] | None = None,
 ) -> Correspondence:
     """Project first's known pixels into second, compare the depth there, and come back with it.
 
     Second's depth at a place between its pixels is interpolated bilinearly in 1/depth, which is
     exact on a plane, wherever the four neighbours are known and lie on one surface: their depths
-    differ by no more than ``occlusion``, |z / depth - 1|. Elsewhere it is that of the nearest
+    differ by no more than OCCLUSION, |z / depth - 1|. Elsewhere it is that of the nearest
     pixel. The pixels of first may be limited by an (H, W) mask, ``where``.
     """
     wanted, depth = known_depth(first)
@@ -84,7 +86,10 @@ def correspond(
 
     known, second_depth = known_depth(second)
     there = np.zeros(len(z))
-    there[inside] = _sample(np.where(known, second_depth, 0), xy[inside], spread=occlusion)
+    there[inside] = _sample(
+        np.where(known, second_depth, 0),
+        xy[inside],
+    )
     back = np.full_like(xy, np.nan)
     found = there > 0
     back[found], ahead = _carry(second.camera, first.camera, xy[found], depth=there[found])
@@ -94,8 +99,8 @@ def correspond(
     seen = np.full(len(z), Seen.COVISIBLE, np.uint8)
     # What second's depth puts behind the first camera is not what that camera saw, however near.
     astray = np.isnan(back[:, 0])
-    seen[(ratio > 1 + occlusion) | (astray & (ratio > 1))] = Seen.OCCLUDED
-    seen[(ratio < 1 - occlusion) | (astray & (ratio <= 1))] = Seen.CONTRADICTING
+    seen[(ratio > 1 + OCCLUSION) | (astray & (ratio > 1))] = Seen.OCCLUDED
+    seen[(ratio < 1 - OCCLUSION) | (astray & (ratio <= 1))] = Seen.CONTRADICTING
     seen[~found] = Seen.UNKNOWN
     seen[~inside] = Seen.OUTSIDE
     return Correspondence(rows, columns, xy, z, there, back, seen)
@@ -134,7 +139,7 @@ def _carry(
         return image[:, :2] / image[:, 2:], points[:, 2]
 
 
-def _sample(depth: NDArray[np.float32], xy: Float64, *, spread: float) -> Float64:
+def _sample(depth: NDArray[np.float32], xy: Float64) -> Float64:
     """Depth (H, W; 0 = none) at (N, 2) places inside the picture; 0 where there is none."""
     height, width = depth.shape
     flat = depth.ravel()
@@ -147,7 +152,7 @@ def _sample(depth: NDArray[np.float32], xy: Float64, *, spread: float) -> Float6
     base = top * width + left
     four = flat[np.stack([base, base + 1, base + width, base + width + 1])].astype(np.float64)
     low, high = four.min(0), four.max(0)
-    smooth = (low > 0) & (high <= low * (1 + spread))
+    smooth = (low > 0) & (high <= low * (1 + OCCLUSION))
     whole = whole[smooth]
     x, y = (xy[whole] - 0.5 - corner[whole]).T
     inverse = 1 / four[:, smooth]

@@ -147,16 +147,11 @@ def keys(kind: type[Settings], prefix: str | None = None) -> list[str]:
         prefix = f"{kind.section}." if kind.section else ""
     names = []
     for name, entry in entries(kind).items():
-        if name in hidden(kind):
+        if name in kind.options_of.values():
             continue
         nested = entry.section
         names += keys(nested, f"{prefix}{name}.") if nested else [f"{prefix}{name}"]
     return names
-
-
-def hidden(kind: type[Settings]) -> frozenset[str]:
-    """Fields that are set by the options of another one, see ``Settings.options_of``."""
-    return frozenset(kind.options_of.values())
 
 
 def _entry_at(kind: type[Settings], path: Sequence[str]) -> Entry | None:

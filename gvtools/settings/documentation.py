@@ -8,7 +8,7 @@ from pathlib import Path
 from types import NoneType
 from typing import Any, Literal, get_args, get_origin
 
-from gvtools.settings.base import Entry, Settings, entries, hidden
+from gvtools.settings.base import Entry, Settings, entries
 
 _TYPES = {bool: "true or false", int: "integer", float: "number", str: "text", Path: "path"}
 
@@ -54,7 +54,7 @@ def _sections(settings: Any, prefix: str = "", doc: str = "") -> Iterator[tuple[
     rows: _Rows = []
     inner = []
     for name, entry in entries(type(settings)).items():
-        if name in hidden(type(settings)):
+        if name in settings.options_of.values():
             continue
         key, value = f"{prefix}{name}", getattr(settings, name, "(required)")
         if entry.section is None:

@@ -44,19 +44,6 @@ def test_constant_errors_are_found_pooled_and_per_view():
     assert found["energy"] == pytest.approx(1)
 
 
-def test_only_generated_pixels_count():
-    rgb = RNG.uniform(0, 1, (*SHAPE, 3)).astype(np.float32)
-    depth = np.ones(SHAPE, np.float32)
-    generated = np.zeros(SHAPE, np.bool_)
-    generated[:, :, :8] = True
-    made, lengths = rgb.copy(), depth.copy()
-    made[~generated], lengths[~generated] = 0, 9
-    found = figures([score(made, lengths, true_rgb=rgb, true_depth=depth, generated=generated)])
-    assert found["psnr"] == pytest.approx(100)
-    assert found["depth"] is not None and found["depth"] < 1e-4
-    assert found["distance"] is None
-
-
 def test_depth_that_is_missing_is_an_infinite_error_and_unknown_truth_is_none():
     rgb = np.zeros((*SHAPE, 3), np.float32)
     depth, truth = np.ones(SHAPE, np.float32), np.ones(SHAPE, np.float32)

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from gvtools.errors import OptionError, ProjectError
 from gvtools.evaluation.published import load_benchmark
 from gvtools.evaluation.splits import SplitRule, protocol_split, split_scene
-from gvtools.scenes.selection import select
 
 EVERY = SplitRule(kind="every", every=8, source="test")
 
@@ -176,12 +175,6 @@ def test_the_two_layouts():
     assert (widest.window["stride"], widest.window["start"]) == (14, 1)
     three = protocol_split(NAMES[:9], context=3)
     assert three.context == (NAMES[0], NAMES[4], NAMES[8])
-
-
-def test_a_split_reads_as_two_selections_in_its_order():
-    split = protocol_split(NAMES, rounds=3, stride=4, seed=3)
-    assert select(NAMES, ",".join(split.context)) == split.context
-    assert select(NAMES, ",".join(split.targets)) == split.targets
 
 
 @pytest.mark.parametrize(

@@ -105,16 +105,6 @@ def test_a_step_loses_the_pixels_beside_it_and_no_others():
     assert len(back_project(_numbered(depth.shape), depth, source)) == depth.size
 
 
-def test_flying_pixels_between_two_surfaces_are_dropped():
-    source = camera(width=60, height=40, focal=50)
-    depth = np.full((40, 60), 2, np.float32)
-    depth[:, 31:] = 4
-    depth[:, 30] = 3
-    lifted = back_project(_numbered(depth.shape), depth, source)
-    assert not np.isin(lifted.colors[:, 1], 30).any()
-    np.testing.assert_array_equal(np.unique(lifted.positions[:, 2]), (2, 4))
-
-
 def test_grazing_surfaces_are_dropped():
     source = camera(width=60, height=40, focal=50)
     depth = _plane_depth(source, np.array((0, 0.8, 0.6)), 1.0)

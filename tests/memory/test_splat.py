@@ -69,21 +69,6 @@ def test_the_number_of_threads_changes_nothing(seed):
             np.testing.assert_array_equal(getattr(results[0], name), getattr(other, name))
 
 
-def test_boxes_hold_their_observations_also_after_merging():
-    """Culling trusts the boxes; a merge moves an observation of an earlier view."""
-    rng = np.random.default_rng(0)
-    memory = SpatialMemory(0.2)
-    source = camera()
-    for _ in range(4):
-        where = rng.uniform((-1, -1, 2), (1, 1, 4), (500, 3))
-        memory.fuse(points(where, source=source, spacing=rng.uniform(0.1, 2, 500)), round=0)
-    records, runs = memory.columns, memory.segments
-    run = np.repeat(np.arange(runs.count), runs.length[: runs.count])
-    assert (records.positions >= runs.box[run, :3]).all()
-    assert (records.positions <= runs.box[run, 3:6]).all()
-    assert (records.spacing[: len(memory)] <= runs.box[run, 6]).all()
-
-
 def test_generated_content_never_outranks_observed_content():
     """Whatever generated views add, the pixels that observed views fill stay as they are."""
     target = camera(width=64, height=48, focal=60)

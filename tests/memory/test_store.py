@@ -16,7 +16,6 @@ from memory_scenes import camera, plane_view, points, random_memory, random_poin
 from gvtools.errors import DegenerateError, OptionError, ShapeError
 from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory, TiledMemory
 from gvtools.memory.splat.api import SplatOptions
-from gvtools.memory.splat.torch_splatter import TorchSplatter
 from gvtools.memory.store import tile_set
 from gvtools.memory.store.observations import ATTRIBUTES
 from gvtools.memory.store.octree import (
@@ -80,13 +79,6 @@ def test_growth_keeps_what_is_there_and_a_cloud_of_before_stays_whole():
 def _frame(depth: float):
     rgb = np.full((30, 40, 3), 90, np.uint8)
     return rgb, np.full((30, 40), depth, np.float32), camera(**SIZE)
-
-
-def test_the_torch_back_end_reads_the_store_in_place():
-    memory = random_memory(2)
-    splatter = TorchSplatter(memory, SplatOptions(backend="torch", device="cpu"))
-    for tensor, name in ((splatter.xyz, "positions"), (splatter.confidence, "confidence")):
-        assert np.shares_memory(tensor.numpy(), getattr(memory.columns.arrays, name))
 
 
 def test_observing_is_lifting_and_fusing():

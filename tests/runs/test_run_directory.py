@@ -136,11 +136,6 @@ def test_a_file_in_the_folders_place_is_refused_untouched(tmp_path):
     assert (tmp_path / "run").read_text() == "mine"
 
 
-def test_a_voxel_too_small_to_be_addressed_is_blamed(scan, tmp_path, capsys):
-    assert reconstruct(scan, tmp_path / "run", "--voxel", "1e-9") == 2
-    assert "voxel edge" in capsys.readouterr().err.splitlines()[-1]
-
-
 def test_cuda_without_a_device_is_refused_before_anything_is_written(
     scan, tmp_path, capsys, monkeypatch
 ):
@@ -210,16 +205,6 @@ def test_a_run_whose_rounds_were_deleted_is_not_overwritten(finished, capsys):
     assert (out / "memory.npz").read_bytes() == memory
     assert reconstruct(scan, out, "--resume") == 0
     assert (out / "memory.npz").read_bytes() == memory
-
-
-def test_a_run_without_its_first_round_is_done_anew(finished):
-    scan, out = finished
-    memory = (out / "memory.npz").read_bytes()
-    shutil.rmtree(out / "round_000")
-    assert reconstruct(scan, out) == 2
-    assert reconstruct(scan, out, "--resume") == 0
-    assert (out / "memory.npz").read_bytes() == memory
-    assert sorted(path.name for path in out.glob("round_*")) == [f"round_00{i}" for i in range(3)]
 
 
 def test_a_memory_that_went_with_a_removed_round_is_said(finished, capsys):
