@@ -128,7 +128,6 @@ def _links(holes, inverse):
 def relax(rgb, holes, neighbors, links, hint, weight, sweeps):
     """Successive over-relaxation of the membrane with data terms, in row-major order."""
     count = len(holes)
-    hinted = len(weight) > 1
     # What each pixel is drawn to is a mean: of four neighbours, whose shares are found once, and
     # of what the data say.
     share = np.zeros((count, 4))
@@ -136,7 +135,7 @@ def relax(rgb, holes, neighbors, links, hint, weight, sweeps):
     step = np.zeros(count)
     for m in range(count):
         i = holes[m]
-        data = weight[i] if hinted else 0.0
+        data = weight[i]
         total = links[m, 0] + links[m, 1] + links[m, 2] + links[m, 3] + data
         # A pixel cut off from all neighbours keeps its seed.
         if total > 1e-3:
@@ -144,7 +143,7 @@ def relax(rgb, holes, neighbors, links, hint, weight, sweeps):
             for k in range(4):
                 share[m, k] = links[m, k] / total
             for c in range(3):
-                given[m, c] = data * hint[i, c] / total if hinted else 0.0
+                given[m, c] = data * hint[i, c] / total
     for _ in range(sweeps):
         for m in range(count):
             i = holes[m]

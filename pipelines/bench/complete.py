@@ -80,8 +80,7 @@ def random_features(config: GeoVerseConfig, batch: ViewBatch) -> VideoFeatures |
     rows, columns = (side // TOKEN for side in config.video.size(*batch.size))
     samples, views = batch.images.shape[:2]
     shape = (samples, views, config.video.channels, rows, columns)
-    levels = tuple(torch.randn(shape, device=batch.images.device) for _ in config.video.taps)
-    return VideoFeatures(levels, tuple(range(views)))
+    return tuple(torch.randn(shape, device=batch.images.device) for _ in config.video.taps)
 
 
 def _filled(network: nn.Module, device: torch.device | str, dtype: torch.dtype) -> nn.Module:

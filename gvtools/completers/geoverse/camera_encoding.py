@@ -31,6 +31,7 @@ COINCIDENT = 8
 GROUP = 4
 # Half of the channels in groups of four, and two rotary quarters of pairs.
 HEAD_MULTIPLE = 8
+ROTARY_BASE = 100.0  # of the rotary frequencies
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +158,6 @@ class Projective:
         *,
         grid: tuple[int, int],  # (h, w) tokens of a view, row-major
         head_dim: int,  # channels of an attention head, a multiple of 8
-        base: float = 100.0,  # of the rotary frequencies
         # (y, x) tokens of another grid per token of this one: keys that lie on a coarser grid get
         # the positions of their centres on the queries' grid.
         position_scale: tuple[float, float] = (1.0, 1.0),
@@ -172,7 +172,7 @@ class Projective:
             cam_from_world.to(dtype), K, size=size, invert_K=invert_K
         )
         self.cos, self.sin = _angles(
-            grid, head_dim // 8, base, scale=position_scale, like=self.matrix.new_empty(0)
+            grid, head_dim // 8, scale=position_scale, like=self.matrix.new_empty(0)
         )
         # As wide as half a head, so that whole rows are multiplied: rows of four are slow.
         self._query, self._key, self._output = (
@@ -239,7 +239,6 @@ def projection_matrices(
 def _angles(
     grid: tuple[int, int],
     frequencies: int,
-    base: float,
     *,
     scale: tuple[float, float],
     like: Tensor,
@@ -251,7 +250,7 @@ def _angles(
     )
     position = torch.stack((columns.repeat(grid[0]), rows.repeat_interleave(grid[1])), dim=-1)
     exponent = torch.arange(frequencies, dtype=like.dtype, device=like.device) / frequencies
-    angle = position[..., None] * base**-exponent
+    angle = position[..., None] * ROTARY_BASE**-exponent
     return angle.cos(), angle.sin()
 
 

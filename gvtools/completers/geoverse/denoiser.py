@@ -247,7 +247,9 @@ class Denoiser(Recomputing):
 
     def embed(self, noisy: Tensor, conditions: Conditions) -> tuple[Tensor, Tensor]:
         """Tokens that enter the encoder, (B, V, N, width), and the head, (B, V, N, head_width)."""
-        return self.encoder_tokens(noisy, conditions), self.head_tokens(noisy, conditions)
+        pair = torch.cat((conditions.latents, noisy), dim=2)
+        x = self._split("x", pair, conditions.camera.context).to(self.t_embedder.W.dtype)
+        return self.encoder_tokens(noisy, conditions), x
 
     def encoder_tokens(self, noisy: Tensor, conditions: Conditions) -> Tensor:
         """Tokens that enter the encoder, (B, V, N, width)."""
@@ -262,11 +264,6 @@ class Denoiser(Recomputing):
             s = s + _tokens(self.depth_embedder, conditions.depth.to(s.dtype))
         # Under autocast the streams stay in full precision; only the products are rounded.
         return s.to(self.t_embedder.W.dtype)
-
-    def head_tokens(self, noisy: Tensor, conditions: Conditions) -> Tensor:
-        """Tokens that enter the head, (B, V, N, head_width)."""
-        pair = torch.cat((conditions.latents, noisy), dim=2)
-        return self._split("x", pair, conditions.camera.context).to(self.t_embedder.W.dtype)
 
     def time(self, t: Tensor, views: int) -> Tensor:
         """(B,) or (B, V) to the encoder's (B, V, 1, width) time embedding."""

@@ -315,7 +315,7 @@ class GeoVerse(nn.Module):
             return prepared
         with self.clock(VIDEO):
             if self.control is not None:
-                adapted = self.control.adapted(features.tensors, prepared.grid)
+                adapted = self.control.adapted(features, prepared.grid)
                 return replace(prepared, adapted=adapted)
             keys = self._keys(features, prepared.level1.camera, prepared.grid)
             return replace(prepared, video=features, keys=keys)

@@ -169,6 +169,6 @@ def video_keys(
             position_scale=(grid[0] / level.shape[-2], grid[1] / level.shape[-1]),
             invert_K=denoiser.invert_K,
         )
-        for level in features.tensors
+        for level in features
     ]
-    return shared(features.tensors, positions)
+    return shared(features, positions)

@@ -12,7 +12,7 @@ four. It drops the rest of other lengths without a word, so clips have such a le
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -156,25 +156,8 @@ def seed_rows(seed: int | Sequence[Sequence[int]], batch: int, views: int) -> li
     return [list(row) for row in seed]
 
 
-@dataclass(frozen=True, eq=False)
-class VideoFeatures:
-    """F^W, to be handed to every denoising step."""
-
-    tensors: tuple[Tensor, ...]  # one (B, V, C, h, w) for each tap
-    # Which of the video model's latents each view's features come from; views with the same number
-    # have the same features.
-    latent_of_view: tuple[int, ...]
-
-    @property
-    def grid(self) -> tuple[int, int]:
-        """Rows and columns of tokens."""
-        return self.tensors[0].shape[-2], self.tensors[0].shape[-1]
-
-    def to(
-        self, device: torch.device | str | None = None, dtype: torch.dtype | None = None
-    ) -> VideoFeatures:
-        """On another device, in another dtype."""
-        return replace(self, tensors=tuple(t.to(device=device, dtype=dtype) for t in self.tensors))
+# F^W, to be handed to every denoising step: a (B, V, C, h, w) for each tap.
+VideoFeatures = tuple[Tensor, ...]
 
 
 class VideoPrior:
@@ -279,12 +262,8 @@ class VideoPrior:
                     timestep=self.config.timestep,
                     blocks=self.config.taps,
                 )
-            where = layout.latent_of_view
-            tensors = (
-                torch.stack([x[:, latent] for latent in where], dim=1).movedim(-1, 2).contiguous()
-                for x in outputs
-            )
-            return VideoFeatures(tuple(tensors), where)
+            where = list(layout.latent_of_view)
+            return tuple(x[:, where].movedim(-1, 2).contiguous() for x in outputs)
 
     def _proxy(
         self, images: Tensor, valid: Tensor, context: int, *, seeds: list[list[int]]

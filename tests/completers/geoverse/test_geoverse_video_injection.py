@@ -37,8 +37,8 @@ class Case:
             ).to(dtype)
         self.x, self.t, self.known = micro.conditions(dtype=dtype)
         self.positions = Positions(self.net.config, self.known.camera, micro.GRID)
-        features = micro.video_features(*self.x.shape[:2]).to(dtype=dtype).tensors
-        self.features = features[: len(layers)]
+        features = micro.video_features(*self.x.shape[:2])
+        self.features = [level.to(dtype) for level in features[: len(layers)]]
 
     def residuals(self) -> dict[int, Tensor]:
         adapted = self.branch.adapted(self.features, micro.GRID)
@@ -141,7 +141,7 @@ class SharedCase:
         self.x, self.t, self.known = micro.conditions(dtype=torch.float64)
         self.positions = Positions(self.net.config, self.known.camera, micro.GRID)
         features = micro.video_features(*self.x.shape[:2], grid=grid)
-        self.features = features.to(dtype=torch.float64).tensors
+        self.features = tuple(level.double() for level in features)
         camera = self.known.camera
         self.video_positions = Projective(
             camera.cam_from_world, camera.K, camera.size, grid=grid, head_dim=HEAD_DIM,

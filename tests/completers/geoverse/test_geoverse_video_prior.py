@@ -119,17 +119,17 @@ def test_features_are_those_of_the_paper_and_include_the_vace_hint(network: Any)
     images, valid = tiny.views(3)
     features = prior.features(images, valid, 1)
     expected = reference(prior, images, valid)
-    for found, wanted in zip(features.tensors, expected, strict=True):
+    for found, wanted in zip(features, expected, strict=True):
         assert found.shape == (1, 3, 48, 2, 3)
         torch.testing.assert_close(found, wanted, rtol=0, atol=1e-5)
-    assert features.grid == (2, 3)
+    assert features[0].shape[3:] == (2, 3)
     # The hints are not small: without them the comparison would have failed.
     network.vace_blocks[0].proj_out.weight.data *= -1
     try:
         other = prior.features(images, valid, 1)
     finally:
         network.vace_blocks[0].proj_out.weight.data *= -1
-    assert (other.tensors[0] - expected[0]).abs().max() > 0.05
+    assert (other[0] - expected[0]).abs().max() > 0.05
 
 
 def test_layouts_say_which_latent_holds_which_view() -> None:
@@ -152,12 +152,12 @@ def test_layouts_say_which_latent_holds_which_view() -> None:
 def test_views_in_one_latent_share_features_and_others_do_not(network: Any, name: Layout) -> None:
     images, valid = tiny.views(6)
     features = tiny.prior(network, layout=name).features(images, valid, 1)
-    assert features.latent_of_view == view_layout(name, 6).latent_of_view
-    for tensor in features.tensors:
+    latents = view_layout(name, 6).latent_of_view
+    for tensor in features:
         assert tensor.shape == (1, 6, 48, 2, 3)
         for a in range(6):
             for b in range(a):
-                same = features.latent_of_view[a] == features.latent_of_view[b]
+                same = latents[a] == latents[b]
                 assert torch.equal(tensor[:, a], tensor[:, b]) == same
 
 
@@ -226,8 +226,8 @@ def test_the_seed_decides_and_each_view_draws_for_itself(network: Any) -> None:
     spy = Spy(prior)
     images, valid = tiny.views(3, batch=2)
     first, again, other = (prior.features(images, valid, 1, seed=s) for s in (1, 1, 2))
-    assert all(map(torch.equal, first.tensors, again.tensors))
-    assert not torch.equal(first.tensors[0], other.tensors[0])
+    assert all(map(torch.equal, first, again))
+    assert not torch.equal(first[0], other[0])
     rows = [
         [view_seed(7, "frame", v) for v in range(3)],
         [view_seed(8, "frame", v) for v in range(3)],
@@ -238,7 +238,7 @@ def test_the_seed_decides_and_each_view_draws_for_itself(network: Any) -> None:
         alone = prior.features(
             images[item : item + 1], valid[item : item + 1], 1, seed=rows[item:][:1]
         )
-        for found, wanted in zip(alone.tensors, both.tensors, strict=True):
+        for found, wanted in zip(alone, both, strict=True):
             torch.testing.assert_close(found[0], wanted[item], rtol=0, atol=1e-5)
     fewer = [0, 2]
     prior.features(images[:, fewer], valid[:, fewer], 1, seed=[[r[v] for v in fewer] for r in rows])
@@ -251,14 +251,14 @@ def test_the_video_model_runs_once_and_gradients_stop_at_its_features(network: A
     spy = Spy(prior)
     images, valid = tiny.views(3)
     features = prior.features(images, valid, 1)
-    kept = [t.clone() for t in features.tensors]
+    kept = [t.clone() for t in features]
     adapter = nn.Conv2d(48, 4, 1)
     for _ in range(4):  # denoising steps, which also train an adapter
-        adapter(features.tensors[0].flatten(0, 1)).square().sum().backward()
+        adapter(features[0].flatten(0, 1)).square().sum().backward()
     assert len(spy.calls) == 1
-    assert all(map(torch.equal, features.tensors, kept))
+    assert all(map(torch.equal, features, kept))
     assert adapter.weight.grad is not None
-    assert not any(t.requires_grad for t in features.tensors)
+    assert not any(t.requires_grad for t in features)
     assert all(p.grad is None and not p.requires_grad for p in network.parameters())
     assert not any(m._forward_pre_hooks for m in [*network.blocks, network.norm_out])
 
@@ -266,7 +266,7 @@ def test_the_video_model_runs_once_and_gradients_stop_at_its_features(network: A
 def test_other_sizes_give_the_tokens_of_the_resolution(network: Any) -> None:
     prior = tiny.prior(network, resolution=(48, 64))
     features = prior.features(*tiny.views(2, size=(42, 56)), 1)
-    assert features.grid == (3, 4)
+    assert features[0].shape[3:] == (3, 4)
 
 
 @pytest.mark.parametrize("size", [(48, 64), (20, 30), (42, 56)])
@@ -292,10 +292,10 @@ def test_the_empty_prompt_is_not_zeros(network: Any) -> None:
     images, valid = tiny.views(2)
     empty = tiny.prior(network).features(images, valid, 1)
     zeros = tiny.prior(network, prompt="zeros").features(images, valid, 1)
-    assert not torch.equal(empty.tensors[0], zeros.tensors[0])
+    assert not torch.equal(empty[0], zeros[0])
     config = replace(tiny.CONFIG, prompt="zeros")
     without = VideoPrior(network, tiny.vae(), config=config)
-    assert torch.equal(without.features(images, valid, 1).tensors[0], zeros.tensors[0])
+    assert torch.equal(without.features(images, valid, 1)[0], zeros[0])
     with pytest.raises(CheckpointError, match="no embedding of the empty prompt"):
         VideoPrior(network, tiny.vae(), config=tiny.CONFIG)
     with pytest.raises(CheckpointError, match="prompt"):
@@ -353,7 +353,7 @@ def test_lent_weights_come_home_without_being_copied_back(network, monkeypatch):
     found = prior.features(*views)
     assert len(moved) >= len(tensors)
     assert [tensor.data_ptr() for tensor in tensors] == home
-    for one, other in zip(found.tensors, wanted.tensors, strict=True):
+    for one, other in zip(found, wanted, strict=True):
         assert torch.equal(one, other)
     with pytest.raises(ZeroDivisionError), networks.lent(torch.device("cpu", 0)):
         _ = 1 / 0

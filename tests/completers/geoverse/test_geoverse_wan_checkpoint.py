@@ -91,7 +91,7 @@ def check_folder(folder: Path, **options: Any) -> VideoPrior:
 
 
 def features(prior: VideoPrior) -> tuple[Tensor, ...]:
-    return prior.features(*tiny.views(2, size=(16, 32)), 1).tensors
+    return prior.features(*tiny.views(2, size=(16, 32)), 1)
 
 
 @pytest.mark.parametrize("wrapper", ["", "model.diffusion_model."])
