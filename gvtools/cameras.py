@@ -182,13 +182,12 @@ def check_usable(cameras: Cameras) -> None:
         K, name = camera.K[0], camera.names[0]
         if not (np.isfinite(K).all() and np.isfinite(camera.cam_from_world).all()):
             raise ShapeError(f"{name}: its camera holds NaN or infinity; mend it or drop the view")
-        if not (K[0, 0] > 0 and K[1, 1] > 0):
-            raise ShapeError(
-                f"{name}: focal lengths {K[0, 0]:g} and {K[1, 1]:g} px; expected positive ones"
-            )
         width, height = int(camera.width[0]), int(camera.height[0])
-        if width < 1 or height < 1:
-            raise ShapeError(f"{name}: an image of {width} x {height} pixels; expected at least 1")
+        if not min(K[0, 0], K[1, 1], width, height) > 0:
+            raise ShapeError(
+                f"{name}: focal lengths {K[0, 0]:g} and {K[1, 1]:g} px and an image of {width} x "
+                f"{height} pixels; expected positive ones"
+            )
 
 
 def concatenate(parts: Sequence[Cameras]) -> Cameras:

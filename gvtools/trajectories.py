@@ -44,10 +44,7 @@ def interpolate(cameras: Cameras, count: int) -> Cameras:
     from scipy.interpolate import PchipInterpolator
     from scipy.spatial.transform import Rotation, Slerp
 
-    if len(cameras) < 2 or count < 2:
-        raise OptionError(
-            f"interpolate: {len(cameras)} key camera(s), {count} asked for; expected 2 or more each"
-        )
+    _check_counts("interpolate", cameras, count, given=2, asked=2)
     world = cameras.world_from_cam
     rotation = Rotation.from_matrix(world[:, :3, :3])
     steps = _steps(world[:, :3, 3], (rotation[:-1].inv() * rotation[1:]).magnitude())
@@ -73,6 +70,14 @@ def interpolate(cameras: Cameras, count: int) -> Cameras:
         cameras.height[nearest],
         (),
     )
+
+
+def _check_counts(what: str, cameras: Cameras, count: int, *, given: int, asked: int) -> None:
+    if len(cameras) < given or count < asked:
+        raise OptionError(
+            f"{what}: {len(cameras)} camera(s) given, {count} asked for; expected {given} or more, "
+            f"and {asked} or more"
+        )
 
 
 def _steps(centers: Float64, turned: Float64) -> Float64:
@@ -174,10 +179,7 @@ def orbit(cameras: Cameras, count: int, *, center: ArrayLike | None = None) -> C
         count: number of cameras, >= 1.
         center: (3,) what to look at; None means ``focus_point``.
     """
-    if len(cameras) < 1 or count < 1:
-        raise OptionError(
-            f"orbit: {len(cameras)} camera(s) given, {count} asked for; expected 1 or more"
-        )
+    _check_counts("orbit", cameras, count, given=1, asked=1)
     middle = focus_point(cameras) if center is None else np.asarray(center, np.float64)
     axis = mean_up(cameras)
     offset = cameras.centers - middle
@@ -205,10 +207,7 @@ def spiral(cameras: Cameras, count: int) -> Cameras:
         cameras: a forward-facing capture, at least two; intrinsics and size are the first's.
         count: number of cameras, >= 1; the end meets the start after TURNS revolutions.
     """
-    if len(cameras) < 2 or count < 1:
-        raise OptionError(
-            f"spiral: {len(cameras)} camera(s) given, {count} asked for; expected 2 and 1 or more"
-        )
+    _check_counts("spiral", cameras, count, given=2, asked=1)
     middle = cameras.centers.mean(axis=0)
     forward = cameras.world_from_cam[:, :3, 2].mean(axis=0)
     if np.linalg.norm(forward) < 1e-3:
