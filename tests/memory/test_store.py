@@ -330,3 +330,12 @@ def test_far_tiles_are_drawn_from_thinned_copies(tmp_path, monkeypatch):
     memory.project(source, options=SplatOptions(far_detail_px=1.0))
     close = memory.project(source)
     assert close.coverage > 0.9
+
+
+def test_a_cloud_with_colours_of_two_channels_is_refused() -> None:
+    import open3d as o3d
+
+    cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor(np.random.rand(200, 3).astype(np.float32)))
+    cloud.point.colors = o3d.core.Tensor(np.zeros((200, 2), np.float32))
+    with pytest.raises(ShapeError, match="colors has shape"):
+        SpatialMemory.from_point_cloud(cloud)

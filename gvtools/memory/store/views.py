@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras, concatenate
+from gvtools.errors import ShapeError
 from gvtools.memory.store.local_frame import LocalFrame
 
 # K (3, 3), cam_from_world (4, 4) and free-space grid (h, w) of one view (see PointSet).
@@ -32,6 +33,14 @@ class PointSet:
     free_depth: NDArray[np.float32] | None
     # How many pixels gave no point, by reason.
     dropped: dict[str, int]
+
+    def __post_init__(self) -> None:
+        count = len(self.positions)
+        shapes = {"positions": (count, 3), "colors": (count, 3), "confidence": (count,)}
+        for name, shape in {**shapes, "spacing": (count,)}.items():
+            found = getattr(self, name).shape
+            if found != shape:
+                raise ShapeError(f"points: {name} has shape {found}; expected {shape}")
 
     def __len__(self) -> int:
         return len(self.positions)
