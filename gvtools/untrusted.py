@@ -108,7 +108,10 @@ def regular(path: Path) -> Path:
         ...
     OSError: [Errno 22] is a folder; expected a file: '/'
     """
-    mode = os.stat(path).st_mode
+    try:
+        mode = os.stat(path).st_mode
+    except ValueError as error:  # a name with a null
+        raise OSError(22, str(error), repr(str(path))) from None
     if not stat.S_ISREG(mode):
         what = "folder" if stat.S_ISDIR(mode) else "pipe or a device"
         raise OSError(22, f"is a {what}; expected a file", str(path))

@@ -94,3 +94,8 @@ def test_wrong_files_are_refused_with_the_line(tmp_path, text, words):
     path.write_text(text, encoding="ascii")
     with pytest.raises(ProjectError, match=words):
         read_trajectory(path, _cameras(1))
+
+
+def test_a_name_with_a_null_is_refused() -> None:
+    with pytest.raises(ProjectError, match="null"):
+        read_poses("a\0b")
