@@ -81,7 +81,8 @@ def open_project(
     _refuse(path, f"no scene of a data set, {FORM}", {"root": root})
     path = Path(path)
     if not path.is_dir() and not path.is_file():
-        raise ProjectError(f"{path}: no such folder{_nearest(path)}")
+        what = "neither a folder nor a file" if path.exists() else "no such folder" + _nearest(path)
+        raise ProjectError(f"{path}: {what}")
     if is_archive(path):
         try:
             scene = open_project(unpacked(path), images=images, masks=masks, rgbd=rgbd, model=model)

@@ -116,3 +116,8 @@ def test_alpha_of_pictures(tmp_path, alpha, masked, value):
     save(tmp_path / "images" / "a.png", picture * np.uint8([1, 1, 1, 0]))
     levels = [item.level for item in open_project(tmp_path, alpha=alpha).findings]
     assert ("warning" in levels) == masked  # all of it is transparent
+
+
+def test_a_device_is_not_called_absent() -> None:
+    with pytest.raises(ProjectError, match="neither a folder nor a file"):
+        open_project("/dev/null")
