@@ -111,9 +111,7 @@ def intrinsics_beside(root: Path) -> tuple[Float64, str] | None:
     texts = [path for path in places if path.is_file()][:1]
     found = [(load_matrix(path, (3, 3)), path) for path in texts]
     for path in sorted(root.glob("*.json")):
-        if path.is_file() and (
-            path.name == "camera.json" or "intrinsic_matrix" in json_object(path)
-        ):
+        if path.is_file() and (path.name == "camera.json" or "intrinsic_matrix" in _text(path)):
             found.append((open3d_intrinsics(path), path))
             break
     if len(found) == 2 and not np.allclose(found[0][0], found[1][0], rtol=1e-4):
@@ -155,6 +153,14 @@ def exported_intrinsics(root: Path, camera: str) -> list[tuple[Float64, str]]:
             found += [(K[:3, :3], path.name)] if K is not None else []
             found += [(pinhole(values.tolist()), path.name)] if values is not None else []
     return found
+
+
+def _text(path: Path) -> str:
+    """As long as it can be read: a damaged calibration still tells that it is one."""
+    try:
+        return read_text(path)
+    except (OSError, ValueError):
+        return ""
 
 
 def times_as_large(center: ArrayLike, size: tuple[int, int]) -> float:

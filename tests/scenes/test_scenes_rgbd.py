@@ -280,6 +280,13 @@ def test_a_damaged_camera_file_is_refused_and_two_that_differ_are(tmp_path, text
         TUM.read(root)
 
 
+def test_a_camera_file_of_any_name_that_is_cut_is_refused(tmp_path):
+    root = tum(tmp_path / "office")
+    (root / "camera_primesense.json").write_text('{"width": 640, "intrinsic_matrix": [525.0, 0')
+    with pytest.raises(ProjectError, match=r"camera_primesense.json: .* expected Open3D's form"):
+        TUM.read(root)
+
+
 def test_tum_freiburg1_distortion_is_opencvs(tmp_path):
     scene = TUM.read(tum(tmp_path / "rgbd_dataset_freiburg1_desk"))
     (fx, fy, cx, cy), (k1, k2, p1, p2, k3) = PUBLISHED["freiburg1"]
