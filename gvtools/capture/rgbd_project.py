@@ -26,15 +26,8 @@ from gvtools.poses.recording import RecordingPoses, RgbdFrames, find_poses
 from gvtools.scenes.calibration import INTRINSICS
 from gvtools.scenes.images import UNREADABLE, read_depth
 from gvtools.scenes.matching import named
-from gvtools.scenes.rgbd import (
-    SIDECAR,
-    UNPOSED,
-    Recording,
-    RgbdOptions,
-    read_unposed,
-    resolve_options,
-    rgbd_scene,
-)
+from gvtools.scenes.rgbd import SIDECAR, Recording, RgbdOptions, resolve_options, rgbd_scene
+from gvtools.scenes.rgbd_layouts import UNPOSED, read_unposed
 from gvtools.scenes.scene import Finding, Scene
 from gvtools.trajectories import level_up
 from gvtools.untrusted import open_picture

@@ -20,7 +20,8 @@ from gvtools.scenes.layout import ARCHIVES, FORM, SPEC, is_address
 from gvtools.scenes.matching import named
 from gvtools.scenes.phones import POLYCAM, RECORD3D, SCANNER_APP, STRAY_SCANNER
 from gvtools.scenes.photographs import Photograph
-from gvtools.scenes.rgbd import LAYOUTS, RgbdOptions, count_unposed
+from gvtools.scenes.rgbd import RgbdOptions
+from gvtools.scenes.rgbd_layouts import LAYOUTS, count_unposed
 from gvtools.scenes.scene import Finding, Scene
 from gvtools.scenes.transforms import FILE as TRANSFORMS
 from gvtools.scenes.transforms import SPLITS, is_transforms, read_transforms

@@ -92,7 +92,7 @@ def capture(
         options: what the user said of photographs and videos, by names of PHOTOGRAPHIC.
     """
     from gvtools.scenes import project as projects
-    from gvtools.scenes.rgbd import count_unposed
+    from gvtools.scenes.rgbd_layouts import count_unposed
     from gvtools.untrusted import unpacked
 
     if not source.exists():

@@ -19,7 +19,8 @@ from gvtools.capture.rgbd_project import capture_rgbd
 from gvtools.errors import ProjectError
 from gvtools.poses.recording import RgbdFrames, compare, residual, start_from_features
 from gvtools.scenes.project import open_project
-from gvtools.scenes.rgbd import RgbdOptions, count_unposed, read_unposed, rgbd_scene
+from gvtools.scenes.rgbd import RgbdOptions, rgbd_scene
+from gvtools.scenes.rgbd_layouts import count_unposed, read_unposed
 from pipelines.cli import main
 
 COUNT = 12

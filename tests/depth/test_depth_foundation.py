@@ -26,7 +26,7 @@ from gvtools.networks.depth_anything.network import (
     load_depth_anything,
 )
 from gvtools.scenes.colmap import read_colmap
-from gvtools.scenes.rgbd import SEVENSCENES
+from gvtools.scenes.rgbd_layouts import SEVENSCENES
 from gvtools.scenes.scene import Scene
 from pipelines.cli import main
 

@@ -28,7 +28,7 @@ from gvtools.depth.stereo.plane_sweep import PlaneSweepStereo
 from gvtools.errors import CheckpointError, DegenerateError, OptionError, ProjectError
 from gvtools.scenes.colmap import read_colmap
 from gvtools.scenes.images import write_depth_map
-from gvtools.scenes.rgbd import SEVENSCENES
+from gvtools.scenes.rgbd_layouts import SEVENSCENES
 from gvtools.scenes.scene import Frame, Scene, SparsePoints, View
 from pipelines.cli import main
 

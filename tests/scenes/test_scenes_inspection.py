@@ -12,7 +12,7 @@ from gvtools.depth.choice import choose_source
 from gvtools.errors import ProjectError
 from gvtools.scenes.colmap import read_colmap
 from gvtools.scenes.inspection import inspect, reprojection_errors
-from gvtools.scenes.rgbd import SEVENSCENES
+from gvtools.scenes.rgbd_layouts import SEVENSCENES
 
 
 def test_report_of_a_model(tmp_path):

@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 from gvtools.errors import GvError, OptionError, ProjectError, ShapeError
 from gvtools.scenes.images import read_depth
 from gvtools.scenes.project import open_project
-from gvtools.scenes.rgbd import PUBLISHED, REDWOOD, SCANNET, SEVENSCENES, TUM, RgbdOptions
+from gvtools.scenes.rgbd import RgbdOptions
+from gvtools.scenes.rgbd_layouts import PUBLISHED, REDWOOD, SCANNET, SEVENSCENES, TUM
 
 
 def messages(scene):

@@ -33,14 +33,8 @@ from gvtools.scenes.images import decode_picture, read_depth, readings
 from gvtools.scenes.layout import Layout
 from gvtools.scenes.matching import natural, pictures_by_stem, pose_at, scenes_holding
 from gvtools.scenes.photographs import Depth, PosedFrame, Registration, first_size, posed_scene
-from gvtools.scenes.rgbd import (
-    SCANNET,
-    SCANNET_FOLDER,
-    SEVENSCENES,
-    SEVENSCENES_FOLDER,
-    RgbdOptions,
-    rgbd_scene,
-)
+from gvtools.scenes.rgbd import RgbdOptions, rgbd_scene
+from gvtools.scenes.rgbd_layouts import SCANNET, SCANNET_FOLDER, SEVENSCENES, SEVENSCENES_FOLDER
 from gvtools.scenes.scene import Finding, Frame, Scene
 from gvtools.scenes.undistort import LensParameters
 from gvtools.untrusted import read_text, reading, regular
@@ -61,8 +55,8 @@ def _read_sevenscenes(root: Path, scene: str) -> Scene:
 
 # --- ScanNet v2 -------------------------------------------------------------------------------
 #
-# Exported folders, see ``gvtools.scenes.rgbd``, or the native ``SCENE.sens``: a head with the
-# cameras, then frames one after another. It is indexed at opening and read frame by frame.
+# Exported folders, see ``gvtools.scenes.rgbd_layouts``, or the native ``SCENE.sens``: a head with
+# the cameras, then frames one after another. It is indexed at opening and read frame by frame.
 
 
 def _scannet_scenes(root: Path) -> tuple[str, ...]:

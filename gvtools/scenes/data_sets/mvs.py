@@ -24,7 +24,7 @@ from gvtools.scenes.images import read_pfm_depth
 from gvtools.scenes.layout import Layout
 from gvtools.scenes.matching import natural, pictures_by_stem
 from gvtools.scenes.photographs import PosedFrame, first_size, posed_scene
-from gvtools.scenes.rgbd import read_log
+from gvtools.scenes.rgbd_layouts import read_log
 from gvtools.scenes.scene import Finding, Scene
 from gvtools.untrusted import load_arrays, read_text, reading
 

@@ -13,7 +13,7 @@ from gvtools.depth.stereo.plane_sweep import PlaneSweepStereo
 from gvtools.errors import DegenerateError, OptionError, ProjectError
 from gvtools.scenes.colmap import read_colmap
 from gvtools.scenes.project import open_project
-from gvtools.scenes.rgbd import SEVENSCENES
+from gvtools.scenes.rgbd_layouts import SEVENSCENES
 from gvtools.scenes.scene import Frame, Scene, View
 from gvtools.settings import with_texts
 from pipelines.cli import main
