@@ -15,6 +15,7 @@ identity.
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -376,13 +377,16 @@ class _RtabMap(_ScanNet):
     def posed(self, recording: Recording, *, strict: bool) -> Recording:
         path = min(recording.root.glob("*_poses.txt"))
         with reading(path, "expected 'timestamp x y z qx qy qz qw id' in each line"):
-            poses, ids = read_poses(path).poses, np.loadtxt(path, ndmin=2)[:, 8].astype(int)
-        by_id = {str(number): pose for number, pose in zip(ids, poses, strict=True)}
-        frames = self.frames(recording.root, recording.options)
-        frames = [
-            replace(frame, pose=by_id.get(frame.image.stem), where=f"{path}, id {frame.image.stem}")
-            for frame in frames
-        ]
+            track, ids = read_poses(path), np.loadtxt(path, ndmin=2)[:, 8].astype(int)
+        # Pictures are named by ID, or by time without --images_id.
+        times = track.stamps if track.stamps is not None else ids
+        keys = [*map(str, ids), *(f"{time:.3f}" for time in times)]
+        poses = dict(zip(keys, [*track.poses, *track.poses], strict=True))
+        frames = []
+        for frame in self.frames(recording.root, recording.options):
+            stem = frame.image.stem
+            key = f"{float(stem):.3f}" if re.fullmatch(r"\d+\.\d+", stem) else stem
+            frames.append(replace(frame, pose=poses.get(key), where=f"{path}, {stem}"))
         return replace(recording, frames=frames)
 
 

@@ -466,6 +466,16 @@ def test_layouts_of_other_scanners(tmp_path, write):
         )
 
 
+def test_rtabmap_pictures_named_by_time(tmp_path):
+    rtabmap(tmp_path)
+    for folder in ("flat_rgb", "flat_depth", "flat_calib"):
+        for path in list((tmp_path / folder).iterdir()):
+            path.rename(path.with_name(f"{int(path.stem) + 92}.000000{path.suffix}"))
+    scene = open_project(tmp_path)
+    assert scene.names == ("100.000000.jpg", "102.000000.jpg")
+    assert scene.cameras.K[1, 0, 0] == 93
+
+
 def test_redwood_trajectory_that_does_not_fit(tmp_path):
     root = redwood(tmp_path)
     text = (root / "trajectory.log").read_text()
