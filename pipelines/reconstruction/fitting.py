@@ -48,6 +48,7 @@ from gvtools.runs.poses import RunPoses
 from gvtools.scenes.images import resize_nearest
 from gvtools.scenes.resized import reduced
 from gvtools.scenes.scene import Frame, View
+from gvtools.splat_files import holds_splats
 from gvtools.untrusted import load_arrays
 from gvtools.view_selection import evenly_spread
 from pipelines.reconstruction.fit_start import GIVEN, given_start
@@ -419,7 +420,8 @@ def fit_appearance(plan: Plan, console: Console, *, earlier: Fitted | None = Non
             f"{enough}"
         )
         asked = plan.config.refine
-        if asked.init is None and fitted.steps != asked.steps:
+        begun = asked.init is not None and holds_splats(Path(asked.init))
+        if not begun and fitted.steps != asked.steps:
             console.warn(f"the fit is not used: {few}; give it more time by --refine")
             return None
         console.warn(
