@@ -13,7 +13,6 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache, partial
 from itertools import pairwise
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numba
@@ -30,12 +29,17 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
     def kernel(function: Callable[..., Any]) -> Any:
         dispatcher = compile_function(function)
-        index = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
+        index = _index_of(dispatcher)
         if index is not None:
             index._load_index = partial(_fresh, index._load_index)
         return dispatcher
 
     return kernel
+
+
+def _index_of(dispatcher: Any) -> Any:
+    """Numba's index of what it has cached of a kernel; None where its compiler is switched off."""
+    return getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
 
 
 def _fresh(load: Callable[[], dict[Any, Any]]) -> dict[Any, Any]:
@@ -109,14 +113,9 @@ class KernelSet(NamedTuple):
 
     @property
     def cached(self) -> bool:
-        """Whether numba's cache holds the last of them, compiled since its file was written."""
-        if not hasattr(self.last, "py_func"):  # numba's compiler is switched off
-            return True
-        function = self.last.py_func
-        source = Path(function.__code__.co_filename)
-        name = f"{source.stem}.{function.__qualname__}-{function.__code__.co_firstlineno}"
-        entries = Path(self.last.stats.cache_path).glob(f"{name}.*.nbi")
-        return any(entry.stat().st_mtime >= source.stat().st_mtime for entry in entries)
+        """Whether numba will find the last of them in its cache: compiled from this very source."""
+        index = _index_of(self.last)
+        return index is None or bool(index._load_index())
 
 
 def compile_side_by_side(sets: Sequence[KernelSet]) -> None:

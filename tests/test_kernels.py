@@ -54,6 +54,14 @@ def test_other_processes_leave_kernels_in_the_cache(tmp_path, monkeypatch, capfd
     compile_side_by_side([broken, *sets])
     assert all(kernels.cached for kernels in sets)
     assert capfd.readouterr() == ("", "")
+    # A file that is newer, and the same, is not compiled again; one that changed is.
+    os.utime(tmp_path / "module_double_once.py", (2**31, 2**31))
+    (tmp_path / "module_double_twice.py").write_text(
+        MODULE.format(name="double_twice") + "# changed\n", encoding="utf-8"
+    )
+    module = importlib.reload(importlib.import_module("module_double_twice"))
+    changed = KernelSet("changed", module.compile_it, module.double_twice)
+    assert sets[0].cached and not changed.cached
     for kernels in sets:
         assert kernels.last(3) == 6
         assert kernels.last.stats.cache_hits.total() == 1
