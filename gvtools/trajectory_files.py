@@ -203,12 +203,16 @@ def _by_numbers(path: Path, rows: list[tuple[int, list[str]]], *, commas: bool) 
 def unit_of(stamps: Float64) -> str:
     """The unit of time stamps that are none in seconds, by their size or their steps; else "".
 
+    Nanoseconds since a machine was switched on may be as many as milliseconds since 1970.
+
     >>> unit_of(np.array([0, 33e6, 66e6])), unit_of(np.array([1.4e9, 1.4e9 + 1]))
     ('ns', '')
+    >>> unit_of(1.4e12 + np.array([0, 33e6, 66e6])), unit_of(1.4e12 + np.array([0, 33, 66]))
+    ('ns', 'ms')
     """
     size = float(np.abs(stamps).max(initial=0))
     for unit, (_, since, _) in _UNITS.items():
-        if 0.9 * since < size < 5 * since:
+        if 0.9 * since < size < 5 * since and _step(stamps) < since / 1e6:
             return unit
     return next((unit for unit, (*_, step) in _UNITS.items() if _step(stamps) >= step), "")
 

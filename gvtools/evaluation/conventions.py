@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -105,29 +107,37 @@ def _other_turn(first: Float64, second: Float64, found: PoseErrors, *, align: st
     assert found.rotation_deg is not None
     turned = found.rotation_deg.rmse
 
-    def left(rotations: Rotation) -> float:
-        poses = second.copy()
-        poses[:, :3, :3] = rotations.as_matrix()
-        again = absolute_errors(first, poses, align=align, refuse_mirrored=False)
+    def left(rotations: Rotation, true: Rotation) -> float:
+        poses = [first.copy(), second.copy()]
+        for each, turns in zip(poses, (true, rotations), strict=True):
+            each[:, :3, :3] = turns.as_matrix()
+        again = absolute_errors(*poses, align=align, refuse_mirrored=False)
         return np.inf if again.rotation_deg is None else again.rotation_deg.rmse
 
-    given = Rotation.from_matrix(second[:, :3, :3])
+    true, given = (Rotation.from_matrix(poses[:, :3, :3]) for poses in (first, second))
     fit = fit_similarity(second[:, :3, 3], first[:, :3, 3], with_scale=align == "sim3")
     frame = Rotation.identity() if align == "none" else Rotation.from_matrix(fit.rotation)
-    mount = (Rotation.from_matrix(first[:, :3, :3]).inv() * frame * given).mean()
-    if left(given * mount.inv()) < EXPLAINED * turned:
+    mount = (true.inv() * frame * given).mean()
+    if left(given * mount.inv(), true) < EXPLAINED * turned:
         axis = (np.round(mount.as_rotvec() / mount.magnitude(), 2) + 0.0).tolist()
         return [
             f"the estimate's cameras are turned by {np.degrees(mount.magnitude()):.4g} degrees "
             f"about their axis {axis} all along: other axes of the camera (OpenGL's), or another "
             "sensor's poses; figures of rotation, RPE and AUC hold this turn"
         ]
-    for order in ([1, 2, 3, 0], [3, 0, 1, 2]):
-        least = left(Rotation.from_quat(given.as_quat()[:, order]))
+    orders = ([0, 1, 2, 3], [1, 2, 3, 0], [3, 0, 1, 2])
+    ways = product(range(len(orders)), repeat=2)
+    # The fewest changes first.
+    for one, two in sorted(ways, key=np.count_nonzero):
+        least = left(
+            Rotation.from_quat(given.as_quat()[:, orders[two]]),
+            Rotation.from_quat(true.as_quat()[:, orders[one]]),
+        )
         if least < EXPLAINED * turned:
+            whose = "both files'" if one and two else f"the {'reference' if one else 'estimate'}'s"
             return [
-                f"quaternions of the other order: with the real part at the other end, rotations "
-                f"are off by {least:.4g} degrees instead of {turned:.4g}; name the columns in a "
-                "first line, or give --layout"
+                f"{whose} quaternions seem to be of the other order: with the real part at the "
+                f"other end, rotations are off by {least:.4g} degrees instead of {turned:.4g}; "
+                "name the columns in a first line ('# timestamp tx ty tz qw qx qy qz')"
             ]
     return []

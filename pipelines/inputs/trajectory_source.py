@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +21,9 @@ if TYPE_CHECKING:
 
 # Share of the time between poses from which pairs that differ by it may be of other moments.
 FAR = 0.25
+# Of poses in the time that both cover, the share that has to find a partner unless it is said; and
+# rates of clocks that are tried beside those of the whole spans and of the steps.
+PARTNERS, RATES = 0.5, (0.5, 2 / 3, 5 / 6, 6 / 5, 3 / 2, 2.0)
 
 
 def open_trajectory(path: Path, *, layout: str = "auto", root: Path | None = None) -> Trajectory:
@@ -139,7 +145,52 @@ def associate(
                 f"{len(stamps)} stamps of one are whole numbers, of which {len(first)} find a time "
                 "of the other: frames' numbers are no seconds; to pair in order, --associate index",
             )
+    timed = replace(estimate, stamps=times + offset)
+    doubts = doubts or _other_rate((reference, timed), (first, second), partial(match, offset=0.0))
     return first, second, how, doubts
+
+
+def _other_rate(
+    tracks: tuple[Trajectory, Trajectory],
+    rows: tuple[NDArray[np.int64], NDArray[np.int64]],
+    match: Callable[..., Any],
+) -> tuple[str, ...]:
+    """What is said where few find a partner, or a clock of another rate would mend the errors."""
+    from gvtools.evaluation.conventions import EXPLAINED, FEW, NOTABLE
+    from gvtools.evaluation.trajectories import absolute_errors
+
+    reference, estimate = tracks
+    assert reference.stamps is not None and estimate.stamps is not None
+    at, times = reference.stamps, estimate.stamps
+
+    def error(rows: tuple[NDArray[np.int64], NDArray[np.int64]]) -> float:
+        pair = reference.poses[rows[0]], estimate.poses[rows[1]]
+        found = absolute_errors(*pair, refuse_mirrored=False)
+        return np.inf if found.translation is None else found.translation.rmse / found.extent
+
+    low, high = max(at.min(), times.min()), min(at.max(), times.max())
+    both = min(int(((low <= stamps) & (stamps <= high)).sum()) for stamps in (at, times))
+    few, given = len(rows[0]) < PARTNERS * both, error(rows)
+    tried = []
+    if min(len(at), len(times)) >= FEW and (few or given > NOTABLE):
+        steps = [np.median(np.diff(stamps)) for stamps in (at, times)]
+        rates = {np.ptp(at) / np.ptp(times), steps[0] / steps[1], *RATES}
+        for rate, start in product(rates, (times[0], 0.0)):
+            with suppress(DegenerateError):
+                pairs = match(at, start + rate * (times - start))
+                if len(pairs[0]) >= max(FEW, len(rows[0])):
+                    tried.append((error(pairs), len(pairs[0]), 1 / rate))
+    best, count, fast = min(tried, default=(np.inf, 0, 1.0))
+    if best < EXPLAINED * given or (few and best < NOTABLE and count > 2 * PARTNERS * len(rows[0])):
+        return (
+            f"the estimate's clock seems to run {fast:.4g} times as fast as the reference's: with "
+            f"its times divided by that, {count} poses find a partner instead of {len(rows[0])}, "
+            f"with an ATE of {best:.4g} of the extent instead of {given:.4g}; mend its times",
+        )
+    return few * (
+        f"{len(rows[0])} of {both} poses of the time that both cover find a partner: the figures "
+        "are of these; clocks may differ (--offset), or their rates",
+    )
 
 
 def _other_unit(

@@ -231,6 +231,25 @@ def test_numbers_of_frames_against_seconds_are_warned_of(tmp_path, capsys):
     assert "warning" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("rate", "dense", "said"),
+    [
+        (1.5, 1, "run 1.5 times as fast"),
+        (1.5, 20, "run 1.5 times as fast"),
+        (1.01, 1, "40 poses find a partner instead of 1"),
+        (1, 20, ""),
+    ],
+)
+def test_clocks_of_another_rate_are_warned_of(tmp_path, rate, dense, said):
+    every = path(39 * dense + 1)
+    for name, poses, step in (("a", every, 0.1 / dense), ("b", every[::dense], 0.1 * rate)):
+        lines = (" ".join([f"{i * step}", *row[1:]]) for i, row in enumerate(rows(poses)))
+        (tmp_path / name).write_text("\n".join(lines))
+    notes = measured(tmp_path, "ate", tmp_path / "a", tmp_path / "b")["notes"]
+    assert said in "".join(notes.get("association", []))
+    assert bool(said) == ("association" in notes)
+
+
 def test_the_table_is_printed_without_json(tmp_path, capsys):
     write_tum(tmp_path / "a.txt", cameras(path()))
     assert main(["trajectory", "ate", str(tmp_path / "a.txt"), str(tmp_path / "a.txt")]) == 0
@@ -301,6 +320,17 @@ def other_order(poses: np.ndarray) -> np.ndarray:
     turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat()[:, [3, 0, 1, 2]]
     poses[:, :3, :3] = Rotation.from_quat(turns).as_matrix()
     return poses
+
+
+@pytest.mark.parametrize("which", ["the reference's", "both files'"])
+def test_the_other_order_of_quaternions_is_told_of_either_file(tmp_path, which):
+    files = tmp_path / "a.txt", tmp_path / "b.txt"
+    poses = path(), disturbed(path(), degrees=1)
+    for at, (file, track) in enumerate(zip(files, poses, strict=True)):
+        swapped = at == 0 or which == "both files'"
+        write_tum(file, cameras(other_order(track) if swapped else track))
+    notes = measured(tmp_path, "rpe", *files)["notes"]["conventions"]
+    assert [which in note and "other order" in note for note in notes] == [True]
 
 
 @pytest.mark.parametrize(
