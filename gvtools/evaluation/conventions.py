@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from itertools import product
+from itertools import product, starmap
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -126,18 +126,29 @@ def _other_turn(first: Float64, second: Float64, found: PoseErrors, *, align: st
             "sensor's poses; figures of rotation, RPE and AUC hold this turn"
         ]
     orders = ([0, 1, 2, 3], [1, 2, 3, 0], [3, 0, 1, 2])
-    ways = product(range(len(orders)), repeat=2)
-    # The fewest changes first.
-    for one, two in sorted(ways, key=np.count_nonzero):
-        least = left(
-            Rotation.from_quat(given.as_quat()[:, orders[two]]),
-            Rotation.from_quat(true.as_quat()[:, orders[one]]),
+    kept, other = (
+        [
+            [Rotation.from_quat(turns.as_quat()[:, order]) for order in some]
+            for turns in (given, true)
+        ]
+        for some in (orders[:1], orders[1:])
+    )
+    ways = {
+        whose: min(starmap(left, product(estimate, reference)))
+        for whose, estimate, reference in (
+            ("the estimate's", other[0], kept[1]),
+            ("the reference's", kept[0], other[1]),
+            ("both files'", other[0], other[1]),
         )
-        if least < EXPLAINED * turned:
-            whose = "both files'" if one and two else f"the {'reference' if one else 'estimate'}'s"
-            return [
-                f"{whose} quaternions seem to be of the other order: with the real part at the "
-                f"other end, rotations are off by {least:.4g} degrees instead of {turned:.4g}; "
-                "name the columns in a first line ('# timestamp tx ty tz qw qx qy qz')"
-            ]
-    return []
+    }
+    whose = min(ways, key=ways.__getitem__)
+    if ways[whose] >= EXPLAINED * turned:
+        return []
+    # In one frame, the order of either explains the same.
+    one = [ways["the estimate's"], ways["the reference's"]]
+    whose = "one file's" if max(one) < EXPLAINED * turned else whose
+    return [
+        f"{whose} quaternions seem to be of the other order: with the real part at the other end, "
+        f"rotations are off by {min(ways.values()):.4g} degrees instead of {turned:.4g}; name the "
+        "columns in a first line ('# timestamp tx ty tz qw qx qy qz')"
+    ]

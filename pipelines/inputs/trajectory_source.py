@@ -145,8 +145,8 @@ def associate(
                 f"{len(stamps)} stamps of one are whole numbers, of which {len(first)} find a time "
                 "of the other: frames' numbers are no seconds; to pair in order, --associate index",
             )
-    timed = replace(estimate, stamps=times + offset)
-    doubts = doubts or _other_rate((reference, timed), (first, second), partial(match, offset=0.0))
+    moved = replace(estimate, stamps=times + offset)
+    doubts = doubts or _other_rate((reference, moved), (first, second), partial(match, offset=0.0))
     return first, second, how, doubts
 
 

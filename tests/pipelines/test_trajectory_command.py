@@ -322,14 +322,19 @@ def other_order(poses: np.ndarray) -> np.ndarray:
     return poses
 
 
-@pytest.mark.parametrize("which", ["the reference's", "both files'"])
-def test_the_other_order_of_quaternions_is_told_of_either_file(tmp_path, which):
-    files = tmp_path / "a.txt", tmp_path / "b.txt"
-    poses = path(), disturbed(path(), degrees=1)
-    for at, (file, track) in enumerate(zip(files, poses, strict=True)):
-        swapped = at == 0 or which == "both files'"
-        write_tum(file, cameras(other_order(track) if swapped else track))
-    notes = measured(tmp_path, "rpe", *files)["notes"]["conventions"]
+@pytest.mark.parametrize(
+    ("which", "swapped", "frame"),
+    [
+        ("the reference's", "a", moved),
+        ("both files'", "ab", moved),
+        ("one file's", "a", lambda poses: poses),
+    ],
+)
+def test_the_other_order_of_quaternions_is_told_of_either_file(tmp_path, which, swapped, frame):
+    walk = disturbed(path(), degrees=20)
+    for name, poses in (("a", walk), ("b", frame(disturbed(walk, degrees=1)))):
+        write_tum(tmp_path / name, cameras(other_order(poses) if name in swapped else poses))
+    notes = measured(tmp_path, "rpe", tmp_path / "a", tmp_path / "b")["notes"]["conventions"]
     assert [which in note and "other order" in note for note in notes] == [True]
 
 
