@@ -32,6 +32,7 @@ from gvtools.completers.geoverse.conditioning import ViewBatch
 from gvtools.completers.geoverse.config import GeoVerseConfig
 from gvtools.completers.geoverse.flow import time_grid
 from gvtools.completers.geoverse.model import DECODE, DECODING, VIDEO, GeoVerse
+from gvtools.completers.geoverse.wan import BLOCKS
 from gvtools.networks.compute import autocast, name_of
 from gvtools.training.distributed import Processes, Replicated
 from gvtools.training.loop import Trainer
@@ -294,6 +295,7 @@ def _inference(options: CompleteOptions, config: GeoVerseConfig) -> list[dict[st
         steps = (options.steps, options.cascade_steps)
         peaks = pass_peaks(model, _views(options, config), steps=steps, dtype=dtype)
         weights, prior = module_bytes(model), module_bytes(*prior_networks(model))
+        visiting = prior - away_bytes(model)
     return [
         {
             "stage": stage,
@@ -301,12 +303,21 @@ def _inference(options: CompleteOptions, config: GeoVerseConfig) -> list[dict[st
             "video_bytes": prior,
             "activation_bytes": peak,
             # The prior is on the card for its own stage alone, or stays there.
-            "total_bytes": weights + peak + (prior if stage == VIDEO else 0),
+            "total_bytes": weights + peak + (visiting if stage == VIDEO else 0),
             "total_bytes_video_stays": weights + peak + prior,
         }
         for stage, peak in peaks.items()
         if stage != DECODE
     ]
+
+
+def away_bytes(model: GeoVerse) -> int:
+    """Of a visiting prior's blocks, but for the two that are on the card at a time."""
+    if model.video is None:
+        return 0
+    transformer = model.video.networks.transformer
+    blocks = [block for name in BLOCKS for block in getattr(transformer, name)]
+    return sum(sorted(map(module_bytes, blocks))[:-2])
 
 
 def _training(

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -37,6 +37,8 @@ STRIDE = 8  # pixels of a latent's edge
 PATCH = (1, 2, 2)  # latents of a token
 COMPONENTS = {"transformer": "WanVACETransformer3DModel", "vae": "AutoencoderKLWan"}
 EMPTY_PROMPT = "empty_prompt.safetensors"
+# Of the transformer, in the order in which they run.
+BLOCKS = ("vace_blocks", "blocks")
 _FLOAT32 = frozenset({"time_embedder", "scale_shift_table", "norm1", "norm2", "norm3"})
 
 
@@ -100,8 +102,7 @@ class WanNetworks:
         self.vae.to(device)
 
     def _tensors(self) -> list[Tensor]:
-        networks = (self.transformer, self.vae)
-        return [tensor for n in networks for tensor in (*n.parameters(), *n.buffers())]
+        return [*_tensors(self.transformer), *_tensors(self.vae)]
 
     def pin(self) -> None:
         """Lock the weights in the host's memory as far as it lets, for cards to fetch sooner."""
@@ -111,19 +112,29 @@ class WanNetworks:
 
     @contextmanager
     def lent(self, device: torch.device | None) -> Iterator[None]:
-        """On another device within the block, where only copies go: nothing is brought back."""
+        """On another device within the block, where only copies go: nothing is brought back.
+
+        Of the transformer's blocks two are there at a time, see ``Visits``.
+        """
         if device is None or device == self.device:
             yield
             return
-        tensors = self._tensors()
-        home = [tensor.data for tensor in tensors]
+        lists = {name: getattr(self.transformer, name) for name in BLOCKS}
+        visits = Visits([block for blocks in lists.values() for block in blocks], device)
+        turns = iter(range(len(visits.blocks)))
         try:
-            for tensor in tensors:
-                tensor.data = tensor.data.to(device, non_blocking=True)
-            yield
+            for name, blocks in lists.items():
+                visitors = [Visitor(visits, next(turns)) for _ in blocks]
+                setattr(self.transformer, name, nn.ModuleList(visitors))
+            tensors = self._tensors()
+            copies = [tensor.data.to(device, non_blocking=True) for tensor in tensors]
+            with _held(tensors, copies):
+                visits.fetch(0)
+                yield
         finally:
-            for tensor, data in zip(tensors, home, strict=True):
-                tensor.data = data
+            visits.wait()
+            for name, blocks in lists.items():
+                setattr(self.transformer, name, blocks)
 
     def encode(self, clips: Tensor) -> Tensor:
         """(N, 16, 1 + k, H / 8, W / 8) float32: the mode of the VAE's latents, normalised.
@@ -190,6 +201,72 @@ class WanNetworks:
                 hook.remove()
         frames, rows, columns = (n // p for n, p in zip(x.shape[2:], PATCH, strict=True))
         return [taken[block].unflatten(1, (frames, rows, columns)) for block in blocks]
+
+
+class Visits:
+    """Blocks on a device for their own turns alone; while one runs, the next one's weights come."""
+
+    def __init__(self, blocks: Sequence[nn.Module], device: torch.device) -> None:
+        self.blocks = blocks
+        self.device = device
+        self.coming: list[Tensor] = []
+        self.aside = torch.cuda.Stream(device) if device.type == "cuda" else None
+
+    def fetch(self, turn: int) -> None:
+        """Begin to copy a block's weights."""
+        home = [tensor.data for tensor in _tensors(self.blocks[turn])]
+        self.coming = [torch.empty_like(data, device=self.device) for data in home]
+        copying: AbstractContextManager[Any] = nullcontext()
+        if self.aside is not None:
+            # An earlier block, whose memory this may be, has to be done with it.
+            self.aside.wait_stream(torch.cuda.current_stream(self.device))
+            copying = torch.cuda.stream(self.aside)
+        with copying:
+            for copy, data in zip(self.coming, home, strict=True):
+                copy.copy_(data, non_blocking=True)
+
+    def wait(self) -> None:
+        """What the device is asked from here on comes after the copies that were begun."""
+        if self.aside is not None:
+            torch.cuda.current_stream(self.device).wait_stream(self.aside)
+
+    def run(self, turn: int, *inputs: Any) -> Any:
+        """A block, in its turn."""
+        self.wait()
+        here = self.coming
+        if turn + 1 < len(self.blocks):
+            self.fetch(turn + 1)
+        with _held(_tensors(self.blocks[turn]), here):
+            return self.blocks[turn](*inputs)
+
+
+class Visitor(nn.Module):
+    """Stands for a block that visits; the block's weights are not among its own."""
+
+    def __init__(self, visits: Visits, turn: int) -> None:
+        super().__init__()
+        self.run = partial(visits.run, turn)
+
+    def forward(self, *inputs: Any) -> Any:
+        """What the block gives."""
+        return self.run(*inputs)
+
+
+def _tensors(network: nn.Module) -> list[Tensor]:
+    return [*network.parameters(), *network.buffers()]
+
+
+@contextmanager
+def _held(tensors: Sequence[Tensor], data: Sequence[Tensor]) -> Iterator[None]:
+    """Other numbers in tensors within the block."""
+    home = [tensor.data for tensor in tensors]
+    try:
+        for tensor, other in zip(tensors, data, strict=True):
+            tensor.data = other
+        yield
+    finally:
+        for tensor, own in zip(tensors, home, strict=True):
+            tensor.data = own
 
 
 def _last_tap(convolution: Any, x: Tensor, cache_x: Tensor | None = None) -> Tensor:

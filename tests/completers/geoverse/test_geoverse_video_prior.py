@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import weakref
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any
 
@@ -321,43 +323,72 @@ def test_a_copied_model_shares_its_prior(network):
 pytest.importorskip("diffusers", reason="the extra wan is not installed")
 
 
-def test_lent_weights_come_home_without_being_copied_back(network, monkeypatch):
+class Stream:
+    """Notes when it waits for another one."""
+
+    def __init__(self, name: str, asked: list[str]) -> None:
+        self.name, self.asked = name, asked
+
+    def wait_stream(self, other: Stream) -> None:
+        self.asked.append(f"{self.name} waits for {other.name}")
+
+
+@pytest.mark.parametrize("device", [torch.device("cpu", 0), torch.device("cuda", 0)])
+def test_lent_weights_come_home_and_blocks_visit_one_after_the_other(network, monkeypatch, device):
     prior = tiny.prior(network)
     views = (*tiny.views(3), 1)
     wanted = prior.features(*views)
-    networks = prior.networks
-    tensors = [
-        tensor
-        for part in (networks.transformer, networks.vae)
-        for tensor in (*part.parameters(), *part.buffers())
-    ]
-    home = [tensor.data_ptr() for tensor in tensors]
-    moved: list[torch.device] = []
-    to = Tensor.to
+    networks, blocks = prior.networks, [*network.vace_blocks, *network.blocks]
+    tensors = [t for n in (network, networks.vae) for t in (*n.parameters(), *n.buffers())]
+    home = {id(tensor): tensor.data_ptr() for tensor in tensors}
+    asked: list[str] = []
+    copies: list[weakref.ref[Tensor]] = []
+    to, empty_like, main = Tensor.to, torch.empty_like, Stream("main", asked)
 
-    def copied(tensor: Tensor, *args: Any, **kwargs: Any) -> Tensor:
-        if args == (torch.device("cpu", 0),):
+    # Another place of the CPU's memory stands for a device.
+    def moved(tensor: Tensor, *args: Any, **kwargs: Any) -> Tensor:
+        if args == (device,):
             assert kwargs == {"non_blocking": True}
-            # Another place of the same memory stands for a device.
-            moved.append(args[0])
             return tensor.clone()
         return to(tensor, *args, **kwargs)
 
-    monkeypatch.setattr(Tensor, "to", copied)
-    with networks.lent(torch.device("cpu", 0)):
-        away = [tensor.data_ptr() for tensor in tensors]
-        assert not {*away} & {*home}
-    assert [tensor.data_ptr() for tensor in tensors] == home
-    prior._guest = torch.device("cpu", 0)
-    moved.clear()
+    def made(tensor: Tensor, **kwargs: Any) -> Tensor:
+        found = empty_like(tensor)
+        if kwargs == {"device": device}:
+            copies.append(weakref.ref(found))
+        return found
+
+    def visit(block: nn.Module, given: Any) -> None:
+        gone = [p.data_ptr() != home[id(p)] for other in blocks for p in other.parameters()]
+        assert sum(gone) == len(list(block.parameters()))
+        held = [copy for copy in copies if copy() is not None]
+        assert len(held) <= 2 * max(len(list(other.parameters())) for other in blocks)
+        asked.append(f"block {blocks.index(block)}")
+
+    monkeypatch.setattr(Tensor, "to", moved)
+    monkeypatch.setattr(torch, "empty_like", made)
+    monkeypatch.setattr(torch.cuda, "Stream", lambda place: Stream("aside", asked))
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda place: main)
+    monkeypatch.setattr(torch.cuda, "stream", lambda stream: nullcontext())
+    hooks = [block.register_forward_pre_hook(visit) for block in blocks]
+    prior._guest = device
     found = prior.features(*views)
-    assert len(moved) >= len(tensors)
-    assert [tensor.data_ptr() for tensor in tensors] == home
+    for hook in hooks:
+        hook.remove()
+    turns = [f"block {index}" for index in range(len(blocks))]
+    if device.type == "cuda":
+        # A block's copy waits for the block before the last, whose memory it may take.
+        pair = ["main waits for aside", "aside waits for main"]
+        turns = [word for turn in turns for word in (*pair, turn)]
+        turns = ["aside waits for main", *turns[:-2], turns[-1], "main waits for aside"]
+    assert asked == turns
     for one, other in zip(found, wanted, strict=True):
         assert torch.equal(one, other)
-    with pytest.raises(ZeroDivisionError), networks.lent(torch.device("cpu", 0)):
+    with pytest.raises(ZeroDivisionError), networks.lent(device):
+        assert all(tensor.data_ptr() != home[id(tensor)] for tensor in networks._tensors())
         _ = 1 / 0
-    assert [tensor.data_ptr() for tensor in tensors] == home
+    assert [tensor.data_ptr() for tensor in tensors] == list(home.values())
+    assert [*network.vace_blocks, *network.blocks] == blocks
 
 
 @pytest.mark.parametrize(

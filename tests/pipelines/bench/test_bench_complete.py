@@ -29,7 +29,14 @@ from pipelines.bench.complete import (
     random_views,
     total,
 )
-from pipelines.bench.memory import LiveBytes, StagePeaks, alone, card_line, fake_tensors
+from pipelines.bench.memory import (
+    LiveBytes,
+    StagePeaks,
+    alone,
+    away_bytes,
+    card_line,
+    fake_tensors,
+)
 from pipelines.bench.prediction import ASKED, CARDS, LEAST, Card, Counter, Kernel, Work, row_of
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -302,6 +309,19 @@ def test_the_tables_and_figures_of_memory(tmp_path, capsys):
     assert len(found["training"]) == 4
     for row in found["training"]:
         assert row["total_bytes"] >= row["lasting_bytes"] > row["weights_bytes"] > 0
+
+
+@pytest.mark.skipif(importlib.util.find_spec("diffusers") is None, reason="needs diffusers")
+def test_of_a_visiting_prior_two_blocks_are_on_the_card():
+    import tiny_wan
+
+    # A video model's first block of the branch is its largest, by a layer of its own.
+    model, network = micro.model(micro.config()), tiny_wan.transformer(5, (0, 2, 4))
+    assert away_bytes(model) == 0
+    model.attach_video(tiny_wan.prior(network))
+    plain, branch = module_bytes(network.blocks[0]), module_bytes(network.vace_blocks[1])
+    assert plain < branch < module_bytes(network.vace_blocks[0])
+    assert away_bytes(model) == 5 * plain + branch
 
 
 def test_what_fits_a_card():
