@@ -4,12 +4,16 @@ Reprojection errors do not tell, as no pixel enters them. A track's detections s
 that what photographs have there is alike: luminance at the detections of a view, freed of what
 varies slowly, is correlated with the mean of the other views' at the same tracks. Where a scene has
 no sparse points, recorded depth of a few views tells what they and those after them show.
+
+Pictures that are all a little off (cropped, shifted, undistorted twice) still show alike places; so
+places that are moved together are tried, too. The points' colours tell channels that are swapped.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache, partial
+from typing import Any
 
 import cv2
 import numpy as np
@@ -37,11 +41,24 @@ CHANGES: Mapping[str, Callable[[Grey], Grey]] = {
     "turned by a quarter": np.rot90,
     "turned by three quarters": lambda grey: np.rot90(grey, -1),
 }
+GIVE = "give the pictures that the poses were computed from"
 # Views whose depth is taken, those so many places after each that it is compared with, pixels of
 # each; how far depth around one may differ, and two views' depth of one place.
 DEPTH_PROBES, DEPTH_GAPS, DEPTH_PIXELS, SMOOTH, SAME_PLACE = 5, (0, 1, 2, 4), 400, 1.05, 0.02
 # Views that a run looks at, that a reason is sought for, and that a finding names.
 PROBES, TRIED, NAMED = 8, 16, 3
+# How all detections may be moved: right and down in longer sides, from the middle in shares of the
+# radius, and of it by its square, by these steps. On four real scenes no step gains more than
+# 0.001; pictures shifted by a hundredth, cropped by 1.5 % or undistorted twice gain 0.03 and more.
+_SIDE = "by {:+.1%} of the longer side"
+MOVES = (f"shifted right {_SIDE}", f"shifted down {_SIDE}", "scaled by {:+.1%}",
+         "bent by {:+.1%} in the corners")  # fmt: skip
+MOVED_BY, GAIN, FITS = (0.04, 0.02, 0.01, 0.005, 0.0025), 0.02, 0.92
+# By so many pixels on average, in so many views with so many detections each in common with others.
+PIXELS, FEWEST, ENOUGH = 2.0, 4, 80
+# Red less blue is judged where it deviates so much, and goes the other way below this correlation
+# with the points'.
+COLORED, SWAPPED = 4.0, -0.3
 
 
 class PixelCheck:
@@ -54,39 +71,110 @@ class PixelCheck:
         self.rows = [] if self.points is None else self.points.rows_of_views(len(scene))
         count = 0 if self.points is None else len(self.points.point_index)
         self.values = np.full(count, np.nan)
+        self.kept = dict.fromkeys(self.most_in_common(range(len(scene))), np.zeros((0, 0), np.int8))
+        self.swapped = dict[int, bool]()
+
+    def most_in_common(self, numbers: Iterable[int]) -> list[int]:
+        """The few views among ``numbers`` that have most tracks in common with one of them."""
+        if self.points is None or not (some := [n for n in numbers if len(self.rows[n])]):
+            return []
+        index, seen = self.points.point_index, np.zeros(len(self.points.positions), np.bool_)
+        seen[index[self.rows[max(some, key=lambda number: len(self.rows[number]))]]] = True
+        return sorted(some, key=lambda number: -int(seen[index[self.rows[number]]].sum()))[:PROBES]
 
     def see(self, number: int, rgb: NDArray[np.uint8]) -> None:
         """Take in the photograph (H, W, 3) of a view."""
-        if self.points is not None and len(self.rows[number]):
-            self.values[self.rows[number]] = self._at_detections(number, detail(rgb))
+        if self.points is None or not len(self.rows[number]):
+            return
+        shown = cv2.blur(detail(rgb), (3, 3))
+        self.values[self.rows[number]] = self._at_detections(number, shown)
+        if number in self.kept:
+            self.kept[number] = np.rint(np.clip(shown, -127, 127)).astype(np.int8)
+        own = self._at_detections(number, cv2.subtract(rgb[..., 0], rgb[..., 2], dtype=cv2.CV_32F))
+        colors = self.points.colors[self.points.point_index[self.rows[number]]].astype(float)
+        reds = np.stack([own, colors[:, 0] - colors[:, 2]])[:, np.isfinite(own)]
+        if reds.shape[1] >= TRACKS and reds.std(axis=1).min() >= COLORED:
+            self.swapped[number] = bool(np.corrcoef(reds)[0, 1] < SWAPPED)
 
-    def _at_detections(self, number: int, grey: Grey) -> NDArray[np.float64]:
+    def _at_detections(
+        self, number: int, picture: NDArray[Any], xy: NDArray[np.float64] | None = None
+    ) -> NDArray[np.float64]:
+        """(N,) numbers of a picture at the detections of a view, or at other places of them."""
         assert self.points is not None
-        height, width = grey.shape
-        x, y = np.floor(self.points.xy[self.rows[number]]).astype(np.int64).T
+        height, width = picture.shape
+        xy = self.points.xy[self.rows[number]] if xy is None else xy
+        x, y = np.floor(xy).astype(np.int64).T
         inside = (x > 0) & (y > 0) & (x < width - 1) & (y < height - 1)
         found = np.full(len(x), np.nan)
-        found[inside] = cv2.blur(grey, (3, 3))[y[inside], x[inside]]
+        found[inside] = picture[y[inside], x[inside]]
         return found
 
-    def agreements(self, without: Sequence[int] = ()) -> dict[int, float]:
+    def _places(self, number: int, move: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(N, 2) where the detections of a view are when they are moved, see MOVES."""
+        assert self.points is not None
+        height, width = self.kept[number].shape
+        middle = np.array([width, height]) / 2
+        off = self.points.xy[self.rows[number]] - middle
+        radius = np.linalg.norm(off, axis=1, keepdims=True) / np.linalg.norm(middle)
+        placed = middle + off * (1 + move[2] + move[3] * radius**2) + move[:2] * max(width, height)
+        return np.asarray(placed)
+
+    def _moved(self) -> str:
+        """How all detections have to be moved for the photographs to agree better, "" for none."""
+        known = [number for number, shown in self.kept.items() if shown.size]
+        if self.rough or len(known) < FEWEST:
+            return ""
+
+        def agreements(move: NDArray[np.float64]) -> list[float]:
+            values = np.full(len(self.values), np.nan)
+            for number in known:
+                places = self._places(number, move)
+                values[self.rows[number]] = self._at_detections(number, self.kept[number], places)
+            return [*self.agreements(values, least=ENOUGH).values()]
+
+        move = np.zeros(len(MOVES))
+        if len(first := agreements(move)) < FEWEST:
+            return ""
+        now = best = float(np.median(first))
+        for step in MOVED_BY:
+            for _ in range(TRIED):
+                tried = [move + way * step for unit in np.eye(len(move)) for way in (unit, -unit)]
+                scores = [float(np.median(agreements(other) or [-1])) for other in tried]
+                if max(scores) <= best:
+                    break
+                best, move = max(scores), tried[int(np.argmax(scores))]
+        pixels = np.concatenate([self._places(n, move) - self._places(n, 0 * move) for n in known])
+        if best < max(FITS, now + GAIN) or np.linalg.norm(pixels, axis=1).mean() < PIXELS:
+            return ""
+        way = ", ".join(MOVES[k].format(move[k]) for k in np.flatnonzero(move))
+        return f"{way} against the detections (correlation {best:.2f} there, {now:.2f} at them)"
+
+    def agreements(
+        self,
+        values: NDArray[np.float64] | None = None,
+        *,
+        without: Sequence[int] = (),
+        least: int = TRACKS,
+    ) -> dict[int, float]:
         """Correlation with the others, of each view that has enough tracks in common with them.
 
-        Views ``without`` are compared, and none is compared with them.
+        Views ``without`` are compared, and none is compared with them. ``values`` (M,) stand for
+        those that were seen.
         """
         if self.points is None:
             return {}
+        values = self.values if values is None else values
         index, count = self.points.point_index, len(self.points.positions)
-        known = np.isfinite(self.values)
+        known = np.isfinite(values)
         trusted = known & ~np.isin(self.points.view_index, list(without))
-        total = np.bincount(index[trusted], self.values[trusted], count)
+        total = np.bincount(index[trusted], values[trusted], count)
         views = np.bincount(index[trusted], minlength=count)
         found = {}
         for number, rows in enumerate(self.rows):
             own_share = trusted[rows]
             shared = rows[known[rows] & (views[index[rows]] > own_share)]
-            own, at = self.values[shared], index[shared]
-            if len(shared) >= TRACKS and own.std() >= CONTRAST:
+            own, at = values[shared], index[shared]
+            if len(shared) >= least and own.std() >= CONTRAST:
                 counted = trusted[shared]
                 others = (total[at] - own * counted) / (views[at] - counted)
                 found[number] = float(np.corrcoef(own, others)[0, 1])
@@ -102,10 +190,21 @@ class PixelCheck:
         if self.rough and wrong and unit_findings(self.scene):
             return []
         # Right ones that were compared with wrong ones are cleared.
-        judged |= self.agreements(wrong)
+        judged |= self.agreements(without=wrong)
         wrong = sorted((n for n in wrong if judged[n] < AGREE), key=lambda n: judged[n])
+        findings = list[Finding]()
+        if swapped := [n for n, turned in self.swapped.items() if turned]:
+            line = (
+                f"{len(swapped)} of {len(self.swapped)} photographs have red and blue the other "
+                f"way round than the points' colours, first {self.scene.views[swapped[0]].name}: "
+                "give the pictures that the points were coloured from, or swap the channels"
+            )
+            findings.append(Finding("warning", line))
+        moved = self._moved()
         if not wrong:
-            return []
+            if moved:
+                findings.append(Finding("warning", f"photographs are {moved}: {GIVE}"))
+            return findings
         names = ", ".join(
             f"{self.scene.views[number].name} ({judged[number]:.2f})" for number in wrong[:NAMED]
         )
@@ -114,10 +213,10 @@ class PixelCheck:
         message = (
             f"{len(wrong)} of {len(judged)} photographs do not show what their cameras saw "
             f"({len(wrong) / len(judged):.0%}; correlation at {place} below {AGREE:g}): "
-            f"{names}{more}{self._reason(wrong)}; renumbered, mirrored, cropped or turned pictures "
-            "give wrong results: give the pictures that the poses were computed from"
+            f"{names}{more}{self._reason(wrong) or (moved and f'; they are {moved}')}; renumbered, "
+            f"mirrored, cropped or turned pictures give wrong results: {GIVE}"
         )
-        return [Finding("warning", message)]
+        return [*findings, Finding("warning", message)]
 
     def _reason(self, wrong: Sequence[int]) -> str:
         """What would make wrong pictures agree, "" where nothing that is tried does."""
@@ -130,14 +229,13 @@ class PixelCheck:
         ways["each fits the next picture"] = lambda n: shown[n + 1]
         ways["each fits the picture before it"] = lambda n: shown[n - 1]
         for reason, picture in ways.items():
-            other = PixelCheck(self.scene)
-            other.values = self.values.copy()
+            values = self.values.copy()
             for number in wrong:
                 grey = picture(number) if number in chosen else None
-                other.values[self.rows[number]] = (
+                values[self.rows[number]] = (
                     np.nan if grey is None else self._at_detections(number, grey)
                 )
-            scores = other.agreements()
+            scores = self.agreements(values)
             fit = [scores[number] for number in chosen if number in scores]
             if fit and np.median(fit) > AGREE:
                 return f"; {reason}"
@@ -149,7 +247,9 @@ class PixelCheck:
 
     def _detail(self, number: int) -> Grey | None:
         frame = frame_there(self.scene, number) if 0 <= number < len(self.rows) else None
-        return None if frame is None else detail(frame.rgb)
+        return (
+            None if frame is None else np.asarray(cv2.blur(detail(frame.rgb), (3, 3)), np.float32)
+        )
 
 
 def _points_of_depth(scene: Scene) -> SparsePoints | None:
@@ -218,11 +318,7 @@ def probed(scene: Scene, names: Sequence[str]) -> list[Finding]:
     numbers = [number for number, view in enumerate(scene.views) if view.name in set(names)]
     if not numbers:
         return []
-    index = check.points.point_index
-    seen = np.zeros(len(check.points.positions), np.bool_)
-    first = max(numbers, key=lambda number: len(check.rows[number]))
-    seen[index[check.rows[first]]] = True
-    common = sorted(numbers, key=lambda number: -int(seen[index[check.rows[number]]].sum()))
-    for number in common[:PROBES]:
+    check.kept = dict.fromkeys(check.most_in_common(numbers), np.zeros((0, 0), np.int8))
+    for number in check.kept:
         check.see(number, scene.views[number].load().rgb)
     return check.findings()

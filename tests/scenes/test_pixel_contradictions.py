@@ -54,6 +54,39 @@ def test_right_pictures_are_believed(room):
     assert said(room) == [] and probed(room, room.names) == []
 
 
+def seen_as(room, pictures, **points):
+    """What is said of the room with other pictures, and points that differ."""
+    views = [
+        replace(view, load=partial(Frame, np.ascontiguousarray(rgb)))
+        for view, rgb in zip(room.views, pictures, strict=True)
+    ]
+    scene = replace(room, views=tuple(views), points=replace(room.points, **points))
+    found = [f.message for f in inspect(scene).findings if f.level == "warning"]
+    assert len(probed(scene, scene.names)) == len(found)
+    return found
+
+
+def test_pictures_that_are_all_a_little_off_are_said(room):
+    pictures = [view.load().rgb for view in room]
+    right = [cv2.warpAffine(p, np.float32([[1, 0, 5], [0, 1, 0]]), (160, 120)) for p in pictures]
+    (line,) = seen_as(room, right)
+    assert "shifted right by +3" in line
+    (line,) = seen_as(room, [cv2.resize(p[3:-3, 4:-4], (160, 120)) for p in pictures])
+    assert "scaled by +" in line
+
+
+def test_swapped_channels_are_told_by_the_points_colours(room):
+    greys = [view.load().rgb[..., 0] for view in room]
+    pictures = [np.dstack([grey, grey, 255 - grey]) for grey in greys]
+    first = room.points.rows_of_views(8)[0]
+    colors = np.zeros_like(room.points.colors)
+    x, y = room.points.xy[first].astype(int).T
+    colors[room.points.point_index[first]] = pictures[0][y, x]
+    assert seen_as(room, pictures, colors=colors) == []
+    (line,) = seen_as(room, [p[..., ::-1] for p in pictures], colors=colors)
+    assert "8 of 8 photographs have red and blue the other way round" in line
+
+
 def test_depth_tells_where_there_are_no_tracks(room, wall_walk):
     for step, wrong in ((0, 0), (1, 1)):
         frames = [
