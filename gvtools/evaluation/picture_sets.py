@@ -31,7 +31,7 @@ from __future__ import annotations
 import re
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
 from pathlib import Path, PurePosixPath
@@ -299,20 +299,21 @@ def in_natural_order(paths: Iterable[Path], folder: Path) -> list[Path]:
     return sorted(paths, key=lambda path: natural_key(path.relative_to(folder).as_posix()))
 
 
-def read_rgb(source: Path) -> NDArray[np.uint8]:
-    """(H, W, 3) uint8; what is transparent lies before black. EXIF orientation is not applied."""
+def read_picture(source: Path) -> Frame:
+    """What is transparent lies before black, and is no part of the mask; as stored, not turned."""
     from gvtools.scenes.images import UNREADABLE, read_header, read_image
 
     if not read_header(source).has_alpha:
-        return read_image(source).rgb
+        return read_image(source)
     try:
         with open_picture(source) as image:
             rgba: NDArray[Any] = np.asarray(image.convert("RGBA")).astype(np.float64)
-            return np.rint(rgba[..., :3] * (rgba[..., 3:] / 255)).astype(np.uint8)
     except UNREADABLE as error:
         raise ProjectError(
             f"{source}: no readable picture ({error}); expected PNG or JPEG"
         ) from None
+    rgb = np.rint(rgba[..., :3] * (rgba[..., 3:] / 255)).astype(np.uint8)
+    return Frame(rgb, mask=rgba[..., 3] == 255)
 
 
 def canvas_picture(file: Path, folder: Path) -> MethodPicture:
@@ -322,7 +323,7 @@ def canvas_picture(file: Path, folder: Path) -> MethodPicture:
 
 
 def _half(file: Path, side: int) -> NDArray[np.uint8]:
-    canvas = read_rgb(file)
+    canvas = read_picture(file).rgb
     width = canvas.shape[1]
     if width % 2:
         raise ProjectError(
@@ -334,8 +335,8 @@ def _half(file: Path, side: int) -> NDArray[np.uint8]:
 def _beside_truth(file: Path, folder: Path, truths: Path) -> MethodPicture:
     """A picture named by its path below ``folder``, whose truth lies at the same path elsewhere."""
     name = file.relative_to(folder)
-    truth = partial(read_rgb, truths / name) if (truths / name).is_file() else None
-    return MethodPicture(name.as_posix(), lambda: Frame(read_rgb(file)), truth)
+    truth = (lambda: read_picture(truths / name).rgb) if (truths / name).is_file() else None
+    return MethodPicture(name.as_posix(), partial(read_picture, file), truth)
 
 
 def nerfstudio_dataset(path: Path) -> PictureSet | None:
@@ -467,5 +468,5 @@ def _rendered(file: Path, folder: Path, ending: str) -> MethodPicture:
     depth = file.with_name(f"{stem}.depth.npz")
     return MethodPicture(
         file.relative_to(folder).with_name(stem + file.suffix).as_posix(),
-        lambda: Frame(read_rgb(file), read_depth(depth) if depth.is_file() else None),
+        lambda: replace(read_picture(file), depth=read_depth(depth) if depth.is_file() else None),
     )

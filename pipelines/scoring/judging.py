@@ -59,6 +59,8 @@ SHAPE_TOLERANCE = 1.0
 # for those of another view where its truth is nearer by more than this factor.
 THUMBNAIL = (32, 24)
 CLEARLY = 2.0
+# Pictures that tell whether all are to be read otherwise.
+READINGS = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,7 +180,8 @@ class MethodPictures:
     targets: list[MeasuredTarget]  # those that the method has a picture of, each with this picture
     # Sizes (width, height) of the pictures that were resized to their target's, and how many.
     resized: dict[tuple[int, int], int]
-    doubt: str  # whether they are of these targets; "" where nothing speaks against it
+    # Whether they are of these targets, and as they should be; nothing where all speaks for it.
+    doubts: tuple[str, ...]
 
     def to_dict(self) -> dict[str, Any]:
         """What was read and how, JSON-ready."""
@@ -202,7 +205,7 @@ class MethodPictures:
                 for size, count in sorted(self.resized.items())
             ],
             "depth": depth,
-            "reading": [*self.pictures.notes, *filter(None, [self.doubt])],
+            "reading": [*self.pictures.notes, *self.doubts],
         }
 
 
@@ -240,7 +243,7 @@ def open_method(
         alphabetical=pictures.alphabetical,
         what=str(path),
     )
-    matched, resized = [], dict[tuple[int, int], int]()
+    matched, resized, opaque = [], dict[tuple[int, int], int](), list[float]()
     for target, number in zip(targets, matching.picture_of, strict=True):
         if number is None:
             continue
@@ -248,10 +251,16 @@ def open_method(
         frame, size = _at_size(picture.load(), view.camera, what=f"{path}: {picture.name}")
         if size is not None:
             resized[size] = resized.get(size, 0) + 1
+        opaque.append(1.0 if frame.mask is None else float(frame.mask.mean()))
         posed = PosedPicture(view.name, view.camera, frame.rgb, frame.depth)
         matched.append(replace(target, picture=posed))
-    doubt = _doubt(pictures, matching, targets, matched=matched)
-    return MethodPictures(name, pictures, matching, matched, resized, doubt)
+    doubts = [_doubt(pictures, matching, targets, matched=matched) or _other_reading(matched)]
+    if clear := [1 - share for share in opaque if share < 1]:
+        doubts.append(
+            f"{len(clear)} of {len(matched)} pictures have transparent pixels ({np.mean(clear):.1%}"
+            " of them), which lie before black here; where that is not meant, save them without"
+        )
+    return MethodPictures(name, pictures, matching, matched, resized, tuple(filter(None, doubts)))
 
 
 def _run_pictures(path: Path) -> PictureSet:
@@ -276,16 +285,17 @@ def _at_size(frame: Frame, camera: Cameras, *, what: str) -> tuple[Frame, tuple[
         return frame, None
     expected = height * columns / width
     if abs(rows - expected) > SHAPE_TOLERANCE:
+        turned = " (an orientation tag is not applied)" * (columns * width == rows * height)
         raise ProjectError(
             f"{what} has {columns}x{rows} pixels; expected {width}x{height} like its view, or the "
-            "same shape in another size; render it from the view's camera"
+            f"same shape in another size{turned}; render it from the view's camera"
         )
     way = cv2.INTER_AREA if columns > width else cv2.INTER_CUBIC
     rgb = np.asarray(cv2.resize(frame.rgb, (width, height), interpolation=way), np.uint8)
     depth = frame.depth
     if depth is not None:
         depth = np.asarray(cv2.resize(depth, (width, height), interpolation=cv2.INTER_NEAREST))
-    return Frame(rgb, depth), (columns, rows)
+    return Frame(rgb, depth, frame.mask), (columns, rows)
 
 
 def _doubt(
@@ -329,6 +339,16 @@ def _doubt(
     if len(off) <= len(matched) / 2:
         return ""
     return f"{len(off)} of {len(matched)} pictures look like other views ({off[0]})"
+
+
+def _other_reading(matched: Sequence[MeasuredTarget]) -> str:
+    """What is said where a few pictures would all fit their truths far better if read otherwise."""
+    from gvtools.evaluation.picture_readings import better_reading
+
+    true = [(target.picture.rgb, target.truth) for target in matched if target.truth is not None]
+    some = [true[row] for row in evenly(len(true), READINGS)]
+    found = better_reading([rgb for rgb, _ in some], [truth for _, truth in some])
+    return found and f"its pictures seem to be {found}"
 
 
 def _thumbnail(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -430,8 +450,8 @@ def _print_matching(method: MethodPictures, targets: int, console: Console) -> N
         console.warn(f"{name}: no picture of {len(matching.missing)} views ({listed})")
     if matching.left_over:
         console.line(f"  {len(matching.left_over)} pictures of no judged view left out")
-    if method.doubt:
-        console.warn(f"{name}: {method.doubt}")
+    for doubt in method.doubts:
+        console.warn(f"{name}: {doubt}")
     for (width, height), count in sorted(method.resized.items()):
         console.warn(f"{name}: {count} pictures of {width}x{height} pixels resized to their views'")
 

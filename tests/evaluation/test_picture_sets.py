@@ -68,7 +68,9 @@ def test_transparent_pixels_lie_before_black(tmp_path):
     rgba = picture(0, channels=4)
     save(tmp_path / "1.png", rgba)
     expected = np.rint(rgba[..., :3] * (rgba[..., 3:] / 255.0))
-    assert np.array_equal(loaded(open_pictures(tmp_path))["1.png"], expected)
+    found = open_pictures(tmp_path)
+    assert np.array_equal(loaded(found)["1.png"], expected)
+    assert np.array_equal(found.pictures[0].load().mask, rgba[..., 3] == 255)
 
 
 @pytest.mark.parametrize("folder", ["", "test"])

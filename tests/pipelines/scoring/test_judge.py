@@ -184,6 +184,23 @@ def test_pictures_named_as_the_views_before_them_are_warned_of(small_run, tmp_pa
     assert f"warning: one off: {said}" in capsys.readouterr().err
 
 
+def test_pictures_that_are_clear_or_to_be_read_otherwise_are_warned_of(small_run, tmp_path, capsys):
+    clear = {}
+    for name, rgb in noisy(small_run, 1).items():
+        opaque = np.full((*rgb.shape[:2], 1), 255, np.uint8)
+        opaque[:3] = 0
+        clear[name] = np.concatenate([rgb[::-1], opaque], axis=-1)
+    write_pictures(tmp_path / "clear", clear)
+    found = quickly(tmp_path / "clear", "--against", small_run, tmp_path / "out")
+    said = found["methods"][0]["reading"]
+    assert "upside down" in said[0] and "4 of 4 pictures have transparent" in said[1]
+    assert capsys.readouterr().err.count("warning: clear") == 2
+    write_pictures(tmp_path / "turned", {k: np.rot90(v) for k, v in truths(small_run).items()})
+    assert "orientation tag" in refused(
+        capsys, "judge", tmp_path / "turned", "--against", small_run, "--out", tmp_path / "other"
+    )
+
+
 def gsplat_renders(folder, pictures, order) -> None:
     """The canvases of gsplat's trainer: truth and render of each view, by number."""
     for number, row in enumerate(order):
