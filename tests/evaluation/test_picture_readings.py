@@ -8,12 +8,14 @@ from gvtools.evaluation.picture_readings import better_reading
 from gvtools.scenes.scene import Frame
 
 RNG = np.random.default_rng(0)
-TRUTHS = [
-    cv2.resize(
-        RNG.integers(0, 256, (12, 16, 3), np.uint8), (160, 120), interpolation=cv2.INTER_CUBIC
-    )
-    for _ in range(3)
-]
+
+
+def smooth() -> np.ndarray:
+    rgb = RNG.integers(0, 256, (12, 16, 3), np.uint8)
+    return np.asarray(cv2.resize(rgb, (160, 120), interpolation=cv2.INTER_CUBIC), np.uint8)
+
+
+TRUTHS = [smooth() for _ in range(3)]
 
 
 def noisy(rgb: np.ndarray) -> np.ndarray:
@@ -26,7 +28,7 @@ def linear(rgb: np.ndarray) -> np.ndarray:
 
 
 def enlarged(rgb: np.ndarray) -> np.ndarray:
-    return cv2.resize(rgb[6:-6, 8:-8], (160, 120), interpolation=cv2.INTER_CUBIC)
+    return np.asarray(cv2.resize(rgb[6:-6, 8:-8], (160, 120), interpolation=cv2.INTER_CUBIC))
 
 
 @pytest.mark.parametrize(

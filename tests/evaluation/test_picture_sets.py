@@ -70,7 +70,8 @@ def test_transparent_pixels_lie_before_black(tmp_path):
     expected = np.rint(rgba[..., :3] * (rgba[..., 3:] / 255.0))
     found = open_pictures(tmp_path)
     assert np.array_equal(loaded(found)["1.png"], expected)
-    assert np.array_equal(found.pictures[0].load().mask, rgba[..., 3] == 255)
+    opaque = found.pictures[0].load().mask
+    assert opaque is not None and np.array_equal(opaque, rgba[..., 3] == 255)
 
 
 @pytest.mark.parametrize("folder", ["", "test"])
