@@ -10,6 +10,7 @@ picture an error.
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
@@ -28,6 +29,8 @@ from gvtools.scenes.calibration import Float64, scaled_lens
 from gvtools.scenes.faces import perspective_views
 from gvtools.scenes.images import (
     ALPHA,
+    DEPTH_SUFFIXES,
+    IMAGE_SUFFIXES,
     ImageHeader,
     check_size,
     fit_depth,
@@ -40,7 +43,7 @@ from gvtools.scenes.images import (
     stored_depth_size,
     white_of_pictures,
 )
-from gvtools.scenes.matching import named
+from gvtools.scenes.matching import named, pictures_in
 from gvtools.scenes.scene import Finding, Frame, Scene, View, natural_key
 from gvtools.scenes.undistort import LensParameters, Undistortion, undistortion
 from gvtools.untrusted import named_file
@@ -50,6 +53,15 @@ Depth = NDArray[np.float32]
 # Reasons for which a frame is left out, as findings have them.
 # Masks that a scene opens to see whether they tell anything.
 MASKS = 8
+# How what lies beside a project is given to it, by its kind.
+HOW_TO_GIVE = {
+    ("colmap", "depth"): "z-depth in scene units is read from stereo/depth_maps/NAME.npy, NAME as "
+    "in the model",
+    ("transforms", "depth"): "name them by depth_file_path in each frame, with "
+    "depth_unit_scale_factor",
+    ("colmap", "mask"): "give the folder with --masks (black = ignore)",
+    ("transforms", "mask"): "give the folder with --masks (black = ignore)",
+}
 NO_PICTURE = "have no picture"
 NO_POSE = "have no pose"
 NAN_POSE = "have NaN in their pose"
@@ -204,6 +216,7 @@ def posed_scene(
         report += center_findings([item.lens for item in photographs])
         report += size_findings(photographs, sieve)
         report += map_findings(photographs)
+        report += unread_findings(Path(root), frames, kind)
     if white != WHOLE[-1]:
         report = [item for item in report if not item.message.endswith(UPPER)]
         line = f"16-bit pictures hold no more than {white:g}: all are read as 0 to {white:g}"
@@ -233,6 +246,27 @@ def mask_findings(frames: Sequence[PosedFrame]) -> list[Finding]:
                 "picture is to be ignored, and others elsewhere"
             )
             findings.append(Finding("warning", line))
+    return findings
+
+
+def unread_findings(root: Path, frames: Sequence[PosedFrame], kind: str) -> list[Finding]:
+    """A warning for each folder beside a project whose depth maps or masks nothing reads."""
+    home, findings = root if root.is_dir() else root.parent, list[Finding]()
+    folders = sorted(entry for entry in home.iterdir() if entry.is_dir())
+    for key, noun, name, suffixes in (
+        ("depth", "depth maps", r"depth|disparit", DEPTH_SUFFIXES),
+        ("mask", "masks", r"mask|segmentation", IMAGE_SUFFIXES),
+    ):
+        if any(getattr(frame, key) is not None for frame in frames):
+            continue
+        for folder in (entry for entry in folders if re.search(name, entry.name.lower())):
+            count = len(pictures_in(folder, suffixes))
+            if 2 * count >= len(frames) and folder not in {item.image.parent for item in frames}:
+                advice = HOW_TO_GIVE.get((kind, key), f"this kind of project has no {noun}")
+                line = (
+                    f"{folder.name} holds {count} files, as of {noun}, that are not read: {advice}"
+                )
+                findings.append(Finding("warning", line))
     return findings
 
 

@@ -92,6 +92,16 @@ def test_masks_of_instant_ngp_are_not_passed_over(tmp_path):
     )
 
 
+@pytest.mark.parametrize(
+    ("folder", "said"), [("depths", "depth_file_path"), ("Mask", "--masks"), ("normals", "")]
+)
+def test_folders_that_nothing_reads_are_said(tmp_path, folder, said):
+    save(tmp_path / "images/a.png", ramp())
+    save(tmp_path / folder / "a.png", ramp())
+    found = messages(read_transforms(transforms(tmp_path, [frame()], **PINHOLE)))
+    assert ("not read" in found) == bool(said) and said in found
+
+
 def test_absent_frames_masks_and_depth_are_reported(tmp_path):
     save(tmp_path / "images/a.png", ramp())
     frames = [frame(mask_path="m.png", depth_file_path="d.png"), frame("images/b.png")]
