@@ -21,7 +21,7 @@ Float64 = NDArray[np.float64]
 
 MILLIMETRES = 1e-3
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-INTRINSICS = "camera-intrinsics.txt"
+INTRINSICS, FLAT = "camera-intrinsics.txt", ("fx", "fy", "cx", "cy")
 # fx, fy, cx, cy of a Kinect-like sensor as PrimeSense's driver and Open3D have them, 640x480.
 SENSOR_DEFAULT, DEFAULT_SIZE = (525.0, 525.0, 319.5, 239.5), (640, 480)
 # A principal point may be so far from the middle, in half sides, and still be of its picture. One
@@ -104,14 +104,16 @@ def pinhole(values: Sequence[float]) -> Float64:
 def intrinsics_beside(root: Path) -> tuple[Float64, str] | None:
     """(3, 3) as published and the file's name: ``camera-intrinsics.txt`` or Open3D's JSON.
 
-    The text file may also stand in the parent folder. ``camera.json`` has to be of Open3D's form,
-    other JSON may be. Files that differ are refused.
+    The text file may also stand in the parent folder. ``camera.json`` has to hold intrinsics, other
+    JSON may. Files that differ are refused.
     """
     places = (root / INTRINSICS, root.resolve().parent / INTRINSICS)
     texts = [path for path in places if path.is_file()][:1]
     found = [(load_matrix(path, (3, 3)), path) for path in texts]
     for path in sorted(root.glob("*.json")):
-        if path.is_file() and (path.name == "camera.json" or "intrinsic_matrix" in _text(path)):
+        text = file_text(path)
+        flat = all(f'"{key}"' in text for key in FLAT)
+        if path.is_file() and (path.name == "camera.json" or flat or "intrinsic_matrix" in text):
             found.append((open3d_intrinsics(path), path))
             break
     if len(found) == 2 and not np.allclose(found[0][0], found[1][0], rtol=1e-4):
@@ -155,7 +157,7 @@ def exported_intrinsics(root: Path, camera: str) -> list[tuple[Float64, str]]:
     return found
 
 
-def _text(path: Path) -> str:
+def file_text(path: Path) -> str:
     """As long as it can be read: a damaged calibration still tells that it is one."""
     try:
         return read_text(path)
@@ -180,11 +182,14 @@ def times_as_large(center: ArrayLike, size: tuple[int, int]) -> float:
 
 
 def open3d_intrinsics(path: Path) -> Float64:
-    """(3, 3) intrinsics of Open3D's JSON form, which lists them column by column."""
+    """(3, 3) intrinsics of Open3D's JSON form, column by column, or of four numbers by name."""
     form = "expected Open3D's form with 'intrinsic_matrix' as nine numbers, column by column"
-    with reading(path, form):
-        values = read_json(path)["intrinsic_matrix"]
-        return np.array(values, np.float64).reshape(3, 3).T
+    with reading(path, f"{form}, or fx, fy, cx and cy"):
+        told = read_json(path)
+        told = told.get("camera", told)
+        if set(FLAT) <= {*told}:
+            return pinhole([float(told[key]) for key in FLAT])
+        return np.array(told["intrinsic_matrix"], np.float64).reshape(3, 3).T
 
 
 def sensor_default(size: tuple[int, int] | None = None) -> tuple[Float64, Finding]:

@@ -12,7 +12,7 @@ from types import MethodType
 from typing import Any
 
 from gvtools.errors import OptionError, ProjectError, UnposedError
-from gvtools.scenes.calibration import load_matrix
+from gvtools.scenes.calibration import file_text, load_matrix
 from gvtools.scenes.collection import SceneCollection, of_scenes
 from gvtools.scenes.colmap_model import find_model
 from gvtools.scenes.images import ALPHA, IMAGE_SUFFIXES
@@ -176,9 +176,24 @@ def _nearest(path: Path) -> str:
 
 
 def _unknown(path: Path) -> ProjectError:
+    lists = [p.name for p in sorted(path.glob("*.json")) if '"transform_matrix"' in file_text(p)]
+    if lists:
+        line = f"{named(lists)} lists frames with poses and is no {TRANSFORMS} by its name"
+        return ProjectError(f"{path}: {line}; give its path")
     unposed = count_unposed(path)
     if unposed:
-        return UnposedError(path, f"{unposed} RGB-D frames without poses", _capture(path))
+        texts = {p.parent.name for p in path.glob("*/*") if p.suffix in (".txt", ".npy")}
+        texts -= {"intrinsic", "intrinsics"}
+        many = [
+            f"{name}/" for name in sorted(texts) if len([*(path / name).iterdir()]) >= unposed / 2
+        ]
+        advice = _capture(path)
+        if many:
+            advice = (
+                f"if {named(many)} holds them, camera-to-world, call it pose/ (invert matrices "
+                f"that map the other way); else {advice}"
+            )
+        return UnposedError(path, f"{unposed} RGB-D frames without poses", advice)
     entries = sorted(entry.name + "/" * entry.is_dir() for entry in path.iterdir())
     there = (place for form in ("*/", "dense/*/", "*.r3d", "*.zip") for place in path.glob(form))
     inside = [str(place) for place in sorted(there) if is_project(place)]

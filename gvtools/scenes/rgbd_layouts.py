@@ -215,6 +215,14 @@ def _stamped_files(path: Path) -> list[tuple[float, str]]:
     return [(time, name) for time, (_, name) in zip(seconds.tolist(), entries, strict=True)]
 
 
+# Where exporters like ScanNet's put each kind; poses that are named camera-from-world are not read.
+FOLDERS = {
+    "color": ("color", "colour", "rgb", "image", "images"),
+    "depth": ("depth", "depths", "depth_map", "depth_maps"),
+    "pose": ("pose", "poses", "camera_pose", "camera_poses", "c2w", "cam2world", "cam_to_world"),
+}
+
+
 class _ScanNet(RgbdFolder):
     name = "ScanNet"
     holds = "color, depth, pose, intrinsic", "color, depth, intrinsic"
@@ -229,12 +237,8 @@ class _ScanNet(RgbdFolder):
         return all(folder.is_dir() for folder in folders)
 
     def _folder(self, root: Path, kind: str) -> Path:
-        kinds = {
-            "color": ("color", "rgb", "image", "images"),
-            "depth": ("depth", "depths"),
-            "pose": ("pose", "poses"),
-        }
-        return next((root / n for n in kinds[kind] if (root / n).is_dir()), root / kind)
+        there = {entry.name.lower(): entry for entry in root.glob("*") if entry.is_dir()}
+        return next((there[name] for name in FOLDERS[kind] if name in there), root / kind)
 
     def _files(self, root: Path, kind: str) -> list[Path]:
         suffixes = {"depth": DEPTH_SUFFIXES, "pose": (".txt", ".npy")}

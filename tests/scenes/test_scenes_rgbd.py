@@ -148,6 +148,21 @@ def test_scannets_cameras_at_the_usual_other_places(tmp_path, place):
         assert "K.txt differs from intrinsic" in messages(open_project(root))
 
 
+@pytest.mark.parametrize("name", ["Pose", "c2w", "extrinsics"])
+def test_poses_in_folders_of_other_names(tmp_path, name):
+    root = scannet(tmp_path / "scan")
+    expected = SCANNET.read(root)
+    (root / "color").rename(root / "RGB")
+    (root / "depth").rename(root / "depth_maps")
+    (root / "pose").rename(root / name)
+    if name == "extrinsics":  # of either way
+        with pytest.raises(ProjectError, match=r"if extrinsics/ holds them, camera-to-world, call"):
+            open_project(root)
+    else:
+        found = open_project(root).cameras.cam_from_world
+        np.testing.assert_array_equal(found, expected.cameras.cam_from_world)
+
+
 @pytest.mark.parametrize("codes", [[[90, 5, 0], [0, 90, 0], [0, 0, 1]], [[0, 0, 0]] * 3])
 def test_impossible_intrinsics(tmp_path, codes):
     root = sevenscenes(tmp_path)
@@ -257,11 +272,13 @@ def test_tum_intrinsics_by_file_by_name_or_by_default(tmp_path):
     plain = TUM.read(tum(tmp_path / "office"))
     np.testing.assert_allclose(plain.cameras.K[0, :2, 2], [320, 240])
     assert "driver's default" in messages(plain)
-    written = {"intrinsic_matrix": [500, 0, 0, 0, 501, 0, 310, 230, 1]}
-    (tmp_path / "office" / "camera.json").write_text(json.dumps(written))
-    np.testing.assert_allclose(
-        TUM.read(tmp_path / "office").cameras.K[0], [[500, 0, 310.5], [0, 501, 230.5], [0, 0, 1]]
-    )
+    flat = {"fx": 500, "fy": 501, "cx": 310, "cy": 230, "width": 640}
+    for written in ({"intrinsic_matrix": [500, 0, 0, 0, 501, 0, 310, 230, 1]}, flat):
+        (tmp_path / "office" / "camera.json").write_text(json.dumps(written))
+        np.testing.assert_allclose(
+            TUM.read(tmp_path / "office").cameras.K[0],
+            [[500, 0, 310.5], [0, 501, 230.5], [0, 0, 1]],
+        )
 
 
 @pytest.mark.parametrize("text", ['{"K": 3}', "\x00"])

@@ -92,6 +92,13 @@ def test_masks_of_instant_ngp_are_not_passed_over(tmp_path):
     )
 
 
+def test_a_file_of_frames_by_another_name_is_named(tmp_path):
+    save(tmp_path / "images/a.png", ramp())
+    transforms(tmp_path, [frame()], **PINHOLE).rename(tmp_path / "transforms_original.json")
+    with pytest.raises(ProjectError, match=r"transforms_original.json lists frames with poses"):
+        open_project(tmp_path)
+
+
 @pytest.mark.parametrize(
     ("folder", "said"), [("depths", "depth_file_path"), ("Mask", "--masks"), ("normals", "")]
 )
