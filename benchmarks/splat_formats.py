@@ -78,15 +78,16 @@ def by_pygltflib(file: Path) -> Found:
 
 
 def by_openusd(file: Path) -> Found:
-    """A USD of one field of splats."""
+    """A USD of one field of splats, in the axes from before its root turned them upright."""
     from pxr import Usd, UsdGeom, UsdVol
 
     stage = Usd.Stage.Open(str(file))
     (prim,) = (p for p in stage.Traverse() if p.IsA(UsdVol.ParticleField3DGaussianSplat))
-    moved = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(prim))[3, :3]
+    root = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(stage.GetDefaultPrim()))
+    world = np.array(prim.GetAttribute("positions").Get()) @ root[:3, :3] + root[3, :3]
     sh = np.array(prim.GetAttribute("radiance:sphericalHarmonicsCoefficients").Get())
     terms = (prim.GetAttribute("radiance:sphericalHarmonicsDegree").Get() + 1) ** 2
-    return np.array(prim.GetAttribute("positions").Get()) + moved, shade(sh[::terms])
+    return world @ root[:3, :3].T, shade(sh[::terms])
 
 
 READERS: dict[str, tuple[tuple[str, Callable[[Path], Found]], ...]] = {
