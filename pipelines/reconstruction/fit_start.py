@@ -84,7 +84,8 @@ def given_start(plan: Plan, frame: LocalFrame, console: Console) -> GivenStart |
         placement = _placed(surface, plan, console, path=path)
     values = _strongest(_local(splats, placement, frame), options.most_gaussians)
     fewer = f" of {len(splats):,}" if len(values) < len(splats) else ""
-    console.line(f"fitting begins with {len(values):,}{fewer} Gaussians of {path}")
+    cut = "" if splats.values.shape[1] <= VALUES else ", without harmonics above degree 2"
+    console.line(f"fitting begins with {len(values):,}{fewer} Gaussians of {path}{cut}")
     return GivenStart(Gaussians(values, frame=frame), fitted=True)
 
 
