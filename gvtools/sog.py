@@ -42,6 +42,11 @@ def read_sog(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     """
     if path.suffix.lower() == ".json":
         meta = read_json(path)
+        if "lodLevels" in meta:
+            raise MemoryFileError(
+                f"{path}: a list of pieces by level of detail; expected the {META} of one piece; "
+                "give a piece's folder, or convert the scene into one .sog"
+            )
         names = {name for part in PARTS if part in meta for name in meta[part]["files"]}
         files = {name: named_file(path.parent, name, where=str(path)) for name in names}
         size = sum(file.stat().st_size for file in files.values())

@@ -60,15 +60,24 @@ KSPLAT_RANGE = 1.5
 KHR, SRGB = "KHR_gaussian_splatting", "srgb_rec709_display"
 # The node by which an exported glTF stands upright.
 UPRIGHT = "gvtools_upright"
+# What glTF and USD tell to be up where an export did not know it.
+UNKNOWN = [0.0, 0.0, 0.0]
 # Of a GLB, in which the extensions that it uses are named.
 GLB_HEAD = 1 << 20
 # Of a Gaussian in a glTF, in bytes.
 LEAST_BYTES = 16
 # How many coefficients of a colour harmonics of degree 1 to 4 have above degree 0.
 RESTS = (0, 3, 8, 15, 24)
-# Who reads a USD, in a child process.
-USD = f"{__name__}:usd"
+# Who reads a USD, in a child process, and what a byte of its text takes there.
+USD, USD_BYTES_PER_BYTE = f"{__name__}:usd", 64
+USD_ENDS = (".usd", ".usda", ".usdc", ".usdz")
+# The node by which an exported USD stands upright, see ``pipelines.export.points``.
+USD_ROOT = "gvtools"
+# Of a flat Gaussian's third size, before the exponential, below its smaller one.
+FLAT = 7.0
 PACKED, MODES = "packed_position", ("mip", "2dgs")
+# Numbers of a compressed PLY's chunk: ranges of positions and of sizes, without those of colours.
+OLD_RANGES = 12
 
 
 def read_splats(path: Path) -> Splats:
@@ -101,7 +110,7 @@ def holds_splats(path: Path) -> bool:
     """
     suffix = path.suffix.lower()
     if suffix == ".json" or path.is_dir():
-        return (path / META).is_file() if path.is_dir() else path.name == META
+        return (path / META).is_file() if path.is_dir() else path.name.endswith(META)
     if suffix == ".ply" and path.is_file():
         header = read_header(path)
         names = {name for element in header.elements for name, _ in element.columns}
@@ -114,7 +123,7 @@ def holds_splats(path: Path) -> bool:
 
 def is_splat(names: Collection[str]) -> bool:
     """Whether a PLY with properties of these names holds Gaussians, compressed or not."""
-    needed = {*"xyz", *numbered("f_dc", 3), "opacity", *numbered("scale", 3), *numbered("rot", 4)}
+    needed = {*"xyz", *numbered("f_dc", 3), "opacity", *numbered("scale", 2), *numbered("rot", 4)}
     return needed <= {*names} or PACKED in names
 
 
@@ -137,7 +146,9 @@ def _splats(
     Positions count from ``center``, which is told as an origin where float32 needs it, and both
     from ``origin``, which the file tells.
     """
-    values = values[:, : SH + 3 * TERMS[-1]].astype(np.float32)
+    widest = SH + 3 * TERMS[-1]
+    cut = values.shape[1] > widest
+    values = values[:, :widest].astype(np.float32)
     values[:, LOGIT] = np.clip(values[:, LOGIT], -99, 99)
     sound = np.isfinite(values).all(axis=1) & values[:, QUATERNION:LOGIT].any(axis=1)
     kept = values[sound]
@@ -156,7 +167,7 @@ def _splats(
         origin = origin + shift
     rounds, generated = np.zeros(len(kept), np.int32), np.zeros(len(kept), np.bool_)
     dropped = len(values) - len(kept)
-    return Splats(kept, origin, None, 0, rounds, generated, up, mode, dropped)
+    return Splats(kept, origin, None, 0, rounds, generated, up, mode, dropped, cut)
 
 
 def _rows(positions: Any, log_scales: Any, quaternions: Any, *, logits: Any, sh: Any) -> Float32:
@@ -187,6 +198,8 @@ def _read_ply(path: Path) -> Splats:
     if any(PACKED in dict(item.columns) for item in header.elements):
         return _splats(_unpacked(path, form="compressed.ply"), **told)
     rows = read_ply(path, strict=False)
+    if "scale_2" not in (rows.dtype.names or ()):
+        told["mode"] = "2dgs"
     if rows.dtype["x"].itemsize == 8 and len(rows):
         # Doubles may be far from 0: any place among them is near.
         first = np.array([rows[axis][0] for axis in "xyz"])
@@ -214,8 +227,12 @@ def _ply_values(rows: NDArray[np.void], center: ArrayLike = 0) -> Float32:
         rest = columns(numbered("f_rest", count)).reshape(len(rows), 3, terms)
         sh = np.concatenate([sh, rest.transpose(0, 2, 1)], axis=1)
     positions = np.stack([rows[axis] for axis in "xyz"], axis=1) - np.asarray(center)
+    log_scales = columns(tuple(name for name in numbered("scale", 3) if name in names))
+    if log_scales.shape[1] == 2:  # 2D Gaussian Splatting's, which are flat
+        flat = log_scales.min(axis=1, keepdims=True) - FLAT
+        log_scales = np.concatenate([log_scales, flat], axis=1)
     return _rows(
-        positions, columns(numbered("scale", 3)), columns(numbered("rot", 4)),
+        positions, log_scales, columns(numbered("rot", 4)),
         logits=rows["opacity"], sh=sh,
     )  # fmt: skip
 
@@ -352,7 +369,8 @@ def unpacked(path: Path, *, form: str) -> Iterator[Item]:
 
     yield {"bytes_per_byte": BYTES_PER_BYTE}, {}
     # As a PLY: what has no harmonics, version 0.6 cannot hand over as arrays.
-    told = gaussforge.GaussForge().convert(read_bytes(path), form, "ply")
+    data = _with_color_ranges(path) if form == "compressed.ply" else read_bytes(path)
+    told = gaussforge.GaussForge().convert(data, form, "ply")
     if "error" in told:
         said = str(told["error"]).removeprefix(f"{form} read failed: ")
         raise MemoryFileError(f"{said}; expected a whole {form}; save it again")
@@ -361,6 +379,20 @@ def unpacked(path: Path, *, form: str) -> Iterator[Item]:
         file.write_bytes(told["data"])
         del told
         yield from _sent(_ply_values(read_ply(file)))
+
+
+def _with_color_ranges(path: Path) -> bytes:
+    """A compressed PLY whose chunks tell ranges of colours; from 0 to 1 where older ones do not."""
+    header, data = read_header(path), read_bytes(path)
+    chunks = header.elements[0]
+    if len(chunks.columns) != OLD_RANGES:
+        return data
+    size = header.offset + 4 * OLD_RANGES * chunks.count
+    rows = np.frombuffer(data[header.offset : size], "<f4").reshape(chunks.count, OLD_RANGES)
+    colors = np.broadcast_to(np.repeat([0, 1], 3), (chunks.count, 6))
+    told = "".join(f"property float {end}_{color}\n" for end in ("min", "max") for color in "rgb")
+    head = data[: header.offset].replace(b"element vertex", told.encode() + b"element vertex", 1)
+    return head + np.concatenate([rows, colors], axis=1, dtype="<f4").tobytes() + data[size:]
 
 
 def spz(path: Path, *, form: str) -> Iterator[Item]:
@@ -473,6 +505,8 @@ def glb_axes(tree: Mapping[str, Any]) -> tuple[Float64 | None, Float64]:
     for node, matrix in nodes:
         told = extras if isinstance(extras := node.get("extras"), dict) else {}
         up = _unit(told.get("up"))
+        if told.get("up") == UNKNOWN:
+            return None, np.eye(3)
         if up is not None:
             shown = _unit(matrix[:3, :3] @ up)
             # A node taken out of the one that turns it has the axes from before.
@@ -518,19 +552,25 @@ def usd(path: Path) -> Iterator[Item]:
     Rows and frame of each ParticleField3DGaussianSplat; positions and linear colours of each
     UsdGeom.Points, in the file's frame, before an export turned that upright.
     """
-    from pxr import Sdf, Usd, UsdGeom
+    from pxr import Gf, Sdf, Usd, UsdGeom
 
-    yield {}, {}
+    yield {"bytes_per_byte": USD_BYTES_PER_BYTE}, {}
     layer = Sdf.Layer.OpenAsAnonymous(str(path))
     if layer is None or layer.GetCompositionAssetDependencies():
         raise MemoryFileError("damaged, or names other files; expected one USD layer")
     cache, stage = UsdGeom.XformCache(), Usd.Stage.Open(layer)
     told, axis = layer.customLayerData, UsdGeom.GetStageUpAxis(stage)
-    back, up = rigid_poses(_turn_back(told.get("turn"))), _unit(told.get("up"))
+    back, up = _turn_back(told.get("turn")), _unit(told.get("up"))
+    if not {"turn", "up"} & {*told}:
+        # Many programs keep the prim that turns, but no data of the layer.
+        turns = [np.array(cache.GetLocalToWorldTransform(prim))[:3, :3]
+                 for prim in stage.Traverse() if prim.GetName() == USD_ROOT]  # fmt: skip
+        back = turns[0] / np.cbrt(np.linalg.det(turns[0])) if turns else back
     # Where an export turned the scene, up is the stage's axis; earlier ones only told it.
-    if "turn" in told or up is None:
-        up = back[:3, :3] @ (0, axis == "Y", axis == "Z")
-    yield {"up": up.tolist()}, {}
+    if "turn" in told or (up is None and told.get("up") != Gf.Vec3d(*UNKNOWN)):
+        up = back @ (0, axis == "Y", axis == "Z")
+    yield {"up": None if up is None else up.tolist()}, {}
+    back = rigid_poses(back)
     for prim in stage.Traverse():
         matrix = back @ np.array(cache.GetLocalToWorldTransform(prim)).T
         if prim.IsA(UsdGeom.Points):
@@ -567,5 +607,5 @@ READERS: Mapping[str, Callable[[Path], Splats]] = {
     ".splat": _read_splat,
     ".ksplat": _read_ksplat,
     ".glb": _read_glb,
-    **dict.fromkeys((".usd", ".usda", ".usdc"), _read_usd),
+    **dict.fromkeys(USD_ENDS, _read_usd),
 }

@@ -53,6 +53,7 @@ class Splats:
     up: NDArray[np.float64] | None = None  # (3,) unit vector, where the cameras or the file tell it
     mode: str = ""  # how a file wants them drawn: "mip" (antialiased), "2dgs"; "" as 3DGS does
     dropped: int = 0  # Gaussians of a file that are no numbers, which are left out
+    cut: bool = False  # whether a file has harmonics above degree 3, which are left out
 
     def __len__(self) -> int:
         return len(self.values)
@@ -111,6 +112,8 @@ class Splats:
             text += f", the first of {self.further + 1} fits"
         if self.dropped:
             text += f", {self.dropped} without finite numbers left out"
+        if self.cut:
+            text += f", harmonics above degree {len(TERMS) - 1} left out"
         if self.origin.any():
             text += f", counted from {' '.join(f'{x:.10g}' for x in self.origin)}"
         return text

@@ -10,6 +10,7 @@ from zipfile import ZipFile
 import numpy as np
 import pytest
 from command_line import refused, run_command
+from numpy.lib.recfunctions import repack_fields
 from PIL import Image
 from plyfile import PlyData, PlyElement
 from scipy.spatial import cKDTree
@@ -19,7 +20,7 @@ from gvtools.errors import GvError, MemoryFileError
 from gvtools.glb import glb_array, join_glb, split_glb
 from gvtools.scans.read import read_scan
 from gvtools.splat_files import read_splats
-from gvtools.splats import SH, TERMS, TO_RUB, Splats, place_gaussians, turn_gaussians
+from gvtools.splats import HARMONICS, SH, TERMS, TO_RUB, Splats, place_gaussians, turn_gaussians
 from pipelines.export.formats import ExportOptions
 from pipelines.export.splats import write_file
 
@@ -272,6 +273,101 @@ def test_splats_are_scans(tmp_path, end):
     assert away.max() < 0.01 and len(scan.positions) <= (given.logits > -0.02).sum()
     colors = 255 * given.colors[chosen]
     np.testing.assert_allclose(scan.colors[place], colors, atol=3)
+
+
+def test_flat_gaussians_have_two_sizes(tmp_path):
+    """As 2D Gaussian Splatting writes them."""
+    file, given = written(tmp_path, ".ply", some()), some()
+    rows = PlyData.read(file)["vertex"].data
+    rows = repack_fields(rows[[name for name in rows.dtype.names if name != "scale_2"]])
+    PlyData([PlyElement.describe(rows, "vertex")]).write(tmp_path / "b.ply")
+    found = read_splats(tmp_path / "b.ply")
+    assert found.mode == "2dgs"
+    np.testing.assert_array_equal(found.log_scales[:, :2], given.log_scales[:, :2])
+    assert (found.log_scales[:, 2] < given.log_scales[:, :2].min(axis=1) - 6).all()
+    np.testing.assert_array_equal(found.harmonics, given.harmonics)
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_compressed_ply_from_before_ranges_of_colors(tmp_path, degree):
+    file = written(tmp_path, ".compressed.ply", some(degree))
+    chunk, *behind = PlyData.read(file).elements
+    ranges = [chunk.data[f"{end}_{color}"][0] for end in ("min", "max") for color in "rgb"]
+    names = [name for name in chunk.data.dtype.names if name[-2:] not in ("_r", "_g", "_b")]
+    older = PlyElement.describe(repack_fields(chunk.data[names]), "chunk")
+    expected = read_splats(file)
+    PlyData([older, *behind]).write(tmp_path / "b.compressed.ply")
+    found = read_splats(tmp_path / "b.compressed.ply")
+    np.testing.assert_array_equal(found.values[:, :SH], expected.values[:, :SH])
+    np.testing.assert_array_equal(found.harmonics[:, 1:], expected.harmonics[:, 1:])
+    # The first chunk's bytes, which count from 0 to 1 instead of within its ranges.
+    low, high = np.split(np.array(ranges), 2)
+    share = (0.5 + HARMONICS[0] * expected.harmonics[:256, 0] - low) / (high - low)
+    np.testing.assert_allclose(0.5 + HARMONICS[0] * found.harmonics[:256, 0], share, atol=1e-5)
+
+
+def test_a_text_usd_may_take_many_times_its_size(tmp_path):
+    many = replace(some(), values=np.tile(some().values, (100, 1)))
+    assert len(read_splats(written(tmp_path, ".usda", many))) == len(many)
+
+
+@pytest.mark.parametrize("end", [".glb", ".usdc"])
+@pytest.mark.parametrize("up", [None, (0.0, -0.6, 0.8)])
+def test_up_that_is_not_known_is_not_told(tmp_path, end, up):
+    given = replace(some(1), up=None if up is None else np.array(up))
+    found = read_splats(written(tmp_path, end, given))
+    assert up is None if found.up is None else found.up == pytest.approx(up, abs=1e-6)
+
+
+@pytest.mark.parametrize("moved", [False, True])
+def test_usd_that_another_program_saved_without_data_of_the_layer(tmp_path, moved):
+    file, given = written(tmp_path, ".usdc", some(1)), some(1)
+    from pxr import Sdf, Usd, UsdGeom
+
+    layer = Sdf.Layer.OpenAsAnonymous(str(file))
+    layer.customLayerData = {}
+    stage = Usd.Stage.CreateInMemory()
+    UsdGeom.SetStageUpAxis(stage, "Z" if moved else "Y")
+    if moved:
+        UsdGeom.Xform.Define(stage, "/World").AddRotateXOp().Set(90)
+    Sdf.CopySpec(layer, "/gvtools", stage.GetRootLayer(), f"{'/World' * moved}/gvtools")
+    stage.GetRootLayer().Export(str(tmp_path / "b.usdc"))
+    with ZipFile(tmp_path / "b.usdz", "w") as out:
+        out.write(tmp_path / "b.usdc", "b.usdc")
+    for name in ("b.usdc", "b.usdz"):
+        found = read_splats(tmp_path / name)
+        check_alike(found, given, (1e-5, 1e-6, 1e-6, 1e-6, 1e-4))
+        assert found.up == pytest.approx(given.up, abs=1e-6)
+
+
+def test_what_a_format_has_no_place_for_is_said(tmp_path, capsys):
+    given = replace(some(), mode="mip")
+    file = written(tmp_path, ".ply", given)
+    rows = PlyData.read(file)["vertex"].data
+    above = [(f"f_rest_{number}", "<f4") for number in range(45, 72)]
+    wide = np.zeros(COUNT, rows.dtype.descr + above)
+    for name in rows.dtype.names:
+        wide[name] = rows[name]
+    PlyData([PlyElement.describe(wide, "vertex")]).write(tmp_path / "b.ply")
+    for end, said in (
+        ("a.splat", ", without harmonics, without SplatRenderMode mip"),
+        ("a.ksplat", ", harmonics up to degree 2, without SplatRenderMode mip"),
+        ("a.spz", "axes right, up, back"),
+        ("a.glb", "nothing tells what is up"),
+    ):
+        told = write_file(replace(given, up=None), tmp_path / end, ExportOptions())
+        assert said in told
+    assert "Mode" not in write_file(given, tmp_path / "a.sog", ExportOptions())
+    run_command("export", tmp_path / "b.ply", "--out", tmp_path / "c.ply")
+    assert "harmonics above degree 3 left out" in capsys.readouterr().out
+    run_command("export", tmp_path / "a.spz", "--out", tmp_path / "c.ply")
+    assert "turned half around x" in capsys.readouterr().out
+
+
+def test_a_list_of_levels_of_detail_is_no_scene(tmp_path, capsys):
+    (tmp_path / "lod-meta.json").write_text('{"version": 1, "lodLevels": 2}')
+    said = refused(capsys, "export", tmp_path / "lod-meta.json", "--out", tmp_path / "a.sog")
+    assert "expected the meta.json of one piece" in said
 
 
 def test_harmonics_of_no_whole_degree_are_refused(tmp_path):

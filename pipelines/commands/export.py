@@ -117,14 +117,17 @@ class ExportCommand(Arguments, ExportOptions):
         self.refuse(("max_points", "observed", "round"), f"{self.memory} is a file of splats")
         splats = read_splats(self.memory)
         splats = replace(splats, up=splats.up if self.up is None else self._told_up())
+        said = _said(splats.up)
+        if self.memory.suffix.lower() == ".spz":
+            said += "; turned half around x, as an SPZ's axes are right, up, back"
         if form.name == "html":
             from pipelines.export.html import page_of, write_page
             from pipelines.viewing.source import ViewSource
 
             run = replace(ViewSource(self.memory).read(), told_up=splats.up)
-            console.line(write_page(page_of(run, splats), splats, self.out) + _said(splats.up))
+            console.line(write_page(page_of(run, splats), splats, self.out) + said)
             return
-        console.line(write_file(splats, self.out, self) + _said(splats.up))
+        console.line(write_file(splats, self.out, self) + said)
 
     def _told_up(self) -> NDArray[np.float64] | None:
         """(3,) unit vector of --up."""

@@ -22,7 +22,7 @@ from gvtools.glb import pack_glb
 from gvtools.memory.ply import export_memory_ply
 from gvtools.ply import up_comment
 from gvtools.runs.run import load_run
-from gvtools.splat_files import UPRIGHT
+from gvtools.splat_files import UNKNOWN, UPRIGHT, USD_ROOT
 from gvtools.splats import box_middle
 from pipelines.export.formats import ExportOptions
 from pipelines.export.source import ExportSource
@@ -39,7 +39,7 @@ UNLIT = "KHR_materials_unlit"
 TO_16_BITS = 257
 # Viewers of USD and glTF are slow beyond it.
 MAX_POINTS = 2_000_000
-ROOT, CLOUD = "/gvtools", "/gvtools/memory"
+ROOT, CLOUD = f"/{USD_ROOT}", f"/{USD_ROOT}/memory"
 NODE = "gvtools_memory"
 FRAME = "input world frame and axes, scene units; any node around this one turns what is up to y"
 # What is up is along an axis from this share of its length on.
@@ -179,7 +179,12 @@ def turn_upright(up: NDArray[np.float64] | None) -> list[float]:
 
 def axes_of(up: NDArray[np.float64] | None) -> str:
     """What is said of the axes of a GLB or USD."""
-    return ", in the input's axes" if up is None else ", turned upright"
+    if up is not None:
+        return ", turned upright"
+    return (
+        ", in the input's axes: nothing tells what is up, and other programs may show it on its "
+        "side or upside down (--up X Y Z turns it)"
+    )
 
 
 def usd_stage(center: NDArray[np.float64], up: NDArray[np.float64] | None) -> Any:
@@ -198,8 +203,8 @@ def usd_stage(center: NDArray[np.float64], up: NDArray[np.float64] | None) -> An
         x, y, z, w = turn
         root.AddOrientOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Quatd(w, x, y, z))
         told["turn"] = Gf.Vec4d(*turn)
-    if up is not None:
-        stage.GetRootLayer().customLayerData = told | {"up": Gf.Vec3d(*up.tolist())}
+    told["up"] = Gf.Vec3d(*(UNKNOWN if up is None else up.tolist()))
+    stage.GetRootLayer().customLayerData = told
     root.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(*center.tolist()))
     stage.SetDefaultPrim(root.GetPrim())
     stage.SetMetadata("comment", f"gvtools, scene units, input world frame and axes below {ROOT}")
@@ -247,7 +252,7 @@ def save_glb(
     """
     center = box_middle(positions.astype(np.float64))
     told, around = {"origin": center.tolist(), "frame": FRAME, **(extras or {})}, None
-    told |= {} if up is None else {"up": up.tolist()}
+    told["up"] = UNKNOWN if up is None else up.tolist()
     turn = turn_upright(up)
     if turn:
         told["turn"], around = turn, {"name": UPRIGHT, "rotation": turn}

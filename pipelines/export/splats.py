@@ -28,7 +28,7 @@ from gvtools.files import replaced_when_written
 from gvtools.optional import installed, require
 from gvtools.ply import up_comment, write_ply
 from gvtools.sog import META
-from gvtools.splat_files import KHR, RESTS, SRGB, numbered
+from gvtools.splat_files import KHR, MODES, RESTS, SRGB, numbered
 from gvtools.splats import SH, TERMS, TO_RUB, Splats, box_middle, turn_gaussians
 from pipelines.export.formats import ExportOptions
 from pipelines.export.points import axes_of, linear, save_glb, save_usd, usd_stage
@@ -40,8 +40,11 @@ BITS, MOST_FRACTIONAL, USUAL_FRACTIONAL = 24, 23, 12
 FRACTIONAL_AT, FLAGS_AT = 13, 14
 # Steps of positions in a small Gaussian's least standard deviation; smaller ones are this share.
 STEPS_PER_SIZE, SMALLEST = 8, 0.05
-# Coefficients of a channel above degree 0, in a PLY; the degree that ksplat's own reader takes.
-REST, KSPLAT_DEGREE = 15, 2
+# Coefficients of a channel above degree 0, in a PLY.
+REST = 15
+# The degree that formats end at (ksplat's own reader takes no more), and what they tell of drawing.
+MOST_DEGREE = {".splat": 0, ".ksplat": 2}
+MODES_KEPT = {".ply": MODES, ".spz": ("mip",), ".sog": ("mip",)}
 FIELD = "/gvtools/splats"
 # What says nothing of what is up.
 SILENT = (".spz", ".splat", ".ksplat")
@@ -59,7 +62,17 @@ def write_file(splats: Splats, path: Path, options: ExportOptions) -> str:
     with replaced_when_written(path, suffix="".join(path.suffixes[-2:]).lower()) as temporary:
         ends = (end for end in WRITERS if path.name.lower().endswith(end))
         note = WRITERS[next(ends)](splats, temporary, options)
-    return f"{splats.summary()} in {path}{note}"
+    return f"{splats.summary()} in {path}{note}{_lost(splats, path.suffix.lower())}"
+
+
+def _lost(splats: Splats, suffix: str) -> str:
+    """What is said of what a format has no place for."""
+    most, text = MOST_DEGREE.get(suffix, splats.degree), ""
+    if most < splats.degree:
+        text = f", harmonics up to degree {most}" if most else ", without harmonics"
+    if splats.mode not in ("", *MODES_KEPT.get(suffix, ())):
+        text += f", without SplatRenderMode {splats.mode}"
+    return text
 
 
 def _write_ply(splats: Splats, path: Path, options: ExportOptions) -> str:
@@ -125,7 +138,7 @@ def _write_spz(splats: Splats, path: Path, options: ExportOptions) -> str:
     data[FRACTIONAL_AT], data[FLAGS_AT] = fractional, data[FLAGS_AT] | antialiased
     # Without a time, so that equal scenes give equal files.
     path.write_bytes(data if version == 4 else gzip.compress(data, mtime=0))
-    return f", positions in steps of {2.0**-fractional:.3g}"
+    return f", axes right, up, back, positions in steps of {2.0**-fractional:.3g}"
 
 
 def _by_gsply(splats: Splats, path: Path, version: int) -> bytes:
@@ -184,7 +197,7 @@ def _write_compressed(splats: Splats, path: Path, options: ExportOptions) -> str
 
 def _write_ksplat(splats: Splats, path: Path, options: ExportOptions) -> str:
     """Degree by degree and in these by colour, which gaussforge 0.6 writes by colour alone."""
-    degree = min(splats.degree, KSPLAT_DEGREE)
+    degree = min(splats.degree, MOST_DEGREE[".ksplat"])
     rest = splats.harmonics[:, 1 : TERMS[degree]]
     by_degree = [rest[:, first:last].transpose(0, 2, 1).reshape(len(splats), -1)
                  for first, last in pairwise(RESTS[: degree + 1])]  # fmt: skip
@@ -196,7 +209,7 @@ def _write_ksplat(splats: Splats, path: Path, options: ExportOptions) -> str:
     # Sections, those that are loaded, Gaussians at most and there.
     struct.pack_into("<4I", data, 4, 1, 1, len(splats), len(splats))
     path.write_bytes(data)
-    return "" if degree == splats.degree else f", harmonics up to degree {degree}"
+    return ""
 
 
 def _by_gaussforge(

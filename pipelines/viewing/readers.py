@@ -188,7 +188,9 @@ def _with_plain_colors(tree: dict[str, Any], body: bytes) -> bytes | None:
     return join_glb(tree, body)
 
 
-def read_usd(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8], NDArray[np.float64]]:
+def read_usd(
+    path: Path,
+) -> tuple[NDArray[np.float64], NDArray[np.uint8], NDArray[np.float64] | None]:
     """(N, 3) positions and colours of all UsdGeom.Points, in the file's frame; (3,) what is up."""
     require("pxr", extra="export", purpose=f"{path}: {path.suffix}")
     try:
@@ -198,7 +200,8 @@ def read_usd(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8], NDArra
         colors = [np.broadcast_to(part.get("colors", grey), part["positions"].shape)
                   for part in parts]  # fmt: skip
         positions = np.concatenate([part["positions"] for part in parts])
-        return positions, srgb_bytes(np.concatenate(colors)), np.array(facts["up"])
+        up = None if facts["up"] is None else np.array(facts["up"])
+        return positions, srgb_bytes(np.concatenate(colors)), up
     except (ReaderError, OSError, ValueError, KeyError):
         raise MemoryFileError(
             f"{path}: no USD with UsdGeom.Points, or one that is damaged or names other files; "

@@ -22,7 +22,7 @@ from gvtools.optional import require
 from gvtools.ply import read_header
 from gvtools.runs.layout import RECORD
 from gvtools.runs.run import Run, count_rounds, load_growing_run, load_memory
-from gvtools.splat_files import READERS, holds_splats, read_splats
+from gvtools.splat_files import READERS, USD_ENDS, holds_splats, read_splats
 from pipelines.export.formats import ExportOptions
 from pipelines.export.html import page_of
 from pipelines.export.source import ExportSource
@@ -255,5 +255,5 @@ OPENERS: Mapping[str, Callable[[Path], RunView | None]] = {
     ".glb": lambda path: _open_splats(path) if holds_splats(path) else _open_mesh(path),
     ".obj": _open_mesh,
     **dict.fromkeys((".las", ".laz"), _open_las),
-    **dict.fromkeys((".usd", ".usda", ".usdc"), _open_usd),
+    **dict.fromkeys(USD_ENDS, _open_usd),
 }
