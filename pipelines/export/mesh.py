@@ -111,8 +111,13 @@ def tsdf_mesh(
                 continue
             raise
         grid.integrate(blocks, *images, lens, lens, pose, 1.0, FAR, TRUNCATION)
-    mesh = grid.extract_triangle_mesh(LEAST_WEIGHT)
-    return _ordered(_checked(mesh, f"a TSDF of voxels of {voxel:.4g}"))
+    mesh = _checked(grid.extract_triangle_mesh(LEAST_WEIGHT), f"a TSDF of voxels of {voxel:.4g}")
+    # Beside blocks that no picture reaches, Open3D leaves vertices black.
+    colors = mesh.vertex.colors.numpy()
+    if (black := ~colors.any(axis=1)).any():
+        near, _ = _nearest(memory.columns.positions, mesh.vertex.positions.numpy()[black])
+        colors[black] = memory.columns.colors[near] / 255
+    return _ordered(mesh)
 
 
 def _blocks(memory: SpatialMemory, edge: float) -> int:
@@ -181,13 +186,20 @@ def poisson_mesh(
     extent = float(np.ptp(positions, axis=0).max())
     levels = int(np.clip(np.ceil(np.log2(1.1 * extent / voxel)), 5, MOST_LEVELS))
     mesh, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=levels)
-    search = o3d.core.nns.NearestNeighborSearch(o3d.core.Tensor(positions))
-    search.knn_index()
-    _, squared = search.knn_search(o3d.core.Tensor(np.asarray(mesh.vertices)), 1)
+    _, squared = _nearest(positions, np.asarray(mesh.vertices))
     reach = REACH * max(voxel, extent * 1.1 / 2**levels)
-    mesh.remove_vertices_by_mask(squared.numpy()[:, 0] > reach**2)
+    mesh.remove_vertices_by_mask(squared > reach**2)
     made = o3d.t.geometry.TriangleMesh.from_legacy(mesh)
     return _checked(made, f"Poisson reconstruction with {levels} levels")
+
+
+def _nearest(points: NDArray[Any], places: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """For each place (P, 3) the row of the nearest point (N, 3), and its squared distance."""
+    search = o3d.core.nns.NearestNeighborSearch(o3d.core.Tensor(np.ascontiguousarray(points)))
+    search.knn_index()
+    found = search.knn_search(o3d.core.Tensor(np.ascontiguousarray(places, points.dtype)), 1)
+    rows, squared = (each.numpy()[:, 0] for each in found)
+    return rows, squared
 
 
 def _checked(mesh: o3d.t.geometry.TriangleMesh, method: str) -> o3d.t.geometry.TriangleMesh:

@@ -8,6 +8,7 @@ import pytest
 from box_project import VOXEL
 from export_runs import Y_UP, export_run, glb_colors
 
+from gvtools.cameras import Cameras
 from gvtools.errors import DegenerateError, OptionError
 from gvtools.memory.spatial_memory import SpatialMemory
 from pipelines.export import mesh as meshes
@@ -61,6 +62,14 @@ def test_trimesh_reads_the_walls(scene, bare_run, tmp_path, method):
     shown = frame.rgb[row[inside], column[inside]].astype(float)
     assert np.median(np.abs(colors - shown)) < 15
     assert np.corrcoef(colors.ravel(), shown.ravel())[0, 1] > 0.8
+
+
+def test_no_vertex_of_a_grey_wall_is_black():
+    memory, rgb = SpatialMemory(0.01), np.full((240, 320, 3), 133, np.uint8)
+    camera = Cameras.pinhole(320, 240, focal=300, cam_from_world=np.eye(4), name="a")
+    memory.observe(rgb, np.ones((240, 320), np.float32), camera, round=0)
+    colors = tsdf_mesh(memory, 0.02).vertex.colors.numpy() * 255
+    assert np.abs(colors - 133).max() < 0.01
 
 
 def test_all_suffixes_hold_one_mesh(bare_run, tmp_path):
