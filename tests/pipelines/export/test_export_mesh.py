@@ -8,7 +8,7 @@ import pytest
 from box_project import VOXEL
 from export_runs import Y_UP, export_run, glb_colors
 
-from gvtools.cameras import Cameras
+from gvtools.cameras import Cameras, rigid_poses
 from gvtools.errors import DegenerateError, OptionError
 from gvtools.memory.spatial_memory import SpatialMemory
 from pipelines.export import mesh as meshes
@@ -66,8 +66,10 @@ def test_trimesh_reads_the_walls(scene, bare_run, tmp_path, method):
 
 def test_no_vertex_of_a_grey_wall_is_black():
     memory, rgb = SpatialMemory(0.01), np.full((240, 320, 3), 133, np.uint8)
-    camera = Cameras.pinhole(320, 240, focal=300, cam_from_world=np.eye(4), name="a")
-    memory.observe(rgb, np.ones((240, 320), np.float32), camera, round=0)
+    for right in (0, 0.05):
+        pose = rigid_poses(np.eye(3), np.array([right, 0, 0]))
+        camera = Cameras.pinhole(320, 240, focal=300, cam_from_world=pose, name=f"{right}")
+        memory.observe(rgb, np.ones((240, 320), np.float32), camera, round=0)
     colors = tsdf_mesh(memory, 0.02).vertex.colors.numpy() * 255
     assert np.abs(colors - 133).max() < 0.01
 
