@@ -52,6 +52,8 @@ LEAST_SEEN, LEAST_POINTS = 20, 100
 EXACT = 1.0
 # More known points than this tell no more; those of the longest tracks count.
 MOST_POINTS = 20_000
+# Whether poses err at all is asked of about so many detections: less time where they do not.
+SAMPLED = 30_000
 # Poses are taken where they lower the median error to this share.
 MAX_ERROR_RATIO = 0.7
 # Focal lengths that features change by more [log] are not told by them.
@@ -81,6 +83,11 @@ class Tracks:
         pose = poses[self.view]
         turned = np.einsum("mij,mj->mi", pose[:, :3, :3], self.positions[self.point])
         return np.asarray(turned + pose[:, :3, 3])
+
+    def every(self, step: int) -> Tracks:
+        """One of so many points, with all of its detections."""
+        use = self.point % step == 0
+        return Tracks(self.positions[::step], self.point[use] // step, self.view[use], self.xy[use])
 
     def exact(self, cameras: Cameras) -> bool:
         """Whether poses are the best that features tell: a model was adjusted to them before."""
@@ -143,24 +150,38 @@ def adjusted_poses(
             with tempfile.TemporaryDirectory() as folder:
                 model = _triangulate(frames, cameras, Path(folder))
         else:
+            if len(tracks.view) >= 2 * SAMPLED:
+                some = _model(cameras, tracks.every(len(tracks.view) // SAMPLED))
+                _solve(some, ROUNDS[-1])
+                if _better(some, cameras) is None:
+                    return None
             model = _model(cameras, tracks)
             _solve(model, ROUNDS[-1])
-        if model is None or len(model.points3D) < LEAST_POINTS:
-            return None
-        poses, found = _poses_and_tracks(model, cameras)
-        given = _model(cameras, found)
-        _solve(given, None)
-        before = _poses_and_tracks(given, cameras)[1].reprojection_errors(
-            cameras, cameras.cam_from_world
-        )
-    after = found.reprojection_errors(cameras, poses)
-    errors = float(np.median(before)), float(np.median(after))
-    if not errors[1] < MAX_ERROR_RATIO * errors[0]:
+        better = None if model is None else _better(model, cameras)
+    if better is None:
         return None
+    poses, found, errors = better
     well_observed = np.bincount(found.view, minlength=len(cameras)) >= LEAST_SEEN
     if well_observed.mean() < 0.5:
         return None
     return _place(poses, found, cameras, well_observed=well_observed, errors=errors)
+
+
+def _better(
+    model: pycolmap.Reconstruction, cameras: Cameras
+) -> tuple[Float64, Tracks, tuple[float, float]] | None:
+    """A solved model's poses, tracks, and errors before and after; None: no better."""
+    if len(model.points3D) < LEAST_POINTS:
+        return None
+    poses, found = _poses_and_tracks(model, cameras)
+    given = _model(cameras, found)
+    _solve(given, None)
+    tracks = _poses_and_tracks(given, cameras)[1]
+    before, after = (
+        float(np.median(each.reprojection_errors(cameras, at)))
+        for each, at in ((tracks, cameras.cam_from_world), (found, poses))
+    )
+    return (poses, found, (before, after)) if after < MAX_ERROR_RATIO * before else None
 
 
 def refine_focals(cameras: Cameras, tracks: Tracks) -> tuple[Cameras, Tracks]:

@@ -105,6 +105,23 @@ def test_known_tracks_need_no_picture(room, monkeypatch):
     assert relative_turns(found.poses, cameras.cam_from_world) < 0.25 * before
 
 
+def test_some_of_the_tracks_tell_whether_poses_err(room, monkeypatch):
+    cameras, tracks, solved = room[1], tracks_through(room[1]), []
+    whole, adjust = adjusted_poses([], off(cameras), tracks=tracks), bundle_adjustment.adjust
+
+    def counted(model, options):
+        solved.append(len(model.points3D))
+        adjust(model, options)
+
+    monkeypatch.setattr(bundle_adjustment, "adjust", counted)
+    monkeypatch.setattr(bundle_adjustment, "SAMPLED", len(tracks.view) // 3)
+    assert adjusted_poses([], cameras, tracks=tracks) is None
+    assert max(solved) < 0.4 * len(tracks.positions)
+    np.testing.assert_array_equal(
+        adjusted_poses([], off(cameras), tracks=tracks).poses, whole.poses
+    )
+
+
 def test_other_cameras_move_only_if_they_err_alike(room):
     frames, cameras = room
     drift = np.linspace(-1, 1, VIEWS)[:, None] * [0.1, 0, 0, 0, 0.1, 0]
