@@ -44,6 +44,9 @@ from gvtools.poses.refinement import (
 
 # The progress from which pictures are taken at a quarter, half and all of their size.
 SIZES = ((0.0, 4), (0.2, 2), (0.6, 1))
+# Smaller photographs [pixels] are taken at twice that size, since steps take hardly less time on
+# fewer pixels: at 240 x 180 pixels, photographs gain 0.1 to 1.8 dB by it, larger ones lose 0.4.
+SMALL = 112_000
 # Each degree of the spherical harmonics joins after so much progress.
 DEGREE_EVERY = 0.12
 # Until GROWTH_END, Gaussians are added every GROWTH_SHARE of progress, at least FEWEST_BETWEEN
@@ -162,7 +165,7 @@ class Fit:
         self._order: list[int] = []
         self._reduced: dict[int, ReducedView] = {}
         self._compared: list[ReducedView] | None = None
-        self._factor = 0
+        self._size_begun = -1.0
         self._errors: list[float] = []
         # PSNR of one validation photograph for each call of ``validation_psnr``.
         self._validation_psnr: list[float] = []
@@ -408,11 +411,14 @@ class Fit:
         return 10 * float(np.log10(np.square(off).mean()))
 
     def _at_size(self, number: int, share: float) -> ReducedView:
-        factor = next(size for start, size in reversed(SIZES) if share >= start)
-        if factor != self._factor:
-            self._factor, self._reduced = factor, {}
+        begun, factor = next(size for size in reversed(SIZES) if share >= size[0])
+        if begun != self._size_begun:
+            self._size_begun, self._reduced = begun, {}
         if number in self._reduced:
             return self._reduced[number]
+        pixels = self.views[number].rgb.size // 3
+        while pixels < SMALL and factor > 1:
+            pixels, factor = 4 * pixels, factor // 2
         view = reduce_view(self.views[number], factor)
         if len(self.views) * view.nbytes < KEPT_BYTES:
             self._reduced[number] = view

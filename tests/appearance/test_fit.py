@@ -236,6 +236,17 @@ def test_an_estimate_pulls_less_where_it_is_missed_by_less_than_its_tolerance():
     assert not gradient.any()
 
 
+@pytest.mark.parametrize(
+    ("width", "widths"),
+    [(480, [120, 240, 480]), (240, [120, 240, 240]), (100, [100, 100, 100])],
+)
+def test_small_photographs_are_reduced_less_and_for_less_of_a_fit(width, widths):
+    rgb = np.zeros((width * 3 // 4, width, 3), np.uint8)
+    fit = Fit(rough_gaussians(), [FitView(rgb, K, pose(0.0), None, None)])
+    found = [fit._at_size(0, share).target.shape[2] for share, _ in module.SIZES]
+    assert found == widths
+
+
 def test_validation_photographs_are_evenly_spread():
     assert validation_rows(7) == ()
     assert validation_rows(8) == (4,)
