@@ -396,18 +396,18 @@ def check_suffix(path: Path) -> None:
 
 def write_film(
     path: Path, frames: Iterable[NDArray[np.uint8]], *, fps: float, panorama: bool = False
-) -> None:
+) -> int:
     """Write frames of one even size to a file with one of SUFFIXES; it appears when whole.
 
-    An MP4 of panoramas says so.
+    An MP4 of panoramas says so. Returns how many frames were left out (see ``shown_frames``).
     """
     with replaced_when_written(path) as temporary:
-        if path.suffix.lower() == ".mp4":
-            _write_mp4(temporary, frames, fps=fps)
-            if panorama:
-                mark_mp4(temporary)
-        else:
-            _write_animation(temporary, frames, form=path.suffix[1:].upper(), fps=fps)
+        if path.suffix.lower() != ".mp4":
+            return _write_animation(temporary, frames, form=path.suffix[1:].upper(), fps=fps)
+        _write_mp4(temporary, frames, fps=fps)
+        if panorama:
+            mark_mp4(temporary)
+        return 0
 
 
 def _write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]], *, fps: float) -> None:
@@ -437,7 +437,7 @@ def _write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]], *, fps: float) -
 
 def _write_animation(
     path: Path, frames: Iterable[NDArray[np.uint8]], *, form: str, fps: float
-) -> None:
+) -> int:
     from PIL import Image
 
     images = [Image.fromarray(frame) for frame in frames]
@@ -449,6 +449,7 @@ def _write_animation(
             file, format=form, save_all=True, append_images=others, duration=durations, loop=0,
             **options,
         )  # fmt: skip
+    return len(images) - len(shown)
 
 
 def shown_frames(frames: int, *, fps: float, unit: int) -> tuple[list[int], list[int]]:

@@ -242,7 +242,13 @@ class FilmCommand(LensArguments):
                 projecting += renderer.projecting
 
         panorama = self.lens == "equirectangular" and len(panels) == 1
-        rendering.write_film(self.out, frames(), fps=self.fps, panorama=panorama)
+        left_out = rendering.write_film(self.out, frames(), fps=self.fps, panorama=panorama)
+        if left_out:
+            console.warn(
+                f"{self.out}: {left_out} frames left out: browsers show what stands for less than "
+                f"{rendering.LEAST_SHOWN} ms ten times as long; give --fps "
+                f"{1000 // rendering.LEAST_SHOWN} or fewer, or an .mp4"
+            )
         count = len(cameras) * len(rounds)
         each = (time.perf_counter() - start) / count
         console.line(

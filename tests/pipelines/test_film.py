@@ -128,11 +128,12 @@ def test_an_mp4_says_its_colours_and_shows_them(tmp_path, width):
 @pytest.mark.parametrize("fps", [12, 24, 60, 144])
 def test_an_animation_lasts_as_long_as_its_frames_and_browsers_obey(tmp_path, suffix, unit, fps):
     frames = [np.full((16, 16, 3), 4 * number, np.uint8) for number in range(60)]
-    write_film(tmp_path / f"film.{suffix}", frames, fps=fps)
+    left_out = write_film(tmp_path / f"film.{suffix}", frames, fps=fps)
     with Image.open(tmp_path / f"film.{suffix}") as film:
         times = []
         for frame in ImageSequence.Iterator(film):
             frame.load()
             times.append(frame.info["duration"])
     assert min(times) >= 20
+    assert suffix == "webp" or len(times) == 60 - left_out  # WebP merges frames that look alike
     assert abs(sum(times) - 60_000 / fps) <= unit
