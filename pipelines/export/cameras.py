@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from gvtools.errors import OptionError
 from gvtools.files import link_or_copy, write_text
 from gvtools.memory.thinning import thin
 from gvtools.runs.target_files import write_png
@@ -95,6 +96,12 @@ def write_transforms(source: ExportSource, path: Path, options: ExportOptions) -
         if isinstance(picture, Path) and not picture.is_file():
             absent.append(name)
         paths.append(place)
+    theirs = [target for target in elsewhere if target.exists()]
+    if theirs and not any(map(written_here, home.glob("*.json"))):
+        raise OptionError(
+            f"{theirs[0]}: is there already, was not written by gvtools export, and would be "
+            "replaced; give another --out"
+        )
     generated = distinct.generated.keys()
     write_frames(file, distinct.cameras, image_paths=paths, generated=generated, up=source.up)
     # Readers look nowhere else: pictures from elsewhere get a second name, by a link or a copy.

@@ -224,6 +224,17 @@ def test_models_of_others_are_kept(saved, tmp_path, kind, out, files):
         export_run(saved, kind, folder / out)
 
 
+def test_pictures_of_others_are_kept(saved, tmp_path):
+    folder, name = tmp_path / "project", "view_0.png"
+    put(folder / "images" / name)
+    put(tmp_path / "elsewhere" / name, "another")
+    with pytest.raises(OptionError, match=r"view_0.png: is there already"):
+        export_run(saved, "transforms", folder, "--images", str(tmp_path / "elsewhere"))
+    assert list(contents(folder).values()) == [b"mine"]
+    export_run(saved, "transforms", folder)
+    assert contents(folder)[folder / "images" / name] == b"mine"
+
+
 def test_an_export_replaces_an_earlier_one(scene, saved, tmp_path):
     folder = tmp_path / "out"
     (folder / "sparse" / "0").mkdir(parents=True)  # empty folders hold no model
