@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 WHOLE = (255, 1023, 4095, 16383, 65535)
 # Scans may be dark, so that 14 bits are not told from 16; fractions that were cut are 0 or 1.
 OF_CLOUDS = (1, 255, 1023, 4095, 65535)
+# Colours in hundredths are told by the share that was cut at white: so large, and more than below.
+PERCENT, CUT = 100, 0.001
 # Fractions of light may go so far beyond 1, where they are cut off.
 GLARE = 4.0
 # Shares of the numbers above zero that may lie beyond the range.
@@ -34,6 +36,9 @@ def white_of(values: NDArray[Any], *, tops: Sequence[int], outliers: float) -> f
     most = float(np.quantile(used, 1 - outliers)) if used.size else tops[-1]
     if values.dtype.kind == "f" and most <= GLARE:
         return 1
+    cut = (used == PERCENT).mean() if used.size else 0
+    if 1 in tops and most <= PERCENT and cut > max(CUT, ((used >= 99) & (used < PERCENT)).mean()):
+        return PERCENT
     usual = (*tops[:-1], 32767) if values.dtype == np.int16 else tops
     return next((top for top in usual if most <= top * (1 + 1e-6)), most)
 

@@ -17,6 +17,7 @@ from gvtools.prefetch import prefetch
 from gvtools.runs.layout import POSES, TUNED
 from gvtools.runs.poses import RunPoses, posed, with_poses
 from gvtools.scenes.matching import natural
+from gvtools.scenes.pixel_contradictions import COLORED, SWAPPED
 from gvtools.scenes.resized import reduced
 from gvtools.scenes.scene import Frame, Scene
 from gvtools.scenes.selection import select
@@ -272,6 +273,9 @@ def saved_poses(round_0: Path, context: Sequence[str], targets: Cameras) -> RunP
     return poses
 
 
+# A scan's colours are compared with so many photographs, the nearest point in each square of so
+# many pixels, from so many places on, and may be so many times as bright.
+COMPARED, CELL, FEWEST_PLACES, BRIGHTER = 4, 8, 200, 2.0
 # A scan is registered to recorded depth of at most so many views, and so many pixels of each.
 VIEWS, PIXELS = 40, 5000
 
@@ -331,7 +335,9 @@ def placed_scan(plan: Plan, console: Console) -> PlacedScan | None:
             f"{options.min_fitness:.0%} of the same places: is the matrix of another unit or frame?"
         )
     _check_reach(scan, placement, plan)
-    return PlacedScan(scan, placement)
+    placed = PlacedScan(scan, placement)
+    _check_colors(placed, plan, console)
+    return placed
 
 
 def _check_reach(scan: Scan, placement: Placement, plan: Plan) -> None:
@@ -347,6 +353,33 @@ def _check_reach(scan: Scan, placement: Placement, plan: Plan) -> None:
             f"{scan.name}: all of its {len(scan):,} points lie beyond the {reach:.3g} scene units "
             f"that voxels of {plan.config.voxel:g} reach from the cameras; expected a scan around "
             "them; correct its placement (--cloud-placement)"
+        )
+
+
+def _check_colors(placed: PlacedScan, plan: Plan, console: Console) -> None:
+    """Warn of colours that are not those that the photographs show in the same places."""
+    scan, pairs = placed.scan, list[NDArray[np.float64]]()
+    world = placed.placement.apply(scan.positions + scan.origin)
+    for name in evenly_spread(plan.context, COMPARED) if scan.colored_by == "colour" else ():
+        view = plan.scene[name]
+        (xy,), (z,), rgb = *view.camera.project(world), view.load().rgb
+        inside = (z > 0) & (xy >= 0).all(axis=1) & (xy < rgb.shape[1::-1]).all(axis=1)
+        nearest = np.flatnonzero(inside)[np.argsort(z[inside])]
+        pixels = xy[nearest].astype(int)
+        first = np.unique(pixels // CELL, axis=0, return_index=True)[1]
+        nearest, (x, y) = nearest[first], pixels[first].T
+        pairs.append(np.stack([scan.colors[nearest], rgb[y, x]]).astype(np.float64))
+    both = np.concatenate(pairs, axis=1) if pairs else np.zeros((2, 0, 3))
+    reds = both[..., 0] - both[..., 2]
+    if both.shape[1] < FEWEST_PLACES:
+        return
+    if reds.std(axis=1).min() > COLORED and np.corrcoef(reds)[0, 1] < SWAPPED:
+        console.warn(f"{scan.name}: red and blue are the other way round than in the photographs")
+    times = both[0].mean() / max(both[1].mean(), 1)
+    if not 1 / BRIGHTER < times < BRIGHTER:
+        console.warn(
+            f"{scan.name}: its colours are {times:.2g} times as bright as the photographs in the "
+            "same places; are they of another range than was read? Save them as bytes"
         )
 
 

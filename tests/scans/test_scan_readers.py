@@ -350,6 +350,10 @@ def test_colours_in_one_number_or_grey_and_fractions_that_were_cut(tmp_path, suf
     path = write_channels(tmp_path / f"a{suffix}", positions, colors // 128, names=RED)
     scan = read_scan(path)
     assert np.array_equal(scan.colors, colors // 128 * 255) and "from 0 to 1" in scan.color_range
+    white = np.minimum(colors * 1.3, 255)
+    for hundredths in (white / 2.55, np.rint(white / 2.55).astype(np.int32)):
+        path = write_channels(tmp_path / f"a{suffix}", positions, hundredths, names=RED)
+        np.testing.assert_allclose(read_scan(path).colors.astype(int), white, atol=2)
     path = write_channels(tmp_path / f"a{suffix}", positions, colors / 127.5 - 1, names=RED)
     assert "are below 0: cut off" in read_scan(path).color_range
 

@@ -17,18 +17,22 @@ pytestmark = pytest.mark.usefixtures("unpainted")
 SCALE = 2.0
 
 
-def far_scan(path: Path) -> Path:
-    """What a scanner at the last view's place sees, twice as large and far away; no colours."""
-    positions = []
+def far_scan(path: Path, *, colored: bool = False) -> Path:
+    """What a scanner at the last view's place sees, twice as large and far away; red is blue."""
+    positions, colors = [], []
     for index in (4, 5):
         pose = world_from_cam(index)
-        _, depth = render(pose)
+        rgb, depth = render(pose)
+        colors.append(rgb.reshape(-1, 3)[:, ::-1])
         row, column = np.mgrid[:HEIGHT, :WIDTH] + 0.5
         rays = [(column - WIDTH / 2) / FOCAL, (row - HEIGHT / 2) / FOCAL, np.ones_like(row)]
         positions.append((np.stack(rays, -1) * depth[..., None]).reshape(-1, 3) + pose[:3, 3])
     count = sum(map(len, positions))
     return write_las(
-        path, SCALE * np.concatenate(positions) + FAR, None, intensity=np.arange(count) % 999
+        path,
+        SCALE * np.concatenate(positions) + FAR,
+        np.concatenate(colors) if colored else None,
+        intensity=np.arange(count) % 999,
     )
 
 
@@ -71,6 +75,15 @@ def test_a_given_placement_that_the_photographs_contradict_is_said(runs, tmp_pat
     words = ["--cloud", str(runs / "scan.laz"), "--cloud-placement", "identity"]
     main(["reconstruct", str(runs / "project"), *options, *words, "--out", str(tmp_path / "run")])
     assert "of the same places: is the matrix of another unit" in capsys.readouterr().err
+
+
+def test_colours_that_the_photographs_contradict_are_said(runs, tmp_path, capsys):
+    scan = far_scan(tmp_path / "scan.las", colored=True)
+    options = ["--context", "range:4-5", "--targets", "first:1", "--refine", "0", "--rounds", "0"]
+    words = ["--cloud", str(scan), "--cloud-placement", str(runs / "placement.txt")]
+    main(["reconstruct", str(runs / "project"), *options, *words, "--out", str(tmp_path / "run")])
+    said = capsys.readouterr().err
+    assert "red and blue are the other way round" in said and "as bright" not in said
 
 
 def test_pages_and_pictures_name_what_is_scanned(runs):
