@@ -45,7 +45,8 @@ DOMAINS = (ROOMS, LEVELS, DEPTH, PHOTOGRAPHS)
 SHIPPED, CANDIDATE = "geoverse", "geoverse, --weights"
 # Domains on which a model has to be better.
 ENOUGH = 3
-# The blend is fitted to so many rooms, of another seed than the judged ones.
+# The blend is fitted to so many rooms and walks through levels, of another seed than the judged
+# ones; of the same maps, where the model has seen others.
 FITTED, OTHER_SEED = 50, 1000
 # Rows of the sheet of pictures, and what share of a picture has to be judged to be shown.
 PICTURES, LEAST_HOLE = 20, 0.03
@@ -107,7 +108,10 @@ class Verdict:
 def run(options: ExperimentOptions) -> tuple[dict[str, Any], list[Table]]:
     """Figures and tables; see ``READS``. Sets whose data are not given are left out."""
     side = options.size or SIZE
-    fitted = held_out_cases(FITTED, seed=options.seed + OTHER_SEED, size=side)
+    other = options.seed + OTHER_SEED
+    fitted = list(held_out_cases(FITTED, seed=other, size=side))
+    if options.levels is not None:
+        fitted += level_cases(options.levels, FITTED, seed=other, size=side)
     weights = fit_blend(fitted)
     baselines: dict[str, Completer] = {
         "inpaint": create("inpaint"),
