@@ -31,7 +31,7 @@ def peak(case: str, config: str, size: int) -> int:
     model = GeoVerse(named(config)).eval()
     batch = random_views((size, size), context=2, targets=6)
     if case == "pass":
-        return max(pass_peaks(model, batch, steps=(3, 1), dtype=torch.float32).values())
+        return max(pass_peaks(model, batch, dtype=torch.float32).values())
     truth = TrainingBatch(batch, torch.rand_like(batch.images), 1 + batch.depth)
     options = OptimizerOptions(batch=1, recompute="recompute" in case)
     rows = step_peaks(model, truth, options)

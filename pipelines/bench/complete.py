@@ -6,7 +6,7 @@ import gc
 import os
 import statistics
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -17,7 +17,6 @@ from torch.utils.flop_counter import FlopCounterMode, sdpa_flop_count
 
 from gvtools.completers.geoverse.conditioning import ViewBatch
 from gvtools.completers.geoverse.config import GeoVerseConfig
-from gvtools.completers.geoverse.flow import time_grid
 from gvtools.completers.geoverse.model import DECODE, DECODING, LEVEL0, LEVEL1, GeoVerse, no_clock
 from gvtools.completers.geoverse.video_prior import VideoFeatures, VideoPrior, VideoPriorConfig
 from gvtools.completers.geoverse.wan import dtype_of, empty_network
@@ -188,16 +187,16 @@ class TimedPass:
         model: GeoVerse,  # on ``device``
         batch: ViewBatch,
         *,
-        bounds: Sequence[float],  # of the level-1 steps
-        cascade_bounds: Sequence[float],
+        sampling: Mapping[str, Any],  # see ``GeoVerse.generate``
         dtype: torch.dtype = torch.float32,
         video: VideoFeatures | None = None,
     ) -> None:
         self.model, self.batch, self.video, self.dtype = model, batch, video, dtype
-        self.bounds, self.cascade_bounds = tuple(bounds), tuple(cascade_bounds)
+        self.sampling = sampling
         self.device = batch.images.device
         # How often the stages with numbered steps are stepped through.
-        self.steps = {LEVEL1: len(self.bounds) - 1, LEVEL0: len(self.cascade_bounds) - 1}
+        bounds = {LEVEL1: sampling["bounds"], LEVEL0: sampling["cascade_bounds"]}
+        self.steps = {level: len(times) - 1 for level, times in bounds.items()}
 
     def now(self) -> float:
         """Wall time [s], after all that was asked of the device is done."""
@@ -210,9 +209,7 @@ class TimedPass:
         self.model.clock = clock or no_clock
         start = self.now()
         with autocast(self.device, self.dtype):
-            self.model.generate(
-                self.batch, bounds=self.bounds, cascade_bounds=self.cascade_bounds, video=self.video
-            )
+            self.model.generate(self.batch, video=self.video, **self.sampling)
         return self.now() - start
 
     def flops(self) -> dict[str, float]:
@@ -258,8 +255,7 @@ def complete_figures(options: CompleteOptions) -> dict[str, Any]:
     timed = TimedPass(
         model,
         batch,
-        bounds=time_grid(options.steps, shift=config.flow.shift),
-        cascade_bounds=time_grid(options.cascade_steps, shift=config.flow.shift),
+        sampling=options.sampling(config),
         dtype=options.compute_type,
         video=None if options.runs_video(config) else random_features(config, batch),
     )

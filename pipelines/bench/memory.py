@@ -30,7 +30,6 @@ from torch.utils._pytree import tree_leaves
 
 from gvtools.completers.geoverse.conditioning import ViewBatch
 from gvtools.completers.geoverse.config import GeoVerseConfig
-from gvtools.completers.geoverse.flow import time_grid
 from gvtools.completers.geoverse.model import DECODE, DECODING, VIDEO, GeoVerse
 from gvtools.completers.geoverse.wan import BLOCKS
 from gvtools.networks.compute import autocast, name_of
@@ -203,17 +202,12 @@ class StagePeaks:
 
 
 def pass_peaks(
-    model: GeoVerse, batch: ViewBatch, *, steps: tuple[int, int], dtype: torch.dtype
+    model: GeoVerse, batch: ViewBatch, *, dtype: torch.dtype, **sampling: Any
 ) -> dict[str, int]:
-    """Bytes beside the weights at the peak of each stage of a pass."""
-    shift = model.config.flow.shift
+    """Bytes beside the weights at the peak of each stage of a pass; see ``GeoVerse.generate``."""
     with LiveBytes([model, *prior_networks(model)]) as live, autocast(CPU, dtype):
         peaks = model.clock = StagePeaks(live)
-        model.generate(
-            batch,
-            bounds=time_grid(steps[0], shift=shift),
-            cascade_bounds=time_grid(steps[1], shift=shift),
-        )
+        model.generate(batch, **sampling)
     return peaks.rows
 
 
@@ -292,8 +286,8 @@ def _inference(options: CompleteOptions, config: GeoVerseConfig) -> list[dict[st
     with fake_tensors():
         model = model_without_numbers(config)
         model.hold_in(dtype)
-        steps = (options.steps, options.cascade_steps)
-        peaks = pass_peaks(model, _views(options, config), steps=steps, dtype=dtype)
+        sampling = options.sampling(config)
+        peaks = pass_peaks(model, _views(options, config), dtype=dtype, **sampling)
         weights, prior = module_bytes(model), module_bytes(*prior_networks(model))
         visiting = prior - away_bytes(model)
     return [
@@ -368,9 +362,11 @@ GB = 1e9
 def pass_of(figures: dict[str, Any]) -> str:
     """The network, its views and steps of a table, for the user."""
     size = "x".join(map(str, figures["size"]))
+    kept = figures["encoder_interval"]
+    encoders = f", encoder interval {kept:g}" if kept else ""
     return (
         f"{figures['config']}, {figures['context']} + {figures['targets']} views of {size}, "
-        f"{figures['steps']} + {figures['cascade_steps']} steps, {figures['precision']}"
+        f"{figures['steps']} + {figures['cascade_steps']} steps{encoders}, {figures['precision']}"
     )
 
 

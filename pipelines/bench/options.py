@@ -33,10 +33,12 @@ class CompleteOptions(Settings):
     """Photographs in a pass."""
     targets: Count = 6
     """Views to complete."""
-    steps: Count = 3
-    """Of level 1."""
-    cascade_steps: Count = 1
-    """Of level 0."""
+    steps: Count | None = None
+    """Of level 1; none for the configuration's own: 3, of gld 49."""
+    cascade_steps: Count | None = None
+    """Of level 0; none for the configuration's own: 1, of gld 49."""
+    encoder_interval: float = Field(0.0, ge=0, le=1)
+    """As ``completer.encoder_interval``."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Auto takes a GPU where there is one."""
     precision: Literal["float32", "bfloat16", "float16"] | None = None
@@ -103,12 +105,24 @@ class CompleteOptions(Settings):
         """What every kind of figures says of the passes."""
         from gvtools.networks.compute import name_of
 
-        counts = ("context", "targets", "steps", "cascade_steps")
+        sampling = self.sampling(config)
         return {
             "config": config.name,
             "size": list(self.picture(config)),
             "precision": name_of(self.compute_type),
-            **{name: getattr(self, name) for name in counts},
+            "context": self.context,
+            "targets": self.targets,
+            "steps": len(sampling["bounds"]) - 1,
+            "cascade_steps": len(sampling["cascade_bounds"]) - 1,
+            "encoder_interval": self.encoder_interval,
+        }
+
+    def sampling(self, config: GeoVerseConfig) -> dict[str, Any]:
+        """How a pass samples, for ``generate``."""
+        return {
+            "bounds": config.flow.times("level1", self.steps),
+            "cascade_bounds": config.flow.times("cascade", self.cascade_steps),
+            "encoder_interval": self.encoder_interval,
         }
 
     def picture(self, config: GeoVerseConfig) -> tuple[int, int]:

@@ -22,7 +22,6 @@ from torch.utils._pytree import tree_leaves
 from torch.utils.flop_counter import flop_registry, sdpa_backward_flop_count, sdpa_flop_count
 
 from gvtools.completers.geoverse.config import GeoVerseConfig
-from gvtools.completers.geoverse.flow import time_grid
 from gvtools.completers.geoverse.model import DECODING
 from gvtools.networks.compute import autocast
 from pipelines.bench.complete import BETWEEN, CPU_ATTENTION, INSIDE, PASS, random_views
@@ -176,8 +175,6 @@ def row_of(stage: str, work: Counter[Kernel]) -> dict[str, Any]:
 
 def _pass(options: CompleteOptions, config: GeoVerseConfig) -> dict[str, Counter[Kernel]]:
     """By stage, in their order."""
-    steps = (options.steps, options.cascade_steps)
-    bounds = [time_grid(count, shift=config.flow.shift) for count in steps]
     with fake_tensors():
         model = model_without_numbers(config)
         model.hold_in(options.compute_type)
@@ -185,7 +182,7 @@ def _pass(options: CompleteOptions, config: GeoVerseConfig) -> dict[str, Counter
         batch = random_views(size, context=options.context, targets=options.targets)
         with Work() as work, autocast(CPU, options.compute_type):
             model.clock = work.clock
-            model.generate(batch, bounds=bounds[0], cascade_bounds=bounds[1])
+            model.generate(batch, **options.sampling(config))
     return work.stages
 
 

@@ -14,7 +14,7 @@ from typing import Literal
 
 from gvtools.completers.geoverse.conditioning import HintConfig
 from gvtools.completers.geoverse.denoiser import DenoiserConfig
-from gvtools.completers.geoverse.flow import MOST_SHIFT, check_bounds
+from gvtools.completers.geoverse.flow import MOST_SHIFT, check_bounds, time_grid
 from gvtools.completers.geoverse.refiner import RefinerConfig
 from gvtools.completers.geoverse.rgb_head import RGBHeadConfig
 from gvtools.completers.geoverse.video_injection import ControlConfig, SharedAttentionConfig
@@ -65,6 +65,16 @@ class FlowConfig:
         check_range("flow.most_time", self.most_time, gt=0, le=1)
         check_bounds(self.level1)
         check_bounds(self.cascade)
+
+    def times(self, level: Literal["level1", "cascade"], steps: int | None) -> tuple[float, ...]:
+        """Of ``steps`` Euler steps; its own where None or as many, none where nothing is denoised.
+
+        1 = tau_0 > ... > tau_K = 0.
+        """
+        own: tuple[float, ...] = getattr(self, level)
+        if steps is None or steps == len(own) - 1:
+            return own
+        return time_grid(steps, shift=self.sampling_shift) if steps else ()
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ zero: a fresh extension returns the pretrained output bit for bit.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -188,6 +188,25 @@ class Conditions:
     depth: Tensor | None = None  # (B, V, 2, H, W) from ``conditioning.depth_condition``, or None
 
 
+class Encoding:
+    """The encoder's tokens in the steps of one pass, taken anew where a step says so."""
+
+    def __init__(
+        self,
+        bounds: Sequence[float],  # of the steps, one evaluation each
+        interval: float,  # how far a step may be, in time, from the one whose tokens it takes
+    ) -> None:
+        self.tokens: Tensor | None = None  # (B, V, N, width); None where they are to be made
+        self._bounds, self._interval = iter(bounds), interval
+        self._made = math.inf
+
+    def begin_step(self) -> None:
+        """The next step; its time is the bounds', since a device's would have to be waited for."""
+        time = next(self._bounds)
+        if self._made - time > self._interval:
+            self._made, self.tokens = time, None
+
+
 class Positions:
     """Projective transforms of one pass for the two head widths."""
 
@@ -284,22 +303,40 @@ class Denoiser(Recomputing):
         video: Mapping[int, VideoKeys] | None = None,
         # Of this grid and cameras, when the caller has them already.
         positions: Positions | None = None,
+        # Of a pass whose steps share the encoder's tokens.
+        encoding: Encoding | None = None,
     ) -> Tensor:  # (B, V, C, h, w)
         """The velocity of every view."""
         grid = (noisy.shape[-2], noisy.shape[-1])
         positions = positions or Positions(self.config, conditions.camera, grid)
         s, x = self.embed(noisy, conditions)
         time = self.time(t, noisy.shape[1]).to(s.dtype)
-        c = nn.functional.silu(time)
-        for index in range(self.config.depth):
-            extra = None if video is None else video.get(index)
-            s = self.layer(self.blocks[index], s, c, positions.encoder, extra)
-            if residuals is not None and index in residuals:
-                s = s + residuals[index]
+        if encoding is not None and encoding.tokens is not None:
+            s = encoding.tokens
+        else:
+            s = self._encoded(s, time, positions.encoder, residuals or {}, video or {})
+        if encoding is not None:
+            encoding.tokens = s
         s = self.s_projector(nn.functional.silu(time + s))
         for index in range(self.config.depth, len(self.blocks)):
             x = self.layer(self.blocks[index], x, s, positions.head)
         return self.final_layer(x, s).transpose(2, 3).unflatten(3, grid)
+
+    def _encoded(
+        self,
+        s: Tensor,
+        time: Tensor,
+        positions: Projective,
+        residuals: Mapping[int, Tensor],
+        video: Mapping[int, VideoKeys],
+    ) -> Tensor:
+        """The encoder's tokens behind its blocks."""
+        c = nn.functional.silu(time)
+        for index in range(self.config.depth):
+            s = self.layer(self.blocks[index], s, c, positions, video.get(index))
+            if index in residuals:
+                s = s + residuals[index]
+        return s
 
     def _split(self, stream: str, x: Tensor, context: int) -> Tensor:
         """Embeds (B, V, 2C, h, w), context views by their own layer where there is one."""

@@ -30,7 +30,13 @@ from gvtools.completers.geoverse.conditioning import (
     fill_holes,
 )
 from gvtools.completers.geoverse.config import GeoVerseConfig
-from gvtools.completers.geoverse.denoiser import Conditions, Denoiser, Positions, VideoKeys
+from gvtools.completers.geoverse.denoiser import (
+    Conditions,
+    Denoiser,
+    Encoding,
+    Positions,
+    VideoKeys,
+)
 from gvtools.completers.geoverse.flow import (
     check_bounds,
     drawn_noise,
@@ -205,6 +211,7 @@ class GeoVerse(nn.Module):
         cfg_scale: float | None = None,
         cascade_cfg_scale: float | None = None,
         temperature: float | None = None,
+        encoder_interval: float = 0.0,  # see ``Encoding``
         video: VideoFeatures | None = None,  # computed before, for the same views
         targets_alone: bool = False,  # see ``decode``
     ) -> Generated:
@@ -240,6 +247,7 @@ class GeoVerse(nn.Module):
                     bounds=bounds,
                     cfg_scale=cfg_scale,
                     temperature=temperature,
+                    encoder_interval=encoder_interval,
                 )
             level0 = self.sample0(
                 prepared,
@@ -247,6 +255,7 @@ class GeoVerse(nn.Module):
                 noise("level0"),
                 bounds=cascade_bounds,
                 cfg_scale=cascade_cfg_scale,
+                encoder_interval=encoder_interval,
             )
         hint = None
         with self.clock(DECODE):
@@ -334,16 +343,19 @@ class GeoVerse(nn.Module):
         t: Tensor,  # (B,) or (B, V)
         *,
         least: float | None = None,  # instead of the configuration's ``flow.least_time``
+        encoding: Encoding | None = None,  # of a pass whose steps share the encoder's tokens
     ) -> Tensor:
         """The level-1 velocity (Eq. 2), with the control branch's residuals (Eqs. 5 and 6)."""
         known, positions, residuals = prepared.level1, prepared.positions, None
-        if self.control is not None and prepared.adapted is not None:
+        encodes = encoding is None or encoding.tokens is None
+        if encodes and self.control is not None and prepared.adapted is not None:
             residuals = self.control(
                 self.level1, state, t, known, adapted=prepared.adapted, positions=positions
             )
         out = self.level1(
-            state, t, known, residuals=residuals, video=prepared.keys, positions=positions
-        )
+            state, t, known, residuals=residuals, video=prepared.keys, positions=positions,
+            encoding=encoding,
+        )  # fmt: skip
         flow = self.config.flow
         if flow.prediction == "velocity":
             return out
@@ -358,6 +370,7 @@ class GeoVerse(nn.Module):
         bounds: Sequence[float] | None = None,
         cfg_scale: float | None = None,
         temperature: float | None = None,
+        encoder_interval: float = 0.0,
     ) -> Tensor:
         """Level-1 latents of noise, one Euler step an interval; see ``generate``."""
         flow = self.config.flow
@@ -368,10 +381,12 @@ class GeoVerse(nn.Module):
         # latents, however small t is; with the floor, short last steps would leave noise behind.
         least = min(flow.least_time, tau[-2])
         known = prepared if scale == 1 else self.without_and_with_cameras(prepared)
+        encoding = Encoding(tau, encoder_interval)
 
         def velocity(state: Tensor, t: Tensor) -> Tensor:
+            encoding.begin_step()
             with self.clock(LEVEL1):
-                return self.velocity1(known, state, t, least=least)
+                return self.velocity1(known, state, t, least=least, encoding=encoding)
 
         return sample(guide(velocity, scale), noise, tau)
 
@@ -383,6 +398,7 @@ class GeoVerse(nn.Module):
         *,
         bounds: Sequence[float] | None = None,
         cfg_scale: float | None = None,
+        encoder_interval: float = 0.0,
     ) -> Tensor:
         """Level-0 latents of level-1 latents (Eq. 3); the mean without a cascade."""
         if self.cascade is None:
@@ -395,12 +411,15 @@ class GeoVerse(nn.Module):
             # As GLD's evaluation runs its cascade: poses are dropped, intrinsics kept.
             known = joined(replace(known, camera=known.camera.unconditional("old")), known)
         positions = Positions(cascade.config, known.camera, prepared.grid)
+        tau = bounds or flow.cascade
+        encoding = Encoding(tau, encoder_interval)
 
         def velocity(state: Tensor, t: Tensor) -> Tensor:
+            encoding.begin_step()
             with self.clock(LEVEL0):
-                return cascade(state, t, known, positions=positions)
+                return cascade(state, t, known, positions=positions, encoding=encoding)
 
-        return sample(guide(velocity, scale), noise, bounds or flow.cascade)
+        return sample(guide(velocity, scale), noise, tau)
 
     def cascade_conditions(self, prepared: Prepared, level1: Tensor) -> Conditions:
         """Clean context level 0, level 1 of all views, cameras: the conditions of Eq. 3."""

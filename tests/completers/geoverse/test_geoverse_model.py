@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -139,6 +140,46 @@ def test_one_evaluation_an_interval_and_everything_else_once(monkeypatch):
     denoisers.clear()
     model.generate(batch)
     assert [net is model.level1 for net in denoisers] == [True] * 3 + [False]
+
+
+@torch.no_grad()
+@pytest.mark.parametrize(
+    ("interval", "level1", "level0"), [(0.0, 4, 3), (0.25, 3, 3), (0.35, 2, 3), (1.0, 1, 1)]
+)
+def test_encoders_run_where_time_is_far_enough_from_their_last_run(interval, level1, level0):
+    model, batch = built("control"), micro.batch(1)
+    assert model.control is not None and model.cascade is not None
+    # An encoder that asks neither for the time nor for the state says the same at every step.
+    for block in model.cascade.blocks[: model.cascade.config.depth]:
+        block.adaLN_modulation[1].weight.zero_()
+    runs: Counter[str] = Counter()
+    nets = {"encoder": model.level1.blocks[0], "head": model.level1.blocks[-1]}
+    nets |= {"control": model.control.blocks[0]}
+    nets |= {"encoder0": model.cascade.blocks[0], "head0": model.cascade.blocks[-1]}
+    options = {"bounds": BOUNDS, "cascade_bounds": (1.0, 0.6, 0.2, 0.0), "cfg_scale": 1.5}
+    options |= {"video": micro.video_features(1, 4)}
+    every = model.generate(batch, **options)
+    hooks = [
+        net.register_forward_hook(lambda *_, name=name: runs.update([name]))
+        for name, net in nets.items()
+    ]
+    found = model.generate(batch, encoder_interval=interval, **options)
+    for hook in hooks:
+        hook.remove()
+    assert runs == {"encoder": level1, "control": level1, "head": 4, "encoder0": level0, "head0": 3}
+    assert torch.equal(found.level1, every.level1) == (level1 == 4)
+    if level1 == 4:
+        assert torch.equal(found.level0, every.level0)
+        return
+    prepared = model.prepare(batch, video=options["video"])
+    noise = torch.randn(every.level0.shape, generator=torch.Generator().manual_seed(0))
+    once, thrice = (
+        model.sample0(
+            prepared, every.level1, noise, bounds=(1.0, 0.6, 0.2, 0.0), encoder_interval=kept
+        )
+        for kept in (1.0, 0.0)
+    )
+    assert torch.equal(once, thrice)
 
 
 def skipping(**flow: Any) -> GeoVerse:

@@ -68,8 +68,7 @@ def timed(config, *, context: int = 1, targets: int = 2, steps: int = 1) -> Time
     return TimedPass(
         micro.model(config),
         batch,
-        bounds=time_grid(steps),
-        cascade_bounds=time_grid(1),
+        sampling={"bounds": time_grid(steps), "cascade_bounds": time_grid(1)},
         video=random_features(config, batch),
     )
 
@@ -395,11 +394,11 @@ def test_a_kernel_takes_as_long_as_the_slower_of_its_two():
 def test_the_operations_of_a_pass_are_those_that_torch_counts():
     model = micro.model()
     views = random_views((32, 32), context=1, targets=2)
-    bounds = (1.0, 0.5, 0.0)
-    counted = TimedPass(model, views, bounds=bounds, cascade_bounds=(1.0, 0.0)).flops()
+    sampling = {"bounds": (1.0, 0.5, 0.0), "cascade_bounds": (1.0, 0.0)}
+    counted = TimedPass(model, views, sampling=sampling).flops()
     with Work() as work:
         model.clock = work.clock
-        model.generate(views, bounds=bounds, cascade_bounds=(1.0, 0.0))
+        model.generate(views, **sampling)
     found = {stage: row_of(stage, kernels)["flops"] for stage, kernels in work.stages.items()}
     assert found["level-1 step"] == counted["level-1 step 1"] + counted["level-1 step 2"]
     assert found["cascade step"] == counted["cascade step 1"]
