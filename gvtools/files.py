@@ -49,7 +49,8 @@ def replaced_when_written(path: Path, *, suffix: str = "", flush: bool = True) -
     except Exception as error:
         # Libraries have errors of their own for a full disk.
         reason = "" if isinstance(error, GvError) else full_disk(folder)
-        if isinstance(error, OSError):
+        # Whoever reads what is printed meanwhile may have gone.
+        if isinstance(error, OSError) and not isinstance(error, BrokenPipeError):
             reason = error.strerror or reason or str(error)
         if not reason:
             raise

@@ -32,7 +32,7 @@ from gvtools.memory.panoramas import Rig
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.splat.api import SplatOptions
 from gvtools.optional import require
-from gvtools.runs.run import at_run_poses, load_appearance, load_memory
+from gvtools.runs.run import at_run_poses, load_appearance, load_memory, said_of_path
 from gvtools.runs.target_files import to_bytes, write_png
 from gvtools.scenes.scene import Frame
 from gvtools.scenes.transforms import read_camera_path
@@ -278,12 +278,13 @@ def _path_cameras(
 
     selection = selection if at else "all"
     cameras = read_camera_path(Path(place), captured, selection=selection)
+    poses = "" if run is None else said_of_path(Path(place), run)
     if cameras is None:
         scene = open_project(Path(place))
         scene, poses = (scene, "") if run is None else at_run_poses(scene, run, memory)
-        if poses:
-            say(poses)
         cameras = scene.subset(select(scene.names, selection)).cameras
+    if poses:
+        say(poses)
     return cameras
 
 

@@ -110,3 +110,10 @@ def test_an_error_of_a_library_on_a_full_disk_is_told_as_that(tmp_path, monkeypa
     with pytest.raises(ProjectError, match=r"/a\.las: cannot be written \(No space left"):
         write()
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_reader_of_the_output_that_goes_is_no_error_of_the_file(tmp_path):
+    with pytest.raises(BrokenPipeError), replaced_when_written(tmp_path / "a") as temporary:
+        temporary.write_bytes(b"begun")
+        raise BrokenPipeError
+    assert not list(tmp_path.iterdir())

@@ -29,7 +29,7 @@ from gvtools.runs.layout import (
     round_folder,
     saved_memory,
 )
-from gvtools.runs.poses import refined_poses_of, with_poses
+from gvtools.runs.poses import RunPoses, refined_poses_of, with_poses
 from gvtools.runs.target_files import TargetFiles, entry_camera, read_target
 from gvtools.splat_files import READERS
 from gvtools.untrusted import read_json
@@ -190,14 +190,25 @@ def load_run(path: Path | str, *, project: Path | None = None) -> Run:
     return Run(path, read_record(path), read_reports(path), project)
 
 
+def _refined(run: Path) -> tuple[Path, RunPoses | None]:
+    """The folder of a run or of the memory in it, and the run's own poses, if it has any."""
+    folder = run if run.is_dir() else run.parent
+    return folder, refined_poses_of(folder) if (folder / RECORD).is_file() else None
+
+
+def said_of_path(path: Path, run: Path) -> str:
+    """What is said of cameras from a file without pictures, which stay as given; "" if nothing."""
+    refined = _refined(run)[1] is not None
+    return f"poses: as given in {path}; the run refined those of its views" if refined else ""
+
+
 def at_run_poses(scene: Scene, run: Path, memory: SpatialMemory | None = None) -> tuple[Scene, str]:
     """A scene at the poses of a run of it, and what was done; "" where the run has no own poses.
 
     ``run`` is a run's folder or the memory in it. Views that it did not have move like its context
     near them, where cameras err alike there. A ``memory`` apart from its run tells other poses.
     """
-    folder = run if run.is_dir() else run.parent
-    poses = refined_poses_of(folder) if (folder / RECORD).is_file() else None
+    folder, poses = _refined(run)
     if poses is None:
         seen = memory.views.photographed if memory is not None else ()
         for camera in (view.camera for view in seen if view.camera.names[0] in scene.names):

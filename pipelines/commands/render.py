@@ -119,10 +119,10 @@ class RenderCommand(LensArguments, LpipsArguments, SceneArguments):
         import numpy as np
 
         from gvtools.cameras import concatenate
-        from gvtools.runs.run import at_run_poses
+        from gvtools.runs.run import at_run_poses, said_of_path
         from gvtools.scenes.selection import select
 
-        scene, poses = None, ""
+        scene, poses = None, said_of_path(self.cameras, self.memory)
         cameras = self._path(memory) if self.cameras.is_file() else None
         if cameras is None:
             scene, poses = at_run_poses(self.open_scene(self.cameras), self.memory, memory)

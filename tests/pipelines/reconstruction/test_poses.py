@@ -131,6 +131,11 @@ def test_the_project_of_a_run_is_seen_at_its_refined_poses(scan, whole, tmp_path
     film = tmp_path / "film.gif"
     run_command("film", copy, "--path", f"{scan}@first:2", "--out", film)
     assert "as refined by the run" in capsys.readouterr().out
+    walk = tmp_path / "walk.txt"
+    walk.write_text("".join(f"{i} {' '.join(map(str, np.eye(4)[:3].ravel()))}\n" for i in (0, 1)))
+    run_command("film", copy, "--path", walk, "--out", film)
+    run_command("render", copy, "--cameras", walk, "--out", tmp_path / "out")
+    assert capsys.readouterr().out.count(f"poses: as given in {walk}; the run refined") == 2
     # Apart from its run, a memory has poses that are not the project's.
     alone, memory = tmp_path / "memory.npz", load_memory(whole)
     assert at_run_poses(scene, alone, memory)[1].startswith("poses: as given, not those")
