@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -44,6 +45,17 @@ OPAQUE = 0.5
 # [px], than the mean colour lie where they belong. What is nearer than this share of the median
 # distance is not drawn.
 LEAST_GAIN, LOOKED_AT, SIDE, NEAR = 2.0, 5, 160, 0.02
+# Where splats may lie: where converters leave the axes of SPZ (right, up, back) or glTF, too.
+AXES = tuple(
+    Placement(np.diag([*signs, 1.0]), how)
+    for signs, how in (
+        ((1, 1, 1), "as it is"),
+        ((1, -1, -1), "turned half around x"),
+        ((-1, -1, 1), "turned half around z"),
+    )
+)
+# The smallest fitness of a placement of splats that photographs may decide on.
+LEAST_SUPPORT = 0.25
 # Folders above a file in which its cameras are sought; how far they may be from the project's on
 # average: centres as a share of the extent, and turns.
 ABOVE, ALIKE = 3, 0.02
@@ -76,12 +88,16 @@ def given_start(plan: Plan, frame: LocalFrame, console: Console) -> GivenStart |
     splats = read_splats(path)
     opaque = splats.opacities > OPAQUE
     surface = splats.positions[opaque if opaque.any() else slice(None)] + splats.origin
-    estimated = plan.config.scan.placement == ESTIMATE
-    if estimated and _shows(_local(splats, None, frame), plan, frame):
-        placement = None
-        console.line(f"{path.name}: placement as it is, since the photographs show it")
+
+    def shows(placed: Placement) -> bool:
+        return _shows(_local(splats, placed, frame), plan, frame)
+
+    tried = AXES if plan.config.scan.placement == ESTIMATE else ()
+    placement = next((placed for placed in tried if shows(placed)), None)
+    if placement is not None:
+        console.line(f"{path.name}: placement {placement.how}, since the photographs show it")
     else:
-        placement = _placed(surface, plan, console, path=path)
+        placement = _placed(surface, plan, console, path=path, shows=shows)
     values = _strongest(_local(splats, placement, frame), options.most_gaussians)
     fewer = f" of {len(splats):,}" if len(values) < len(splats) else ""
     cut = "" if splats.values.shape[1] <= VALUES else ", without harmonics above degree 2"
@@ -108,9 +124,17 @@ def _shows(values: NDArray[np.float32], plan: Plan, frame: LocalFrame) -> bool:
 
 
 def _placed(
-    positions: NDArray[np.float64], plan: Plan, console: Console, *, path: Path
+    positions: NDArray[np.float64],
+    plan: Plan,
+    console: Console,
+    *,
+    path: Path,
+    shows: Callable[[Placement], bool] | None = None,
 ) -> Placement | None:
-    """Where surfaces of a file lie; None: as they are, where the project knows hardly any."""
+    """Where surfaces of a file lie; None: as they are, where the project knows hardly any.
+
+    With ``shows``, photographs decide where few points support a placement.
+    """
     options = plan.config.scan
     if options.file is None and options.placement != ESTIMATE:
         return given_placement(options.placement)
@@ -127,11 +151,18 @@ def _placed(
             "it by; give --cloud-placement where it lies elsewhere"
         )
         return None
+    least = options.min_fitness if shows is None else min(LEAST_SUPPORT, options.min_fitness)
     try:
         placement = register(
-            Surface(positions, None), known, least=options.min_fitness,
+            Surface(positions, None), known, least=least,
             metric=plan.scene.metric, seed=plan.config.seed,
         )  # fmt: skip
+        few = max(placement.fitness or 0, placement.scan_fitness or 0) < options.min_fitness
+        if shows is not None and few and not shows(placement):
+            raise DegenerateError(
+                f"nothing like the photographs where it fits best ({placement.summary()}); give "
+                "its placement"
+            )
     except DegenerateError as error:
         raise DegenerateError(f"{path}: {error} (--cloud-placement)") from None
     console.line(f"{path.name}: placement {placement.summary()}")

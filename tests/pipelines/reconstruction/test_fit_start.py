@@ -14,6 +14,8 @@ from tiny_scan import write_colmap_scan, write_scan
 
 from gvtools.appearance.fit import Fit
 from gvtools.appearance.fit_options import FitOptions
+from gvtools.errors import DegenerateError
+from gvtools.scans.registration import Placement
 from gvtools.scenes.project import open_project
 from gvtools.settings import with_texts
 from gvtools.splats import LOG_SCALE, LOGIT, QUATERNION, Splats, place_gaussians
@@ -107,6 +109,30 @@ def test_splats_lie_where_the_project_is(scan, rows, tmp_path):
     frame = same.gaussians.frame
     world = frame.to_world(a[:, :LOG_SCALE])
     np.testing.assert_allclose(world, rows[:, :LOG_SCALE], atol=1e-4 * extent)
+
+
+def test_photographs_decide_where_few_points_support_a_placement(scan, rows, tmp_path, monkeypatch):
+    move = np.eye(4)
+    move[:3, :3] = 2.5 * Rotation.from_rotvec([0.3, -1.2, 2.0]).as_matrix()
+    wide = np.concatenate([rows, np.full((len(rows), 21), 0.1, np.float32)], axis=1)
+    file, told = saved(wide, tmp_path / "moved.ply", move), list[str]()
+    monkeypatch.setattr(QUIET, "line", told.append)
+    for matrix, fitness in ((np.linalg.inv(move), 0.4), (np.eye(4), 0.6), (np.eye(4), 0.4)):
+        placement = Placement(np.asarray(matrix, np.float64), "estimated", fitness, 0.3, 0.01, 0.02)
+        monkeypatch.setattr(
+            "pipelines.reconstruction.fit_start.register", lambda *a, _it=placement, **k: _it
+        )
+        if matrix[0, 0] == 1 and fitness < 0.5:
+            with pytest.raises(DegenerateError, match=r"nothing like the photographs.*--cloud-pl"):
+                started(scan, file)
+        else:
+            assert started(scan, file).fitted
+    assert told[1].endswith("moved.ply, without harmonics above degree 2")
+    turned = started(scan, saved(rows, tmp_path / "turned.ply", np.diag([1.0, -1, -1, 1])))
+    assert "turned half around x, since" in told[-2]
+    same = started(scan, saved(rows, tmp_path / "same.ply"))
+    alike = np.isclose(turned.gaussians.values, same.gaussians.values, atol=1e-3)
+    assert alike[:, :QUATERNION].all() and alike[:, LOGIT:].all()  # quaternions may be negative
 
 
 def test_of_too_many_those_of_most_light_stay(scan, rows, tmp_path):
