@@ -371,8 +371,8 @@ def unpacked(path: Path, *, form: str) -> Iterator[Item]:
     # As a PLY: what has no harmonics, version 0.6 cannot hand over as arrays.
     data = _with_color_ranges(path) if form == "compressed.ply" else read_bytes(path)
     told = gaussforge.GaussForge().convert(data, form, "ply")
-    if "error" in told:
-        said = str(told["error"]).removeprefix(f"{form} read failed: ")
+    if not told.get("data"):  # of some damaged files, without an error
+        said = str(told.get("error", "no Gaussians")).removeprefix(f"{form} read failed: ")
         raise MemoryFileError(f"{said}; expected a whole {form}; save it again")
     with TemporaryDirectory() as folder:
         file = Path(folder) / "unpacked.ply"

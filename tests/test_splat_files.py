@@ -386,3 +386,11 @@ def test_half_a_file_is_refused(tmp_path, end):
     with pytest.raises(MemoryFileError, match=f"a{end}: ") as error:
         read_splats(file)
     assert "\n" not in str(error.value)
+
+
+def test_an_spz_that_its_reader_gives_up_on_without_an_error_is_refused(tmp_path):
+    pytest.importorskip("gaussforge")
+    file = tmp_path / "a.spz"
+    file.write_bytes(b"NGSP" + (4).to_bytes(4, "little") + bytes(4000))
+    with pytest.raises(MemoryFileError, match=r"a\.spz: no Gaussians; expected a whole spz"):
+        read_splats(file)
