@@ -99,10 +99,8 @@ def _motion(pairs: Sequence[tuple[Picture, Picture, object]]) -> dict[str, Readi
     larger = np.sqrt(abs(np.linalg.det(motion[:, :2])))
 
     def undone(picture: Picture) -> Picture:
-        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        moved = cv2.warpAffine(
-            picture, motion, (width, height), flags=flags, borderMode=cv2.BORDER_REPLICATE
-        )
+        flags, border = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, cv2.BORDER_REPLICATE
+        moved = cv2.warpAffine(picture, motion, (width, height), None, flags, border)
         return np.asarray(moved, np.float32)
 
     return {f"shifted ({right:.2g} right, {down:.2g} down) and {larger:.3g} times as large": undone}

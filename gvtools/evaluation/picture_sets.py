@@ -41,11 +41,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.errors import OptionError, ProjectError
-from gvtools.scenes.images import read_depth
+from gvtools.scenes.images import IMAGE_SUFFIXES, read_depth
 from gvtools.scenes.scene import Frame, natural_key
 from gvtools.untrusted import open_picture, unpacked
 
-IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp", ".ppm")
 SPLITS = ("test", "val", "train")
 _CANVAS = re.compile(r"(\d{6})-img\.(jpg|png)", re.IGNORECASE)
 _RENDER = re.compile(r"(val|compress)_step(\d+)_(\d{4,})\.png")
@@ -248,7 +247,7 @@ def _partners(pictures: Sequence[str], views: Sequence[str]) -> list[list[int]]:
 def _key(name: str, *, folders: bool, padded: bool = True) -> str:
     """A name as it is compared; folders may be joined to it by other signs elsewhere."""
     path = PurePosixPath(name.replace("\\", "/"))
-    path = path.with_suffix("") if path.suffix.lower() in IMAGE_ENDINGS else path
+    path = path.with_suffix("") if path.suffix.lower() in IMAGE_SUFFIXES else path
     key = str(path if folders else path.name).replace("/", "_").lower()
     return key if padded else re.sub(r"(?<!\d)0+(?=\d)", "", key)
 
@@ -287,7 +286,7 @@ def image_files(folder: Path) -> list[Path]:
     found = [
         path
         for path in folder.rglob("*")
-        if path.suffix.lower() in IMAGE_ENDINGS
+        if path.suffix.lower() in IMAGE_SUFFIXES
         and not any(part.startswith(".") for part in path.relative_to(folder).parts)
         and path.is_file()
     ]

@@ -17,6 +17,7 @@ from gvtools.errors import DegenerateError, OptionError, ProjectError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from gvtools.evaluation.trajectories import Rows
     from gvtools.trajectory_files import Trajectory
 
 # Share of the time between poses from which pairs that differ by it may be of other moments.
@@ -95,7 +96,7 @@ def associate(
     how: str = "auto",
     max_difference: float,
     offset: float = 0.0,
-) -> tuple[NDArray[np.int64], NDArray[np.int64], str, tuple[str, ...]]:
+) -> tuple[Rows, Rows, str, tuple[str, ...]]:
     """Rows of both trajectories that belong together, how they were found, and what is doubtful.
 
     Args:
@@ -139,21 +140,13 @@ def associate(
             f"times of pairs differ by {gap:.3g} s (median), and poses are {max(steps):.3g} s "
             "apart: other moments may be paired; give an offset or a smaller largest difference",
         )
-    for stamps in (reference.stamps, estimate.stamps):
-        if len(first) < len(stamps) / 2 and (stamps == np.round(stamps)).all():
-            doubts += (
-                f"{len(stamps)} stamps of one are whole numbers, of which {len(first)} find a time "
-                "of the other: frames' numbers are no seconds; to pair in order, --associate index",
-            )
     moved = replace(estimate, stamps=times + offset)
     doubts = doubts or _other_rate((reference, moved), (first, second), partial(match, offset=0.0))
     return first, second, how, doubts
 
 
 def _other_rate(
-    tracks: tuple[Trajectory, Trajectory],
-    rows: tuple[NDArray[np.int64], NDArray[np.int64]],
-    match: Callable[..., Any],
+    tracks: tuple[Trajectory, Trajectory], rows: tuple[Rows, Rows], match: Callable[..., Any]
 ) -> tuple[str, ...]:
     """What is said where few find a partner, or a clock of another rate would mend the errors."""
     from gvtools.evaluation.conventions import EXPLAINED, FEW, NOTABLE
@@ -163,14 +156,14 @@ def _other_rate(
     assert reference.stamps is not None and estimate.stamps is not None
     at, times = reference.stamps, estimate.stamps
 
-    def error(rows: tuple[NDArray[np.int64], NDArray[np.int64]]) -> float:
-        pair = reference.poses[rows[0]], estimate.poses[rows[1]]
-        found = absolute_errors(*pair, refuse_mirrored=False)
-        return np.inf if found.translation is None else found.translation.rmse / found.extent
+    def error(first: Rows, second: Rows) -> float:
+        pair = reference.poses[first], estimate.poses[second]
+        found = absolute_errors(*pair, refuse_mirrored=False).translation_share
+        return np.inf if found is None else found.rmse
 
     low, high = max(at.min(), times.min()), min(at.max(), times.max())
     both = min(int(((low <= stamps) & (stamps <= high)).sum()) for stamps in (at, times))
-    few, given = len(rows[0]) < PARTNERS * both, error(rows)
+    few, given = len(rows[0]) < PARTNERS * both, error(*rows)
     tried = []
     if min(len(at), len(times)) >= FEW and (few or given > NOTABLE):
         steps = [np.median(np.diff(stamps)) for stamps in (at, times)]
@@ -179,13 +172,14 @@ def _other_rate(
             with suppress(DegenerateError):
                 pairs = match(at, start + rate * (times - start))
                 if len(pairs[0]) >= max(FEW, len(rows[0])):
-                    tried.append((error(pairs), len(pairs[0]), 1 / rate))
+                    tried.append((error(*pairs), len(pairs[0]), 1 / rate))
     best, count, fast = min(tried, default=(np.inf, 0, 1.0))
     if best < EXPLAINED * given or (few and best < NOTABLE and count > 2 * PARTNERS * len(rows[0])):
         return (
             f"the estimate's clock seems to run {fast:.4g} times as fast as the reference's: with "
             f"its times divided by that, {count} poses find a partner instead of {len(rows[0])}, "
-            f"with an ATE of {best:.4g} of the extent instead of {given:.4g}; mend its times",
+            f"with an ATE of {best:.4g} of the extent instead of {given:.4g}; mend its times, "
+            "or, of frames' numbers, --associate index",
         )
     return few * (
         f"{len(rows[0])} of {both} poses of the time that both cover find a partner: the figures "
