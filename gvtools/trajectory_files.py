@@ -260,8 +260,8 @@ def read_trajectory(
         beside: cameras of the scene, which tell the order of quaternions that a file leaves open.
 
     Returns:
-        V cameras; the names are the timestamps as written (TUM, EuRoC; a repeated one gets _1, _2,
-        ...) or running numbers (KITTI).
+        V cameras in the order of their times; the names are the timestamps as written (TUM, EuRoC;
+        a repeated one gets _1, _2, ...) or running numbers (KITTI).
     """
     path = Path(path)
     track = read_poses(path, layout=layout)
@@ -280,7 +280,10 @@ def read_trajectory(
         if repeats[name]:
             name = f"{name}_{repeats[name]}"
         names.append(name)
-    return _with_intrinsics(track.poses, like, names, path=path)
+    cameras = _with_intrinsics(track.poses, like, names, path=path)
+    if track.stamps is None:
+        return cameras
+    return cameras[np.argsort(track.stamps, kind="stable").tolist()]
 
 
 def _check_order(path: Path, poses: Float64, *, beside: Cameras, scalar_last: bool) -> None:

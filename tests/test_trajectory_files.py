@@ -69,6 +69,15 @@ def test_places_in_the_unit_that_the_head_names(tmp_path, unit, metres):
     assert any("read as m" in note for note in track.notes) == (unit != "m")
 
 
+def test_a_path_goes_in_the_order_of_its_times(tmp_path):
+    write_tum(tmp_path / "a.txt", _cameras())
+    lines = (tmp_path / "a.txt").read_text().splitlines()
+    (tmp_path / "b.txt").write_text("\n".join([*lines[3:], *lines[:3]]))
+    given, found = (read_trajectory(tmp_path / name, _cameras()[0]) for name in ("a.txt", "b.txt"))
+    assert found.names == given.names
+    np.testing.assert_array_equal(found.cam_from_world, given.cam_from_world)
+
+
 def test_repeated_timestamps_get_names_of_their_own(tmp_path):
     path = tmp_path / "path.txt"
     path.write_text("".join(f"7.5 {x} 0 0 0 0 0 1\n" for x in range(3)), encoding="ascii")
