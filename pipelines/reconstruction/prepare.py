@@ -362,15 +362,16 @@ def _check_colors(placed: PlacedScan, plan: Plan, console: Console) -> None:
     world = placed.placement.apply(scan.positions + scan.origin)
     for name in evenly_spread(plan.context, COMPARED) if scan.colored_by == "colour" else ():
         view = plan.scene[name]
-        (xy,), (z,), rgb = *view.camera.project(world), view.load().rgb
+        xy, z = (each[0] for each in view.camera.project(world))
+        rgb = view.load().rgb
         inside = (z > 0) & (xy >= 0).all(axis=1) & (xy < rgb.shape[1::-1]).all(axis=1)
         nearest = np.flatnonzero(inside)[np.argsort(z[inside])]
-        pixels = xy[nearest].astype(int)
+        pixels = xy[nearest].astype(np.int64)
         first = np.unique(pixels // CELL, axis=0, return_index=True)[1]
         nearest, (x, y) = nearest[first], pixels[first].T
         pairs.append(np.stack([scan.colors[nearest], rgb[y, x]]).astype(np.float64))
-    both = np.concatenate(pairs, axis=1) if pairs else np.zeros((2, 0, 3))
-    reds = both[..., 0] - both[..., 2]
+    both = np.concatenate([np.zeros((2, 0, 3)), *pairs], axis=1)
+    reds = np.subtract(both[..., 0], both[..., 2])
     if both.shape[1] < FEWEST_PLACES:
         return
     if reds.std(axis=1).min() > COLORED and np.corrcoef(reds)[0, 1] < SWAPPED:

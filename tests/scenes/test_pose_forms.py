@@ -75,8 +75,10 @@ def test_focal_lengths_of_pictures_that_were_cropped(tmp_path):
     file = write_project(tmp_path / "room", [photograph(each, textures) for each in cameras])
     assert pose_findings(open_project(file)) == []
     data = json.loads(file.read_text())
+    (file.parent / "bent.json").write_text(json.dumps({**data, "k1": 0.3}))
     for frame in data["frames"]:
         frame |= {key: 0.8 * frame[key] for key in ("fl_x", "fl_y")}
     file.write_text(json.dumps(data))
-    (found,) = pose_findings(open_project(file))
-    assert "focal lengths 1.25 times as long fit" in found.message
+    for path, said in ((file, "focal lengths +2"), (file.parent / "bent.json", "k1 +0.")):
+        (found,) = pose_findings(open_project(path))
+        assert "another lens fits" in found.message and said in found.message
