@@ -44,7 +44,7 @@ from gvtools.scenes.images import (
     resize_nearest,
 )
 from gvtools.scenes.layout import Layout
-from gvtools.scenes.matching import natural
+from gvtools.scenes.matching import natural, pictures_by_stem
 from gvtools.scenes.photographs import Depth, PosedFrame, first_size, posed_scene
 from gvtools.scenes.scene import Finding, Frame, Scene
 from gvtools.scenes.undistort import LensParameters
@@ -74,8 +74,9 @@ def phone_scene(
         line = f"{bare} of {len(readers)} depth maps have no confidence map: all of them is used"
         findings = [*findings, Finding("info", line)]
     scene = posed_scene(
-        root, frames, poses="world_from_cam", metric=True, kind=name, findings=tuple(findings)
-    )
+        root, frames, poses="world_from_cam", metric=True, kind=name, findings=tuple(findings),
+        advice=AGAIN,
+    )  # fmt: skip
     sky = sky_findings(scene.cameras.cam_from_world, WORLD_UP) if upright else []
     return replace(scene, findings=(*scene.findings, *sky))
 
@@ -121,27 +122,26 @@ def _read_polycam(root: Path) -> Scene:
     home = _keyframes(root)
     corrected = all((home / folder).is_dir() for folder in _CORRECTED)
     cameras, images = _CORRECTED if corrected else _RECORDED
-    names = natural(
-        path.stem
-        for folder, kind in ((cameras, ".json"), (images, ".jpg"))
-        for path in (home / folder).glob(f"*{kind}")
-    )
+    pictures = pictures_by_stem(home / images)
+    names = natural([*pictures, *(path.stem for path in (home / cameras).glob("*.json"))])
     pose_keys = [f"t_{row}{column}" for row in range(3) for column in range(4)]
     frames = []
     for name in names:
         camera = json_object(home / cameras / f"{name}.json")
         pose = finite_array([camera.get(key) for key in pose_keys], 3, 4)
         K = finite_array([camera.get(key) for key in ("fx", "fy", "cx", "cy")], 4)
+        image = pictures.get(name, home / images / f"{name}.jpg")
+        depth = home / "depth" / f"{name}.png"
         size = finite_array([camera.get(key) for key in ("width", "height")], 2)
-        image, depth = home / images / f"{name}.jpg", home / "depth" / f"{name}.png"
+        width_height = first_size([image]) if size is None else (int(size[0]), int(size[1]))
         lens = None
-        if K is not None and size is not None:
-            lens = pinhole_lens(K, (int(size[0]), int(size[1])))
+        if K is not None and width_height is not None:
+            lens = pinhole_lens(K, width_height)
         # A reader of its own is given where a picture is readable and of its camera's size.
         whole = lens is not None and first_size([image]) == lens.size
         frames.append(
             PosedFrame(
-                f"{name}.jpg",
+                image.name,
                 image,
                 lens,
                 None if pose is None else opencv_pose(pose),

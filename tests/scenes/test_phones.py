@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from data_sets.miniature import Expected, compare
 from phone_exports import polycam, record3d, record3d_export, scanner_app, stray_scanner
+from PIL import Image
 
 from gvtools.errors import OptionError, ProjectError
 from gvtools.scenes.inspection import inspect
@@ -164,6 +165,22 @@ def test_polycam_masks_the_border_of_corrected_pictures_alone(tmp_path: Path) ->
     assert mask[:, 7:].all()  # what is dark inside of the picture is part of it
     polycam(tmp_path / "recorded", corrected=False)
     assert open_project(tmp_path / "recorded").views[0].load().mask is None
+
+
+def test_polycam_with_pictures_of_another_format_and_cameras_without_size(tmp_path: Path) -> None:
+    polycam(tmp_path, corrected=False)
+    before = open_project(tmp_path)
+    shown = before.views[0].load().rgb
+    for path in (tmp_path / "keyframes/images").glob("*.jpg"):
+        with Image.open(path) as picture:
+            picture.save(path.with_suffix(".png"))
+        path.unlink()
+    for path in (tmp_path / "keyframes/cameras").glob("*.json"):
+        camera = json.loads(path.read_text())
+        path.write_text(json.dumps({k: v for k, v in camera.items() if k[0] not in "wh"}))
+    scene = open_project(tmp_path)
+    np.testing.assert_array_equal(scene.cameras.K, before.cameras.K)
+    np.testing.assert_array_equal(scene.views[0].load().rgb, shown)
 
 
 def test_polycam_never_mixes_corrected_and_recorded_poses(tmp_path: Path) -> None:

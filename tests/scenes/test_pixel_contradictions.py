@@ -68,7 +68,7 @@ def seen_as(room, pictures, **points):
 
 def test_pictures_that_are_all_a_little_off_are_said(room):
     pictures = [view.load().rgb for view in room]
-    right = [cv2.warpAffine(p, np.float32([[1, 0, 5], [0, 1, 0]]), (160, 120)) for p in pictures]
+    right = [np.roll(p, 5, axis=1) for p in pictures]
     (line,) = seen_as(room, right)
     assert "shifted right by +3" in line
     (line,) = seen_as(room, [cv2.resize(p[3:-3, 4:-4], (160, 120)) for p in pictures])
