@@ -42,11 +42,10 @@ from gvtools.poses.refinement import (
 # The progress of a fit runs from 0 to 1: the share of its time, not of its steps, that is over.
 # Numbers below that name a part of the fit are progress.
 
-# The progress from which pictures are taken at a quarter, half and all of their size.
+# The progress from which photographs are taken at a quarter, half and all of their size; those with
+# fewer than SMALL pixels at twice that, those with more than LARGE at half of it until LAST.
 SIZES = ((0.0, 4), (0.2, 2), (0.6, 1))
-# Smaller photographs [pixels] are taken at twice that size, since steps take hardly less time on
-# fewer pixels: at 240 x 180 pixels, photographs gain 0.1 to 1.8 dB by it, larger ones lose 0.4.
-SMALL = 112_000
+SMALL, LARGE, LAST = 112_000, 900_000, 0.85
 # Each degree of the spherical harmonics joins after so much progress.
 DEGREE_EVERY = 0.12
 # Until GROWTH_END, Gaussians are added every GROWTH_SHARE of progress, at least FEWEST_BETWEEN
@@ -163,9 +162,8 @@ class Fit:
         ]
         self._grown = (0, begin)
         self._order: list[int] = []
-        self._reduced: dict[int, ReducedView] = {}
+        self._reduced: dict[int, tuple[int, ReducedView]] = {}
         self._compared: list[ReducedView] | None = None
-        self._size_begun = -1.0
         self._errors: list[float] = []
         # PSNR of one validation photograph for each call of ``validation_psnr``.
         self._validation_psnr: list[float] = []
@@ -411,17 +409,12 @@ class Fit:
         return 10 * float(np.log10(np.square(off).mean()))
 
     def _at_size(self, number: int, share: float) -> ReducedView:
-        begun, factor = next(size for size in reversed(SIZES) if share >= size[0])
-        if begun != self._size_begun:
-            self._size_begun, self._reduced = begun, {}
-        if number in self._reduced:
-            return self._reduced[number]
-        pixels = self.views[number].rgb.size // 3
-        while pixels < SMALL and factor > 1:
-            pixels, factor = 4 * pixels, factor // 2
+        factor = _reduction(self.views[number], share)
+        if number in self._reduced and self._reduced[number][0] == factor:
+            return self._reduced[number][1]
         view = reduce_view(self.views[number], factor)
         if len(self.views) * view.nbytes < KEPT_BYTES:
-            self._reduced[number] = view
+            self._reduced[number] = factor, view
         return view
 
     def _loss_gradient(self, number: int, picture: Splat, view: ReducedView) -> NDArray[np.float32]:
@@ -456,6 +449,17 @@ def validation_rows(views: int) -> tuple[int, ...]:
     """Numbers of the validation photographs among ``views`` photographs, evenly spread."""
     count = min(views // VALIDATION_EVERY, MOST_VALIDATION)
     return tuple((2 * k + 1) * views // (2 * count) for k in range(count))
+
+
+def _reduction(view: FitView, share: float) -> int:
+    """By how much a photograph's size is divided at a progress of ``share``."""
+    factor = next(size for begins, size in reversed(SIZES) if share >= begins)
+    pixels = view.rgb.size // 3
+    if pixels < SMALL:
+        return max(factor // 2, 1)
+    while pixels > LARGE and share < LAST:
+        factor, pixels = 2 * factor, pixels // 4
+    return factor
 
 
 def _shows(view: FitView) -> bool:

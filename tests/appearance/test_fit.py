@@ -238,13 +238,14 @@ def test_an_estimate_pulls_less_where_it_is_missed_by_less_than_its_tolerance():
 
 @pytest.mark.parametrize(
     ("width", "widths"),
-    [(480, [120, 240, 480]), (240, [120, 240, 240]), (100, [100, 100, 100])],
-)
-def test_small_photographs_are_reduced_less_and_for_less_of_a_fit(width, widths):
+    [(3000, [187, 375, 750, 3000]), (1600, [200, 400, 800, 1600]), (480, [120, 240, 480, 480]),
+     (240, [120, 240, 240, 240])],
+)  # fmt: skip
+def test_how_far_photographs_are_reduced_depends_on_their_size(width, widths):
     rgb = np.zeros((width * 3 // 4, width, 3), np.uint8)
     fit = Fit(rough_gaussians(), [FitView(rgb, K, pose(0.0), None, None)])
-    found = [fit._at_size(0, share).target.shape[2] for share, _ in module.SIZES]
-    assert found == widths
+    shares = [*(share for share, _ in module.SIZES), module.LAST]
+    assert [fit._at_size(0, share).target.shape[2] for share in shares] == widths
 
 
 def test_validation_photographs_are_evenly_spread():

@@ -151,13 +151,13 @@ def test_encoders_run_where_time_is_far_enough_from_their_last_run(interval, lev
     assert model.control is not None and model.cascade is not None
     # An encoder that asks neither for the time nor for the state says the same at every step.
     for block in model.cascade.blocks[: model.cascade.config.depth]:
-        block.adaLN_modulation[1].weight.zero_()
+        torch.nn.init.zeros_(block.get_parameter("adaLN_modulation.1.weight"))
     runs: Counter[str] = Counter()
     nets = {"encoder": model.level1.blocks[0], "head": model.level1.blocks[-1]}
     nets |= {"control": model.control.blocks[0]}
     nets |= {"encoder0": model.cascade.blocks[0], "head0": model.cascade.blocks[-1]}
-    options = {"bounds": BOUNDS, "cascade_bounds": (1.0, 0.6, 0.2, 0.0), "cfg_scale": 1.5}
-    options |= {"video": micro.video_features(1, 4)}
+    options: dict[str, Any] = {"bounds": BOUNDS, "cascade_bounds": (1.0, 0.6, 0.2, 0.0)}
+    options |= {"cfg_scale": 1.5, "video": micro.video_features(1, 4)}
     every = model.generate(batch, **options)
     hooks = [
         net.register_forward_hook(lambda *_, name=name: runs.update([name]))
