@@ -290,6 +290,8 @@ PLACES = {
     "facade, exposed": Place(facade, 6, 18, exposure=0.2),
     "corridor": Place(corridor, 7, 24),
     "street": Place(street, 8, 20),
+    "street, 1600 pixels": Place(street, 13, 20, size=(1600, 1200)),
+    "corridor, 240 pixels": Place(corridor, 14, 24, size=(240, 180)),
     "from above": Place(from_above, 9, 18),
     "from above, noisy": Place(from_above, 10, 30, pose_noise=0.0015),
     "room inside": Place(room_inside, 11, 24),
