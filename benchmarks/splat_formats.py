@@ -3,7 +3,7 @@
 Usage: python benchmarks/splat_formats.py RUN [--splat-transform PROGRAM] [--views 3]
 
 RUN is one that fitted Gaussians. Each format is exported once and read by what there is of
-splat-transform (npm), Open3D, gsply, pygltflib and OpenUSD. A row tells how many Gaussians the
+splat-transform (npm, 3.7), Open3D, gsply, pygltflib and OpenUSD. A row tells how many Gaussians the
 reader found, how far the farthest is from its own in the PLY [share of the median distance to the
 next one], the median error of colours [of 255], and what pictures of the run's targets lose when
 gvtools draws the file instead of the PLY [dB].

@@ -1,24 +1,48 @@
-"""Binary glTF: its JSON and its bytes, and the arrays that the JSON says are in them."""
+"""glTF, binary or as text: its JSON and its bytes, and the arrays that the JSON says are there."""
 
 from __future__ import annotations
 
+import base64
 import json
 import struct
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.errors import MemoryFileError
-from gvtools.untrusted import other_version, parse_json
+from gvtools.untrusted import named_file, other_version, parse_json, read_bytes, reading
 
+GLTF_ENDS = (".glb", ".gltf")
 GLB, JSON, BIN, VERSION = b"glTF", b"JSON", b"BIN\0", 2
 # By their number in glTF, and how many make one item.
 TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 NUMBERS = {np.dtype(kind): number for number, kind in TYPES.items()}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 ITEMS = {width: name for name, width in WIDTHS.items()}
+
+
+def read_gltf(path: Path) -> tuple[dict[str, Any], bytes]:
+    """The JSON and the bytes of a file; of a ``.gltf`` those of all its buffers, as in a GLB."""
+    if path.suffix.lower() != ".gltf":
+        return split_glb(read_bytes(path))
+    tree, starts, body = parse_json(read_bytes(path)), dict[str, int](), bytearray()
+    uris = [buffer["uri"] for buffer in tree.get("buffers", ())]
+    for uri in dict.fromkeys(uris):
+        starts[uri] = len(body)
+        if uri.startswith("data:"):
+            body += base64.b64decode(uri.partition(",")[2])
+        else:
+            with reading(f"{path}: its buffer {uri[:80]!r}", "expected a file beside it"):
+                body += read_bytes(named_file(path.parent, unquote(uri), where=str(path)))
+        body += bytes(-len(body) % 4)
+    for view in tree.get("bufferViews", ()):
+        start = starts[uris[view.get("buffer", 0)]]
+        view |= {"buffer": 0, "byteOffset": start + view.get("byteOffset", 0)}
+    return {**tree, "buffers": [{"byteLength": len(body)}]}, bytes(body)
 
 
 def split_glb(data: bytes) -> tuple[dict[str, Any], bytes]:

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gvtools.cameras import rigid_poses
 from gvtools.errors import GvError, MemoryFileError, OptionError
-from gvtools.glb import drawn_nodes, glb_numbers, split_glb
+from gvtools.glb import GLTF_ENDS, drawn_nodes, glb_numbers, read_gltf
 from gvtools.optional import installed, require
 from gvtools.ply import read_header, read_ply
 from gvtools.sandbox import Item, ReaderError, read_apart
@@ -115,9 +115,9 @@ def holds_splats(path: Path) -> bool:
         header = read_header(path)
         names = {name for element in header.elements for name, _ in element.columns}
         return is_splat(names) and not header.holds("face")
-    if suffix == ".glb" and path.is_file():
+    if suffix in GLTF_ENDS and path.is_file():
         with regular(path).open("rb") as file:
-            return KHR.encode() in file.read(GLB_HEAD)
+            return KHR.encode() in file.read(GLB_HEAD if suffix == ".glb" else -1)
     return suffix in READERS
 
 
@@ -457,7 +457,7 @@ def _joined(parts: list[tuple[Float32, Float64]]) -> tuple[Float32, Float64]:
 
 
 def _read_glb(path: Path) -> Splats:
-    tree, body = split_glb(read_bytes(path))
+    tree, body = read_gltf(path)
     up, back = glb_axes(tree)
     parts = []
     for node, matrix in drawn_nodes(tree):
@@ -606,6 +606,6 @@ READERS: Mapping[str, Callable[[Path], Splats]] = {
     ".json": _read_sog,
     ".splat": _read_splat,
     ".ksplat": _read_ksplat,
-    ".glb": _read_glb,
+    **dict.fromkeys(GLTF_ENDS, _read_glb),
     **dict.fromkeys(USD_ENDS, _read_usd),
 }

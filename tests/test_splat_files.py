@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 from dataclasses import replace
 from typing import Any
@@ -19,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from gvtools.errors import GvError, MemoryFileError
 from gvtools.glb import glb_array, join_glb, split_glb
 from gvtools.scans.read import read_scan
-from gvtools.splat_files import read_splats
+from gvtools.splat_files import holds_splats, read_splats
 from gvtools.splats import HARMONICS, SH, TERMS, TO_RUB, Splats, place_gaussians, turn_gaussians
 from pipelines.export.formats import ExportOptions
 from pipelines.export.splats import write_file
@@ -137,6 +138,29 @@ def test_a_glb_shows_linear_colors_and_its_node_moves_turns_and_scales(tmp_path)
     values, _ = place_gaussians(values, matrix)
     found = read_splats(file)
     check_alike(found, replace(given, values=values, origin=moved), (1e-5, 1e-5, 1e-5, 1e-5, 1e-4))
+
+
+@pytest.mark.parametrize("embedded", [True, False])
+def test_gltf_with_its_bytes_inside_or_beside_it(tmp_path, capsys, embedded):
+    """Of two buffers, the second is beside the file in any case, under a name with a blank."""
+    file, given = written(tmp_path, ".glb", some()), some()
+    tree, body = split_glb(file.read_bytes())
+    data = "data:application/octet-stream;base64," + base64.b64encode(body).decode()
+    (tmp_path / "a b.bin").write_bytes(body)
+    uris = (data if embedded else "first.bin", "a%20b.bin")
+    tree["buffers"] = [{"uri": uri, "byteLength": len(body)} for uri in uris]
+    for number, view in enumerate(tree["bufferViews"]):
+        view["buffer"] = number % 2
+    text = tmp_path / "a.gltf"
+    text.write_text(json.dumps(tree))
+    if not embedded:
+        with pytest.raises(GvError, match=r"'first.bin': no such file; expected a file beside it"):
+            read_splats(text)
+        (tmp_path / "first.bin").write_bytes(body)
+    assert holds_splats(text)
+    check_alike(read_splats(text), given, ERRORS[".glb"])
+    said = refused(capsys, "export", text, "--out", tmp_path / "b.gltf")
+    assert "or an end that is written: .glb" in said
 
 
 def test_sparse_arrays_of_a_glb_and_what_no_scene_shows(tmp_path):

@@ -267,8 +267,8 @@ class SpatialMemory(Store):
         finite &= np.isfinite(columns["colors"]).all(axis=1)
         columns = {key: column[finite] for key, column in columns.items()}
         positions = columns["positions"].astype(np.float64)
-        distance = _neighbour_distance(positions)
-        if not distance > 0:
+        distance = _neighbour_distance(positions) or voxel or 0.0
+        if not (distance > 0 and len(positions)):
             raise DegenerateError(f"{len(positions)} distinct points; expected at least two")
         edge = distance if voxel is None else voxel
         middle = positions.mean(axis=0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -12,13 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.errors import GvError, MemoryFileError, OptionError
+from gvtools.glb import GLTF_ENDS
 from gvtools.ranges import CLOUD_OUTLIERS, OF_CLOUDS, said_of, to_bytes, white_of
 from gvtools.scans.lidar import open_lidar
 from gvtools.scans.points import Chunk, Scan, ScanFile
-from gvtools.scans.tables import open_glb, open_pcd, open_ply, open_splats
+from gvtools.scans.tables import open_glb, open_pcd, open_ply, open_splats, open_text
 
 GAUSSIANS = (".spz", ".sog", ".splat", ".ksplat")
-SUFFIXES = (".ply", ".las", ".laz", ".e57", ".pcd", ".glb", *GAUSSIANS)
+OPENERS: dict[str, Callable[[Path], ScanFile]] = {
+    ".ply": open_ply, **dict.fromkeys((".las", ".laz", ".e57"), open_lidar), ".pcd": open_pcd,
+    **dict.fromkeys(GLTF_ENDS, open_glb), **dict.fromkeys(GAUSSIANS, open_splats),
+    **dict.fromkeys((".xyz", ".xyzrgb", ".asc", ".txt"), open_text),
+}  # fmt: skip
 # Points that are kept at once, 36 bytes each and as much again for work; more are thinned.
 MOST_POINTS = 8_000_000
 # Thinning begins with so many cells along the longest side.
@@ -35,21 +40,13 @@ FARTHEST = 1e15
 def open_scan(path: Path, *, generated: bool = False) -> ScanFile:
     """The scan in a file, its header read and checked against the file's size."""
     suffix = path.suffix.lower()
-    if suffix not in SUFFIXES:
-        raise OptionError(f"{path}: expected a scan that ends with {', '.join(SUFFIXES)}")
+    if suffix not in OPENERS:
+        raise OptionError(f"{path}: expected a scan that ends with {', '.join(OPENERS)}")
     if not path.is_file():
         raise MemoryFileError(f"{path}: no such file; expected a scan")
     with _one_line(path):
-        if suffix == ".ply":
-            file = open_ply(path)
-        elif suffix == ".pcd":
-            file = open_pcd(path)
-        elif suffix == ".glb":
-            file = open_glb(path)
-        elif suffix in GAUSSIANS:
-            file = open_splats(path)
-        else:
-            file = open_lidar(path, generated=generated)
+        opener = OPENERS[suffix]
+        file = open_lidar(path, generated=generated) if opener is open_lidar else opener(path)
     if not file.count:
         raise MemoryFileError(f"{path}: no points in it; expected a scan")
     return file

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Any
 
@@ -12,16 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.errors import MemoryFileError
-from gvtools.glb import drawn_nodes, glb_colors, glb_numbers, split_glb
+from gvtools.glb import drawn_nodes, glb_colors, glb_numbers, read_gltf
 from gvtools.kernels import compiled
 from gvtools.ply import point_vertices, read_header
 from gvtools.ranges import color_names, intensity_names, packed_names
 from gvtools.scans.points import CHUNK, GENERATED, Chunk, ScanFile, Station
 from gvtools.splat_files import glb_axes, holds_splats, read_splats
-from gvtools.untrusted import read_bytes
 
 # A number and what parts it from the next one; what one takes at most.
 LEAST_TEXT, MOST_TEXT = 2, 64
+# What a line of text tells.
+COLORED = ("x", "y", "z", "red", "green", "blue")
 # Bytes of a vertex of a GLB at least.
 LEAST_VERTEX = 6
 # Of rows that are read at once.
@@ -143,6 +145,30 @@ def open_ply(path: Path) -> ScanFile:
     return ScanFile(path, table.count, (Station(path.stem),), chunks)
 
 
+def open_text(path: Path) -> ScanFile:
+    """Lines of x y z, or of x y z red green blue; normals instead of colours are not taken."""
+    most = MOST_TEXT * len(COLORED)
+    with path.open("rb") as file:
+        while (line := file.readline(most)).startswith((b"#", b"//")):
+            pass
+        offset = file.tell() - len(line)
+        count = bool(line.strip()) + sum(1 for _ in _lines(file, sys.maxsize, most))
+    if (width := len(line.split())) not in (3, len(COLORED)):
+        raise MemoryFileError(f"{path}: {width} numbers a line; expected x y z (red green blue)")
+    kinds = dict.fromkeys(COLORED[:width], np.dtype("f8"))
+    table = ScanTable(np.dtype(list(kinds.items())), count, "text", offset)
+    chunks = (_chunk(columns, kinds) for columns in table.chunks(path))
+    chunks = (replace(c, colors=None) if _normals(c.colors) else c for c in chunks)
+    return ScanFile(path, count, (Station(path.stem),), chunks)
+
+
+def _normals(vectors: NDArray[Any] | None) -> bool:
+    """Whether they are all of length 1, or some point backwards, as colours do not."""
+    if vectors is None:
+        return False
+    return bool(vectors.min() < 0 or np.allclose(np.linalg.norm(vectors, axis=1), 1, atol=0.01))
+
+
 def open_splats(path: Path) -> ScanFile:
     """The centres of Gaussians that are rather opaque, in the colour that they have all around."""
     splats = read_splats(path)
@@ -156,7 +182,7 @@ def open_glb(path: Path) -> ScanFile:
     """Points of a glTF, else its meshes' coloured vertices, or its Gaussians, in its own axes."""
     if holds_splats(path):
         return open_splats(path)
-    tree, body = split_glb(read_bytes(path))
+    tree, body = read_gltf(path)
     _, back = glb_axes(tree)
     chunks: dict[bool, list[Chunk]] = {True: [], False: []}
     count = 0

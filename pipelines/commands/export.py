@@ -106,7 +106,9 @@ class ExportCommand(Arguments, ExportOptions):
             fits = [FORMATS["splat"]]
         if len(fits) != 1:
             names = ", ".join(each.name for each in fits or FORMATS.values())
-            raise OptionError(f"--out {self.out}: give --format, one of {names}")
+            ends = {end for each in FORMATS.values() for end in each.suffixes}
+            known = "" if fits else f"; or an end that is written: {', '.join(sorted(ends))}"
+            raise OptionError(f"--out {self.out}: give --format, one of {names}{known}")
         return fits[0]
 
     def _convert(self, console: Console, form: ExportFormat) -> None:

@@ -30,7 +30,8 @@ class ViewCommand(Arguments):
 
     folder: Path
     """A run, memory.npz, or a file of gvtools export: splats and points (.ply, .spz, .las, .laz,
-    .usdc, .usda, .glb), meshes (.ply, .glb, .obj), recordings (.rrd, by rerun). [RUN_OR_FILE]"""
+    .usdc, .usda, .glb, .gltf), meshes (.ply, .glb, .gltf, .obj), recordings (.rrd, by rerun).
+    [RUN_OR_FILE]"""
     web: bool = False
     """Serve a web page (default)."""
     open3d: bool = False

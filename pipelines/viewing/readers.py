@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import rigid_poses
 from gvtools.errors import MemoryFileError
-from gvtools.glb import GLB, glb_array, join_glb, split_glb, srgb_bytes
+from gvtools.glb import GLB, GLTF_ENDS, glb_array, join_glb, read_gltf, split_glb, srgb_bytes
 from gvtools.optional import require
 from gvtools.ply import read_header
 from gvtools.sandbox import ReaderError, read_apart
@@ -41,17 +41,17 @@ def load_mesh(path: Path) -> trimesh.Trimesh | trimesh.PointCloud:
     """The triangles or the points of a file, in one, before an export turned them upright."""
     import trimesh
 
-    data = read_bytes(path)
+    kind = path.suffix.lower().removeprefix(".")
+    data = join_glb(*read_gltf(path)) if kind == "gltf" else read_bytes(path)
     if data.startswith(b"ply"):
         read_header(path)
     place: Any = path
-    back = np.eye(3)
-    kind = path.suffix.lower().removeprefix(".")
+    back, size = np.eye(3), len(data)
     if data.startswith(GLB):
         place, kind = io.BytesIO(_checked_glb(path, data)), "glb"
         _, back = glb_axes(split_glb(data)[0])
     del data
-    with _small_pictures(path.stat().st_size):
+    with _small_pictures(size):
         scene = trimesh.load_scene(place, process=False, resolver=_beside(path), file_type=kind)
         loaded: Any = scene.to_geometry()
     loaded.apply_transform(rigid_poses(back))
@@ -68,10 +68,10 @@ def load_mesh(path: Path) -> trimesh.Trimesh | trimesh.PointCloud:
 
 
 def told_up(path: Path) -> NDArray[np.float64] | None:
-    """(3,) what is up, as a PLY, an OBJ or a GLB says; None where it does not."""
+    """(3,) what is up, as a PLY, an OBJ or a glTF says; None where it does not."""
     suffix, comments = path.suffix.lower(), tuple[str, ...]()
-    if suffix == ".glb":
-        return glb_axes(split_glb(read_bytes(path))[0])[0]
+    if suffix in GLTF_ENDS:
+        return glb_axes(read_gltf(path)[0])[0]
     if suffix == ".ply":
         comments = read_header(path).comments
     elif suffix == ".obj":
@@ -204,6 +204,6 @@ def read_usd(
         return positions, srgb_bytes(np.concatenate(colors)), up
     except (ReaderError, OSError, ValueError, KeyError):
         raise MemoryFileError(
-            f"{path}: no USD with UsdGeom.Points, or one that is damaged or names other files; "
-            "expected a file as gvtools export writes it; export it again"
+            f"{path}: no USD with whole Gaussians or UsdGeom.Points, or one that is damaged or "
+            "names other files; expected a file as gvtools export writes it; export it again"
         ) from None

@@ -17,12 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.errors import GvError, MemoryFileError, OptionError, ProjectError
+from gvtools.glb import GLTF_ENDS
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.optional import require
 from gvtools.ply import read_header
 from gvtools.runs.layout import RECORD
 from gvtools.runs.run import Run, count_rounds, load_growing_run, load_memory
 from gvtools.splat_files import READERS, USD_ENDS, holds_splats, read_splats
+from gvtools.splats import LOG_SCALE, QUATERNION
 from pipelines.export.formats import ExportOptions
 from pipelines.export.html import page_of
 from pipelines.export.source import ExportSource
@@ -180,7 +182,7 @@ def _open_mesh(path: Path) -> RunView:
     loaded = load_mesh(path)
     if isinstance(loaded, trimesh.PointCloud):
         colors = np.asarray(loaded.colors)[:, :3] if len(loaded.colors) else None
-        return _points_view(path, np.asarray(loaded.vertices), colors, up=told_up(path))
+        return RunView(path, _memory(path, loaded.vertices, colors), told_up=told_up(path))
     vertices, colors = np.asarray(loaded.vertices, np.float64), _vertex_colors(loaded)
     mesh = ColoredMesh(vertices, np.asarray(loaded.faces), colors)
     return RunView(
@@ -204,7 +206,7 @@ def _open_las(path: Path) -> RunView:
 
     require("laspy", extra="export", purpose=f"{path}: {path.suffix}")
     scan = read_scan(path, generated=True)
-    return _points_view(path, scan.positions + scan.origin, scan.colors)
+    return RunView(path, _memory(path, scan.positions + scan.origin, scan.colors))
 
 
 def _open_usd(path: Path) -> RunView:
@@ -212,30 +214,24 @@ def _open_usd(path: Path) -> RunView:
         return _open_splats(path)
     except MemoryFileError:
         positions, colors, up = read_usd(path)
-        return _points_view(path, positions, colors, up=up)
-
-
-def _points_view(
-    path: Path,
-    positions: NDArray[Any],
-    colors: NDArray[Any] | None,
-    *,
-    up: NDArray[np.float64] | None = None,
-) -> RunView:
-    return RunView(path, _memory(path, positions, colors), told_up=up)
+        return RunView(path, _memory(path, positions, colors), told_up=up)
 
 
 def _open_splats(path: Path) -> RunView:
     splats = read_splats(path)
     colors = np.rint(255 * splats.colors).astype(np.uint8)
-    memory = _memory(path, splats.positions + splats.origin, colors)
+    size = float(np.exp(np.median(splats.values[:, LOG_SCALE:QUATERNION])))
+    memory = _memory(path, splats.positions + splats.origin, colors, edge=size)
     return RunView(
         path, memory, looks=(SPLATS, POINTS), page_of=lambda run, _: page_of(run, splats),
         told_up=splats.up,
     )  # fmt: skip
 
 
-def _memory(path: Path, positions: NDArray[Any], colors: NDArray[Any] | None) -> SpatialMemory:
+def _memory(
+    path: Path, positions: NDArray[Any], colors: NDArray[Any] | None, *, edge: float = 1.0
+) -> SpatialMemory:
+    """A memory of a file's points; ``edge`` is that of its voxel where all lie at one place."""
     from gvtools.o3d import o3d
 
     cloud = o3d.t.geometry.PointCloud()
@@ -244,7 +240,8 @@ def _memory(path: Path, positions: NDArray[Any], colors: NDArray[Any] | None) ->
     cloud.point.positions = o3d.core.Tensor(np.ascontiguousarray(positions, np.float64))
     cloud.point.colors = o3d.core.Tensor(np.ascontiguousarray(colors, np.uint8))
     try:
-        return SpatialMemory.from_point_cloud(cloud, name=path.name)
+        apart = not (positions == positions[:1]).all()
+        return SpatialMemory.from_point_cloud(cloud, voxel=None if apart else edge, name=path.name)
     except GvError as error:
         raise MemoryFileError(f"{path}: {error}") from None
 
@@ -252,7 +249,9 @@ def _memory(path: Path, positions: NDArray[Any], colors: NDArray[Any] | None) ->
 OPENERS: Mapping[str, Callable[[Path], RunView | None]] = {
     **dict.fromkeys(READERS, _open_splats),
     ".ply": _open_ply,
-    ".glb": lambda path: _open_splats(path) if holds_splats(path) else _open_mesh(path),
+    **dict.fromkeys(
+        GLTF_ENDS, lambda path: _open_splats(path) if holds_splats(path) else _open_mesh(path)
+    ),
     ".obj": _open_mesh,
     **dict.fromkeys((".las", ".laz"), _open_las),
     **dict.fromkeys(USD_ENDS, _open_usd),

@@ -256,7 +256,7 @@ def test_cut_and_flipped_files_end_in_one_line(tmp_path, suffix):
 
 def test_unknown_suffixes_missing_files_and_missing_packages_are_named(tmp_path, monkeypatch):
     with pytest.raises(OptionError, match=r"ends with \.ply, \.las"):
-        open_scan(tmp_path / "scan.xyz")
+        open_scan(tmp_path / "scan.rar")
     with pytest.raises(MemoryFileError, match="no such file"):
         open_scan(tmp_path / "scan.laz")
     path = write_las(tmp_path / "scan.las", surface(10)[0], None)
@@ -401,6 +401,31 @@ def written(path, change=lambda text: text, *, rows=None):
     return path, positions, colors
 
 
+@pytest.mark.parametrize(
+    ("head", "divisor"), [("", 1), ("//X Y Z R G B\n", 1), ("# made by hand\n", 255)]
+)
+def test_points_as_text_with_colours(tmp_path, head, divisor):
+    positions, colors = surface(300)
+    path = tmp_path / "points.xyz"
+    with path.open("w") as file:
+        file.write(head)
+        np.savetxt(file, np.hstack([positions + FAR, colors / divisor]))
+    same(path, positions + FAR, colors)
+
+
+@pytest.mark.parametrize("columns", [3, 6])
+def test_points_as_text_without_colours(tmp_path, columns):
+    """Normals are not taken for colours, even where none of them points backwards."""
+    positions, colors = surface(300)
+    normals = (colors + 1) / np.linalg.norm(colors + 1.0, axis=1, keepdims=True)
+    path = tmp_path / "points.txt"
+    np.savetxt(path, np.hstack([positions, normals])[:, :columns], fmt="%.5f")
+    assert same(path, positions, None, atol=1e-5).colored_by == "nothing"
+    path.write_text("1 2 3 4 5\n")
+    with pytest.raises(MemoryFileError, match="5 numbers a line; expected x y z"):
+        read_scan(path)
+
+
 def test_glb_of_points_in_a_scene_of_other_things(tmp_path):
     """Points before meshes, else coloured vertices; light is linear, but bytes are sRGB."""
     trimesh = pytest.importorskip("trimesh")
@@ -415,6 +440,9 @@ def test_glb_of_points_in_a_scene_of_other_things(tmp_path):
     np.testing.assert_allclose(scan.positions + scan.origin, 2 * points + [1, 2, 3], atol=1e-5)
     np.testing.assert_array_equal(scan.colors, colors[:, :3])
     mesh = trimesh.Trimesh(points, [[0, 1, 2]], vertex_colors=colors, process=False)
+    for name, data in trimesh.exchange.gltf.export_gltf(mesh.scene()).items():
+        (tmp_path / name).write_bytes(data)
+    assert len(read_scan(tmp_path / "model.gltf")) >= 3
     mesh.export(tmp_path / "mesh.glb")
     assert len(read_scan(tmp_path / "mesh.glb")) >= 3
     linear = np.full((1, 3), 0.2159, np.float32)

@@ -252,6 +252,29 @@ def test_a_texture_is_measured_by_its_own_file(tmp_path, monkeypatch):
     assert before == Image.MAX_IMAGE_PIXELS
 
 
+def test_a_mesh_of_gltf_opens_with_its_colors(tmp_path):
+    import trimesh
+
+    box = trimesh.creation.box()
+    box.visual.vertex_colors = np.arange(32, dtype=np.uint8).reshape(8, 4)
+    for name, data in trimesh.exchange.gltf.export_gltf(box.scene()).items():
+        (tmp_path / name).write_bytes(data)
+    surface: Any = ViewSource(tmp_path / "model.gltf").read().surface
+    order = np.lexsort(surface.vertices.T)
+    np.testing.assert_allclose(surface.vertices[order], box.vertices[np.lexsort(box.vertices.T)])
+    assert surface.colors[order].tolist() == (
+        box.visual.vertex_colors[np.lexsort(box.vertices.T), :3].tolist()
+    )
+
+
+def test_a_single_gaussian_opens_at_its_own_size(tmp_path):
+    row = np.array([(1, 2, 3), (0.5, 0.5, 0.5)], "<f4").tobytes() + bytes([200] * 8)
+    (tmp_path / "one.splat").write_bytes(row)
+    shown = ViewSource(tmp_path / "one.splat").read()
+    np.testing.assert_allclose(shown.memory.positions, [[1, 2, 3]])
+    assert shown.memory.voxel == pytest.approx(0.5)
+
+
 def test_a_glb_of_more_than_a_million_points_opens(tmp_path):
     import trimesh
 
