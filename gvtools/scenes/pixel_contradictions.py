@@ -143,8 +143,11 @@ class PixelCheck:
                 if max(scores) <= best:
                     break
                 best, move = max(scores), tried[int(np.argmax(scores))]
+        # Noisy detections of corners are alike at any place beside them.
+        beside = float(np.median(agreements(-move) or [-1]))
         pixels = np.concatenate([self._places(n, move) - self._places(n, 0 * move) for n in known])
-        if best < max(FITS, now + GAIN) or np.linalg.norm(pixels, axis=1).mean() < PIXELS:
+        gained = best - max(now, beside) >= GAIN and best >= FITS
+        if not gained or np.linalg.norm(pixels, axis=1).mean() < PIXELS:
             return ""
         way = ", ".join(MOVES[k].format(move[k]) for k in np.flatnonzero(move))
         return f"{way} against the detections (correlation {best:.2f} there, {now:.2f} at them)"

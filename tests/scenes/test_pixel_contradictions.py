@@ -75,6 +75,20 @@ def test_pictures_that_are_all_a_little_off_are_said(room):
     assert "scaled by +" in line
 
 
+def test_noisy_detections_of_corners_are_no_displacement(room):
+    rng, points = np.random.default_rng(0), room.points
+    smooth = cv2.GaussianBlur(rng.normal(0, 1, (120, 160)), (0, 0), 3)
+    picture = 128 + 25 * smooth / smooth.std()
+    x, y = (each.ravel() for each in np.meshgrid(np.arange(8, 152, 8), np.arange(8, 112, 7)))
+    picture[y, x] += rng.normal(0, 60, len(x))
+    rgb = np.repeat(np.clip(picture, 0, 255).astype(np.uint8)[..., None], 3, axis=2)
+    xy = np.tile(np.stack([x, y], axis=1) + 0.5, (8, 1)) + rng.normal(0, 0.8, (8 * len(x), 2))
+    index, view = np.tile(np.arange(len(x)), 8), np.repeat(np.arange(8), len(x))
+    seen = replace(points, point_index=index, view_index=view, xy=xy)
+    views = tuple(replace(view, load=partial(Frame, rgb)) for view in room.views)
+    assert probed(replace(room, views=views, points=seen), room.names) == []
+
+
 def test_swapped_channels_are_told_by_the_points_colours(room):
     greys = [view.load().rgb[..., 0] for view in room]
     pictures = [np.dstack([grey, grey, 255 - grey]) for grey in greys]
