@@ -122,17 +122,19 @@ class PixelCheck:
     def _moved(self) -> str:
         """How all detections have to be moved for the photographs to agree better, "" for none."""
         known = [number for number, shown in self.kept.items() if shown.size]
-        if self.rough or len(known) < FEWEST:
+        if self.points is None or self.rough or len(known) < FEWEST:
             return ""
 
-        def agreements(move: NDArray[np.float64]) -> list[float]:
+        def agreements(move: NDArray[np.float64], aside: float = 0.0) -> list[float]:
             values = np.full(len(self.values), np.nan)
             for number in known:
-                places = self._places(number, move)
+                places = self._places(number, move) + aside * ways[self.rows[number]]
                 values[self.rows[number]] = self._at_detections(number, self.kept[number], places)
             return [*self.agreements(values, least=ENOUGH).values()]
 
-        move = np.zeros(len(MOVES))
+        # For each track another direction, the same in all views.
+        turn = 2.4 * self.points.point_index
+        ways, move = np.stack([np.cos(turn), np.sin(turn)], axis=1), np.zeros(len(MOVES))
         if len(first := agreements(move)) < FEWEST:
             return ""
         now = best = float(np.median(first))
@@ -143,11 +145,11 @@ class PixelCheck:
                 if max(scores) <= best:
                     break
                 best, move = max(scores), tried[int(np.argmax(scores))]
-        # Noisy detections of corners are alike at any place beside them.
-        beside = float(np.median(agreements(-move) or [-1]))
-        pixels = np.concatenate([self._places(n, move) - self._places(n, 0 * move) for n in known])
-        gained = best - max(now, beside) >= GAIN and best >= FITS
-        if not gained or np.linalg.norm(pixels, axis=1).mean() < PIXELS:
+        away = np.concatenate([self._places(n, move) - self._places(n, 0 * move) for n in known])
+        pixels = float(np.linalg.norm(away, axis=1).mean())
+        # Where detections are noisy, places beside corners agree more than corners do.
+        beside = float(np.median(agreements(0 * move, max(pixels, PIXELS)) or [-1]))
+        if best < max(FITS, now + GAIN, beside + GAIN) or pixels < PIXELS:
             return ""
         way = ", ".join(MOVES[k].format(move[k]) for k in np.flatnonzero(move))
         return f"{way} against the detections (correlation {best:.2f} there, {now:.2f} at them)"

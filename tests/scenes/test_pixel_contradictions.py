@@ -80,7 +80,7 @@ def test_noisy_detections_of_corners_are_no_displacement(room):
     smooth = cv2.GaussianBlur(rng.normal(0, 1, (120, 160)), (0, 0), 3)
     picture = 128 + 25 * smooth / smooth.std()
     x, y = (each.ravel() for each in np.meshgrid(np.arange(8, 152, 8), np.arange(8, 112, 7)))
-    picture[y, x] += rng.normal(0, 60, len(x))
+    picture[y, x] += rng.normal(0, 100, len(x))
     rgb = np.repeat(np.clip(picture, 0, 255).astype(np.uint8)[..., None], 3, axis=2)
     xy = np.tile(np.stack([x, y], axis=1) + 0.5, (8, 1)) + rng.normal(0, 0.8, (8 * len(x), 2))
     index, view = np.tile(np.arange(len(x)), 8), np.repeat(np.arange(8), len(x))
