@@ -81,10 +81,11 @@ SAY_EVERY = 5.0
 # Least tolerance of the blend with recorded depth. In targets far from all views Gaussians are
 # smeared and the memory is right; validation photographs are too near to other views to show it.
 WITH_DEPTH = 0.4
-# A fit that its clock ends after fewer steps for each photograph is not used; of other short ones
-# a warning tells. With 50, 100 and 600 steps, 44
-# photographs have 18.8, 21.1 and 29.1 dB in held-out pictures, and 27.3 without a fit.
-SHORT = 7.5
+# A fit that its clock ends after fewer steps for each photograph, and fewer than ENOUGH in all, is
+# not used; of other short ones a warning tells. With 50, 100 and 600 steps, 44 photographs have
+# 18.8, 21.1 and 29.1 dB in held-out pictures, and 27.3 without a fit; 175 of a room have 32.1 dB
+# with 409 steps, and 29.8 without.
+SHORT, ENOUGH = 7.5, 400
 # A fit whose validation photographs stopped gaining makes this share of its steps or more.
 SKIPPED = 0.9
 
@@ -412,7 +413,7 @@ def fit_appearance(plan: Plan, console: Console, *, earlier: Fitted | None = Non
             console.warn("the fit is not used: give it more time by --refine")
             return None
         return replace(fitted, validation=validation)
-    enough = round(SHORT * len(plan.context))
+    enough = min(round(SHORT * len(plan.context)), ENOUGH)
     # Recorded depth keeps surfaces.
     if not _recorded(plan) and fitted.steps < enough:
         few = (
