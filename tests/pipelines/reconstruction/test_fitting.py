@@ -183,15 +183,19 @@ def test_photographs_alone_get_depth_by_the_gaussians(tmp_path, monkeypatch, poi
     assert 1.5 < np.median(shown[shown > 0]) < 3.5
 
 
-@pytest.mark.parametrize(("steps", "told"), [(20, True), (25, False)])
-def test_a_fit_too_short_for_its_photographs_is_told(bare, monkeypatch, capsys, steps, told):
+@pytest.mark.parametrize(
+    ("steps", "enough", "told"), [(20, 22, True), (25, 22, False), (9, 10, True), (11, 10, False)]
+)
+def test_a_fit_too_short_for_its_photographs_is_told(
+    bare, monkeypatch, capsys, steps, enough, told
+):
     # Where nothing judges it.
     monkeypatch.setattr(fitting, "validate_fit", lambda *args: None)
     monkeypatch.setattr(fitting, "SWEPT_SIDE", 64)
+    monkeypatch.setattr(fitting, "ENOUGH", 10 if enough == 10 else 400)
     plan = planned(bare, f"refine.steps={steps}", "context=first:3")
     fit_appearance(plan, Console())
-    needed = round(7.5 * len(plan.context))
-    assert (f"expected at least {needed}" in capsys.readouterr().err) == told
+    assert (f"expected at least {enough}" in capsys.readouterr().err) == told
 
 
 def test_a_fit_that_its_clock_ends_too_early_is_not_used(bare, monkeypatch, capsys):
