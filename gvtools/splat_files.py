@@ -293,7 +293,7 @@ def _read_sog(path: Path) -> Splats:
 def _read_ksplat(path: Path) -> Splats:
     """The sections of a file, at any of three levels of compression."""
     data = read_bytes(path)
-    sections, level = *struct.unpack_from("<I", data, 4), *struct.unpack_from("<H", data, 20)
+    sections, level = struct.unpack_from("<I12xH", data, 4)
     if level > 2 or data[0] != 0:
         raise MemoryFileError(
             f"ksplat version {data[0]}, compression {level}; expected version 0, compression 0 to 2"

@@ -125,30 +125,23 @@ def _other_turn(first: Float64, second: Float64, found: PoseErrors, *, align: st
             f"about their axis {axis} all along: other axes of the camera (OpenGL's), or another "
             "sensor's poses; figures of rotation, RPE and AUC hold this turn"
         ]
-    orders = ([0, 1, 2, 3], [1, 2, 3, 0], [3, 0, 1, 2])
-    kept, other = (
-        [
-            [Rotation.from_quat(turns.as_quat()[:, order]) for order in some]
-            for turns in (given, true)
-        ]
-        for some in (orders[:1], orders[1:])
+    estimates, references = (
+        [Rotation.from_quat(turns.as_quat()[:, order]) for order in ([1, 2, 3, 0], [3, 0, 1, 2])]
+        for turns in (given, true)
     )
     ways = {
-        whose: min(starmap(left, product(estimate, reference)))
-        for whose, estimate, reference in (
-            ("the estimate's", other[0], kept[1]),
-            ("the reference's", kept[0], other[1]),
-            ("both files'", other[0], other[1]),
-        )
+        "the estimate's": min(left(other, true) for other in estimates),
+        "the reference's": min(left(given, other) for other in references),
+        "both files'": min(starmap(left, product(estimates, references))),
     }
-    whose = min(ways, key=ways.__getitem__)
-    if ways[whose] >= EXPLAINED * turned:
+    whose, least = min(ways.items(), key=lambda way: way[1])
+    if least >= EXPLAINED * turned:
         return []
     # In one frame, the order of either explains the same.
-    one = [ways["the estimate's"], ways["the reference's"]]
-    whose = "one file's" if max(one) < EXPLAINED * turned else whose
+    if max(ways["the estimate's"], ways["the reference's"]) < EXPLAINED * turned:
+        whose = "one file's"
     return [
         f"{whose} quaternions seem to be of the other order: with the real part at the other end, "
-        f"rotations are off by {min(ways.values()):.4g} degrees instead of {turned:.4g}; name the "
+        f"rotations are off by {least:.4g} degrees instead of {turned:.4g}; name the "
         "columns in a first line ('# timestamp tx ty tz qw qx qy qz')"
     ]

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from gvtools.glb import srgb_bytes
 from gvtools.scenes.scene import Frame
 
 Picture = NDArray[np.float32]  # (H, W, 3), 0 to 255
@@ -58,18 +59,14 @@ def better_reading(pictures: Sequence[NDArray[np.uint8]], truths: Sequence[Frame
     return f"{best}: otherwise PSNR would be {min(after, 100):.1f} dB instead of {before:.1f}"
 
 
-def _from_linear(picture: Picture) -> Picture:
-    share = picture / 255
-    curve = np.where(share < 0.0031308, 12.92 * share, 1.055 * share ** (1 / 2.4) - 0.055)
-    return np.asarray(255 * curve, np.float32)
-
-
 FIXED: dict[str, Reading] = {
     "mirrored left to right": lambda picture: picture[:, ::-1],
     "upside down": lambda picture: picture[::-1],
     "turned by 180 degrees": lambda picture: picture[::-1, ::-1],
     "of red and blue exchanged": lambda picture: picture[..., ::-1],
-    "in linear light, without the curve of sRGB": _from_linear,
+    "in linear light, without the curve of sRGB": lambda picture: srgb_bytes(picture / 255).astype(
+        np.float32
+    ),
 }
 
 

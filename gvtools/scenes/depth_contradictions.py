@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cache, partial
 
 import numpy as np
@@ -33,6 +33,8 @@ NEARLY, LEAST, ONE_PAIR, TWO_PAIRS = 0.05, 100, 0.3, 0.6
 # Maps are those of the next frames, or of those before, when so much of them then agrees within the
 # first share, in the middle of the pairs, and less as they are. On three recordings it is 0.98.
 CLOSE, FITTING = 0.02, 0.93
+# Steps of one length at most, in a search for what fits better.
+CLIMBS = 8
 
 Pair = tuple[Depth, Depth, tuple[Cameras, Cameras]]
 
@@ -113,6 +115,21 @@ def _close(pairs: Sequence[Pair]) -> float:
     agreed, shared = (part[:, 0] for part in _agreeing(pairs, np.ones(1), same=CLOSE))
     told = shared * PIXELS >= LEAST
     return float(np.median(agreed[told] / shared[told])) if told.any() else 0.0
+
+
+def climbed(
+    score: Callable[[Float64], float], start: Float64, steps: Sequence[float], *, gain: float = 0.0
+) -> tuple[float, Float64]:
+    """The best score and its place: ever smaller steps along an axis, each worth a gain."""
+    best, place = score(start), start
+    for step in steps:
+        for _ in range(CLIMBS):
+            tried = [place + way * step for unit in np.eye(len(place)) for way in (unit, -unit)]
+            scores = [score(other) for other in tried]
+            if max(scores) <= best + gain:
+                break
+            best, place = max(scores), tried[int(np.argmax(scores))]
+    return best, place
 
 
 def frame_there(scene: Scene, number: int) -> Frame | None:

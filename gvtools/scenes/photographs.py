@@ -50,7 +50,6 @@ from gvtools.untrusted import named_file
 
 Depth = NDArray[np.float32]
 
-# Reasons for which a frame is left out, as findings have them.
 # Masks that a scene opens to see whether they tell anything.
 MASKS = 8
 # How what lies beside a project is given to it, by its kind.
@@ -62,6 +61,7 @@ HOW_TO_GIVE = {
     ("colmap", "mask"): "give the folder with --masks (black = ignore)",
     ("transforms", "mask"): "give the folder with --masks (black = ignore)",
 }
+# Reasons for which a frame is left out, as findings have them.
 NO_PICTURE = "have no picture"
 NO_POSE = "have no pose"
 NAN_POSE = "have NaN in their pose"
@@ -361,14 +361,9 @@ class Photograph:
 
     def view(self) -> View:
         """The photograph as a view that loads lazily."""
-        width, height = self.lens.size
-        camera = Cameras(
-            self.lens.K[None],
-            np.asarray(self.cam_from_world, np.float64)[None],
-            np.array([width]),
-            np.array([height]),
-            (self.name,),
-        )
+        width, height = map(np.array, self.lens.size)
+        poses = np.asarray(self.cam_from_world, np.float64)[None]
+        camera = Cameras(self.lens.K[None], poses, width, height, (self.name,))
         paths = (self.frame.image, self.frame.mask, self.frame.depth)
         files = tuple(dict.fromkeys(path for path in paths if path is not None))
         return View(self.name, camera, self.load, self.frame.depth is not None, files)
@@ -403,13 +398,9 @@ class Photograph:
 
         width, height = lens.size
         return register_depth(
-            depth,
-            frame.registration.depth_K,
-            lens.K,
+            depth, frame.registration.depth_K, lens.K, width=width, height=height,
             color_from_depth=frame.registration.color_from_depth,
-            width=width,
-            height=height,
-        )
+        )  # fmt: skip
 
 
 def size_findings(photographs: Sequence[Photograph], sieve: _Sieve) -> list[Finding]:
@@ -503,12 +494,8 @@ def center_findings(lenses: Sequence[Undistortion]) -> list[Finding]:
 def rotation_findings(defects: Sequence[float]) -> list[Finding]:
     """One line when rotations had to be made orthonormal."""
     mended = sum(defect > ROTATION_ROUNDING for defect in defects)
-    if not mended:
-        return []
-    return [
-        Finding(
-            "info",
-            f"{mended} of {len(defects)} rotations made orthonormal; largest entry of R Rᵀ − I "
-            f"was {max(defects):.2g}",
-        )
-    ]
+    line = (
+        f"{mended} of {len(defects)} rotations made orthonormal; largest entry of R Rᵀ − I was "
+        f"{max(defects, default=0):.2g}"
+    )
+    return [Finding("info", line)] if mended else []

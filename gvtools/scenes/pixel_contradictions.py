@@ -19,7 +19,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.scenes.depth_contradictions import frame_there, unit_findings
+from gvtools.scenes.depth_contradictions import climbed, frame_there, unit_findings
+from gvtools.scenes.matching import named
 from gvtools.scenes.scene import Finding, Scene, SparsePoints
 
 Grey = NDArray[np.float32]
@@ -33,20 +34,22 @@ TRACKS, AGREE = 20, 0.65
 CONTRAST = 2.0
 # Detail is what a blur over this share of the longer side takes away.
 BLUR = 1 / 40
-# How pictures come to be wrong, by what sets them right.
-CHANGES: Mapping[str, Callable[[Grey], Grey]] = {
-    "mirrored left to right": lambda grey: grey[:, ::-1],
-    "turned by half": lambda grey: grey[::-1, ::-1],
-    "turned upside down": lambda grey: grey[::-1],
-    "turned by a quarter": np.rot90,
-    "turned by three quarters": lambda grey: np.rot90(grey, -1),
+# What sets wrong pictures right: that so many places after each, changed.
+CHANGES: Mapping[str, tuple[int, Callable[[Grey], Grey]]] = {
+    "they fit mirrored left to right": (0, lambda grey: grey[:, ::-1]),
+    "they fit turned by half": (0, lambda grey: grey[::-1, ::-1]),
+    "they fit turned upside down": (0, lambda grey: grey[::-1]),
+    "they fit turned by a quarter": (0, np.rot90),
+    "they fit turned by three quarters": (0, lambda grey: np.rot90(grey, -1)),
+    "each fits the next picture": (1, np.asarray),
+    "each fits the picture before it": (-1, np.asarray),
 }
 GIVE = "give the pictures that the poses were computed from"
 # Views whose depth is taken, those so many places after each that it is compared with, pixels of
 # each; how far depth around one may differ, and two views' depth of one place.
 DEPTH_PROBES, DEPTH_GAPS, DEPTH_PIXELS, SMOOTH, SAME_PLACE = 5, (0, 1, 2, 4), 400, 1.05, 0.02
-# Views that a run looks at, that a reason is sought for, and that a finding names.
-PROBES, TRIED, NAMED = 8, 16, 3
+# Views that a run looks at, and that a reason is sought for.
+PROBES, TRIED = 8, 16
 # How all detections may be moved: right and down in longer sides, from the middle in shares of the
 # radius, and of it by its square, by these steps. On four real scenes no step gains more than
 # 0.001; pictures shifted by a hundredth, cropped by 1.5 % or undistorted twice gain 0.03 and more.
@@ -67,16 +70,16 @@ class PixelCheck:
     def __init__(self, scene: Scene) -> None:
         # Depth is rougher than detections: it judges all photographs together.
         self.rough = scene.points is None
-        self.scene, self.points = scene, _points_of_depth(scene) if self.rough else scene.points
-        self.rows = [] if self.points is None else self.points.rows_of_views(len(scene))
-        count = 0 if self.points is None else len(self.points.point_index)
-        self.values = np.full(count, np.nan)
+        self.scene, self.points = scene, scene.points or _points_of_depth(scene)
+        self.rows = self.points.rows_of_views(len(scene))
+        self.values = np.full(len(self.points.point_index), np.nan)
         self.kept = dict.fromkeys(self.most_in_common(range(len(scene))), np.zeros((0, 0), np.int8))
         self.swapped = dict[int, bool]()
 
     def most_in_common(self, numbers: Iterable[int]) -> list[int]:
         """The few views among ``numbers`` that have most tracks in common with one of them."""
-        if self.points is None or not (some := [n for n in numbers if len(self.rows[n])]):
+        some = [number for number in numbers if len(self.rows[number])]
+        if not some:
             return []
         index, seen = self.points.point_index, np.zeros(len(self.points.positions), np.bool_)
         seen[index[self.rows[max(some, key=lambda number: len(self.rows[number]))]]] = True
@@ -84,9 +87,9 @@ class PixelCheck:
 
     def see(self, number: int, rgb: NDArray[np.uint8]) -> None:
         """Take in the photograph (H, W, 3) of a view."""
-        if self.points is None or not len(self.rows[number]):
+        if not len(self.rows[number]):
             return
-        shown = cv2.blur(detail(rgb), (3, 3))
+        shown = _shown(rgb)
         self.values[self.rows[number]] = self._at_detections(number, shown)
         if number in self.kept:
             self.kept[number] = np.rint(np.clip(shown, -127, 127)).astype(np.int8)
@@ -100,7 +103,6 @@ class PixelCheck:
         self, number: int, picture: NDArray[Any], xy: NDArray[np.float64] | None = None
     ) -> NDArray[np.float64]:
         """(N,) numbers of a picture at the detections of a view, or at other places of them."""
-        assert self.points is not None
         height, width = picture.shape
         xy = self.points.xy[self.rows[number]] if xy is None else xy
         x, y = np.floor(xy).astype(np.int64).T
@@ -111,7 +113,6 @@ class PixelCheck:
 
     def _places(self, number: int, move: NDArray[np.float64]) -> NDArray[np.float64]:
         """(N, 2) where the detections of a view are when they are moved, see MOVES."""
-        assert self.points is not None
         height, width = self.kept[number].shape
         middle = np.array([width, height]) / 2
         off = self.points.xy[self.rows[number]] - middle
@@ -122,33 +123,27 @@ class PixelCheck:
     def _moved(self) -> str:
         """How all detections have to be moved for the photographs to agree better, "" for none."""
         known = [number for number, shown in self.kept.items() if shown.size]
-        if self.points is None or self.rough or len(known) < FEWEST:
+        if self.rough or len(known) < FEWEST:
             return ""
+        # For each track another direction, the same in all views.
+        turn, still = 2.4 * self.points.point_index, np.zeros(len(MOVES))
+        ways = np.stack([np.cos(turn), np.sin(turn)], axis=1)
 
-        def agreements(move: NDArray[np.float64], aside: float = 0.0) -> list[float]:
+        def agreement(move: NDArray[np.float64], aside: float = 0.0) -> float:
             values = np.full(len(self.values), np.nan)
             for number in known:
                 places = self._places(number, move) + aside * ways[self.rows[number]]
                 values[self.rows[number]] = self._at_detections(number, self.kept[number], places)
-            return [*self.agreements(values, least=ENOUGH).values()]
+            found = [*self.agreements(values, least=ENOUGH).values()]
+            return float(np.median(found)) if len(found) >= FEWEST else -1.0
 
-        # For each track another direction, the same in all views.
-        turn = 2.4 * self.points.point_index
-        ways, move = np.stack([np.cos(turn), np.sin(turn)], axis=1), np.zeros(len(MOVES))
-        if len(first := agreements(move)) < FEWEST:
+        if (now := agreement(still)) == -1:
             return ""
-        now = best = float(np.median(first))
-        for step in MOVED_BY:
-            for _ in range(TRIED):
-                tried = [move + way * step for unit in np.eye(len(move)) for way in (unit, -unit)]
-                scores = [float(np.median(agreements(other) or [-1])) for other in tried]
-                if max(scores) <= best:
-                    break
-                best, move = max(scores), tried[int(np.argmax(scores))]
-        away = np.concatenate([self._places(n, move) - self._places(n, 0 * move) for n in known])
+        best, move = climbed(agreement, still, MOVED_BY)
+        away = np.concatenate([self._places(n, move) - self._places(n, still) for n in known])
         pixels = float(np.linalg.norm(away, axis=1).mean())
         # Where detections are noisy, places beside corners agree more than corners do.
-        beside = float(np.median(agreements(0 * move, max(pixels, PIXELS)) or [-1]))
+        beside = agreement(still, max(pixels, PIXELS))
         if best < max(FITS, now + GAIN, beside + GAIN) or pixels < PIXELS:
             return ""
         way = ", ".join(MOVES[k].format(move[k]) for k in np.flatnonzero(move))
@@ -166,8 +161,6 @@ class PixelCheck:
         Views ``without`` are compared, and none is compared with them. ``values`` (M,) stand for
         those that were seen.
         """
-        if self.points is None:
-            return {}
         values = self.values if values is None else values
         index, count = self.points.point_index, len(self.points.positions)
         known = np.isfinite(values)
@@ -210,59 +203,42 @@ class PixelCheck:
             if moved:
                 findings.append(Finding("warning", f"photographs are {moved}: {GIVE}"))
             return findings
-        names = ", ".join(
-            f"{self.scene.views[number].name} ({judged[number]:.2f})" for number in wrong[:NAMED]
-        )
-        more = f" and {len(wrong) - NAMED} more" if len(wrong) > NAMED else ""
+        names = named([f"{self.scene.views[n].name} ({judged[n]:.2f})" for n in wrong])
         place = "the same places by depth" if self.rough else "detections"
         message = (
             f"{len(wrong)} of {len(judged)} photographs do not show what their cameras saw "
             f"({len(wrong) / len(judged):.0%}; correlation at {place} below {AGREE:g}): "
-            f"{names}{more}{self._reason(wrong) or (moved and f'; they are {moved}')}; renumbered, "
+            f"{names}{self._reason(wrong) or (moved and f'; they are {moved}')}; renumbered, "
             f"mirrored, cropped or turned pictures give wrong results: {GIVE}"
         )
         return [*findings, Finding("warning", message)]
 
     def _reason(self, wrong: Sequence[int]) -> str:
         """What would make wrong pictures agree, "" where nothing that is tried does."""
-        chosen = wrong[:TRIED]
-        shown = {n: self._detail(n) for n in {m + step for m in chosen for step in (-1, 0, 1)}}
-        ways: dict[str, Callable[[int], Grey | None]] = {
-            f"they fit {name}": partial(lambda change, n: self._changed(shown[n], change), change)
-            for name, change in CHANGES.items()
-        }
-        ways["each fits the next picture"] = lambda n: shown[n + 1]
-        ways["each fits the picture before it"] = lambda n: shown[n - 1]
-        for reason, picture in ways.items():
+        chosen, shown = wrong[:TRIED], dict[int, Grey]()
+        for number in {n + step for n in chosen for step in (-1, 0, 1)} & {*range(len(self.rows))}:
+            if frame := frame_there(self.scene, number):
+                shown[number] = _shown(frame.rgb)
+        for reason, (step, change) in CHANGES.items():
             values = self.values.copy()
             for number in wrong:
-                grey = picture(number) if number in chosen else None
-                values[self.rows[number]] = (
-                    np.nan if grey is None else self._at_detections(number, grey)
-                )
+                values[self.rows[number]] = np.nan
+                grey = shown.get(number + step)
+                if number in chosen and grey is not None and change(grey).shape == grey.shape:
+                    values[self.rows[number]] = self._at_detections(number, change(grey))
             scores = self.agreements(values)
             fit = [scores[number] for number in chosen if number in scores]
             if fit and np.median(fit) > AGREE:
                 return f"; {reason}"
         return ""
 
-    def _changed(self, shown: Grey | None, change: Callable[[Grey], Grey]) -> Grey | None:
-        found = None if shown is None else np.ascontiguousarray(change(shown))
-        return None if found is None or shown is None or found.shape != shown.shape else found
 
-    def _detail(self, number: int) -> Grey | None:
-        frame = frame_there(self.scene, number) if 0 <= number < len(self.rows) else None
-        return (
-            None if frame is None else np.asarray(cv2.blur(detail(frame.rgb), (3, 3)), np.float32)
-        )
-
-
-def _points_of_depth(scene: Scene) -> SparsePoints | None:
+def _points_of_depth(scene: Scene) -> SparsePoints:
     """Places with detail that depth of a few views gives, and where some after them show these."""
     numbers = [number for number, view in enumerate(scene.views) if view.has_depth]
     load = cache(partial(frame_there, scene))
     places, count = [np.zeros((0, 3))], 0
-    tracks = list[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]]()
+    tracks = [(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)))]
     last = len(numbers) - 1
     for at in sorted({*np.linspace(0, last, min(DEPTH_PROBES, last + 1)).astype(int).tolist()}):
         frame, camera = load(numbers[at]), scene.views[numbers[at]].camera
@@ -282,8 +258,6 @@ def _points_of_depth(scene: Scene) -> SparsePoints | None:
             rows = np.flatnonzero(inside & (np.abs(frame.depth[y, x] - z) < SAME_PLACE * z))
             tracks.append((count + rows, np.full(len(rows), other), xy[rows]))
         count += len(places[-1])
-    if not tracks:
-        return None
     point, view, xy = (np.concatenate(part) for part in zip(*tracks, strict=True))
     colors, errors = np.zeros((count, 3), np.uint8), np.zeros(count, np.float32)
     point, view = point.astype(np.int32), view.astype(np.int32)
@@ -303,6 +277,11 @@ def _detailed(
     return rows[chosen], columns[chosen]
 
 
+def _shown(rgb: NDArray[np.uint8]) -> Grey:
+    """(H, W) detail, as it is compared: of three by three pixels."""
+    return np.asarray(cv2.blur(detail(rgb), (3, 3)), np.float32)
+
+
 def detail(rgb: NDArray[np.uint8]) -> Grey:
     """(H, W) luminance without what varies slowly."""
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
@@ -318,11 +297,7 @@ def detail(rgb: NDArray[np.uint8]) -> Grey:
 def probed(scene: Scene, names: Sequence[str]) -> list[Finding]:
     """The findings of a few views among ``names`` that have most tracks in common."""
     check = PixelCheck(scene)
-    if check.points is None:
-        return []
     numbers = [number for number, view in enumerate(scene.views) if view.name in set(names)]
-    if not numbers:
-        return []
     check.kept = dict.fromkeys(check.most_in_common(numbers), np.zeros((0, 0), np.int8))
     for number in check.kept:
         check.see(number, scene.views[number].load().rgb)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from gvtools.cameras import invert_rigid
 from gvtools.features import Features, SiftMatcher
 from gvtools.scenes.calibration import OPENCV_FROM_OPENGL
-from gvtools.scenes.depth_contradictions import frame_there
+from gvtools.scenes.depth_contradictions import climbed, frame_there
 from gvtools.scenes.scene import Finding, Scene
 from gvtools.trajectory_files import reordered
 
@@ -36,7 +37,7 @@ JUDGED = 120
 # by these steps. Where the best change is large and makes nearly all matches fit, of cropped
 # pictures and wrong distortion, without it less than a share of that does; on real scenes it is
 # 0.98, of a tracker's poses 0.85 with changes of less than 0.08.
-LONGER, STEPS_OF_LENS, TRIED, GAIN = (0.7, 0.8, 0.9, 1.1, 1.25, 1.45), (0.16, 0.08, 0.04), 6, 0.005
+LONGER, STEPS_OF_LENS, GAIN = (0.7, 0.8, 0.9, 1.1, 1.25, 1.45), (0.16, 0.08, 0.04), 0.005
 FITS, BENT, LARGE = 0.9, 0.82, 0.1
 # Views farther apart are not looked at where a pair moves by this share.
 ENOUGH = 0.08
@@ -156,15 +157,8 @@ def pose_contradiction(
         return None
     now = share()
     starts = [NO_CHANGE, *(np.array([times - 1, 0]) for times in LONGER)]
-    scores = [share(lens=start) for start in starts]
-    best, lens = max(scores), starts[int(np.argmax(scores))]
-    for step in STEPS_OF_LENS:
-        for _ in range(TRIED):
-            others = [lens + way * step for unit in np.eye(len(lens)) for way in (unit, -unit)]
-            scores = [share(lens=other) for other in others]
-            if max(scores) < best + GAIN:
-                break
-            best, lens = max(scores), others[int(np.argmax(scores))]
+    nearest = max(starts, key=lambda start: share(lens=start))
+    best, lens = climbed(partial(share, np.asarray), nearest, STEPS_OF_LENS, gain=GAIN)
     if now >= WRONG and (best < FITS or now >= BENT * best or np.abs(lens).max() < LARGE):
         return None
     way = f"focal lengths {lens[0]:+.0%}, k1 {lens[1]:+.2f}"

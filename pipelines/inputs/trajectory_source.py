@@ -4,22 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import replace
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from gvtools.cameras import invert_rigid
 from gvtools.errors import DegenerateError, OptionError, ProjectError
+from gvtools.evaluation.conventions import EXPLAINED, FEW, NOTABLE
+from gvtools.evaluation.trajectories import Rows, absolute_errors, by_index, by_name, by_time
+from gvtools.scenes.colmap_model import find_model, load_model
+from gvtools.scenes.layout import holds_views, is_address
+from gvtools.scenes.matching import times_in
+from gvtools.scenes.scene import natural_key
+from gvtools.trajectory_files import Trajectory, in_time, read_poses
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from gvtools.evaluation.trajectories import Rows
-    from gvtools.trajectory_files import Trajectory
-
+Float64 = NDArray[np.float64]
+# Rows of two lists of times that belong together.
+Match = Callable[[Float64, Float64], tuple[Rows, Rows]]
 # Share of the time between poses from which pairs that differ by it may be of other moments.
 FAR = 0.25
 # Of poses in the time that both cover, the share that has to find a partner unless it is said; and
@@ -34,10 +38,6 @@ def open_trajectory(path: Path, *, layout: str = "auto", root: Path | None = Non
     pictures need not be there), a transforms.json or posed RGB-D folder, spec:NAME:SCENE (below
     ``root``), or a run, whose poses are those of the views in its memory.
     """
-    from gvtools.scenes.matching import times_in
-    from gvtools.scenes.scene import natural_key
-    from gvtools.trajectory_files import Trajectory, in_time
-
     track = _opened(path, layout, root)
     if not track.names:
         return in_time(track)
@@ -50,12 +50,9 @@ def open_trajectory(path: Path, *, layout: str = "auto", root: Path | None = Non
 
 def _opened(path: Path, layout: str, root: Path | None) -> Trajectory:
     """The poses as they stand in a file or project."""
-    from gvtools.scenes.colmap_model import find_model
-    from gvtools.scenes.data_sets.catalogue import open_address
-    from gvtools.scenes.layout import holds_views, is_address
-    from gvtools.trajectory_files import Trajectory, read_poses
-
     if is_address(path):
+        from gvtools.scenes.data_sets.catalogue import open_address
+
         scene = open_address(path, root)
         return Trajectory(scene.cameras.world_from_cam, scene.names)
     if not path.exists():
@@ -68,18 +65,14 @@ def _opened(path: Path, layout: str, root: Path | None) -> Trajectory:
         views = load_memory(path).views
         cameras = views.cameras
         # A scan's stations are no poses of a camera.
-        cameras = None if cameras is None else cameras[np.flatnonzero(~views.scanned).tolist()]
-        if cameras is None or not len(cameras):
+        if cameras is None or views.scanned.all():
             raise ProjectError(f"{path}: a memory without views; expected at least one")
         # A view that was fused twice is one pose.
-        first = {name: row for row, name in reversed(list(enumerate(cameras.names)))}
+        first = {cameras.names[row]: row for row in np.flatnonzero(~views.scanned)[::-1].tolist()}
         cameras = cameras[sorted(first.values())]
         return Trajectory(cameras.world_from_cam, cameras.names)
     model = find_model(path) if path.is_dir() else None
     if model is not None:
-        from gvtools.cameras import invert_rigid
-        from gvtools.scenes.colmap_model import load_model
-
         images = load_model(model, faces=True).images
         poses = invert_rigid(np.array([image.cam_from_world for image in images]))
         return Trajectory(poses, tuple(image.name for image in images))
@@ -105,8 +98,6 @@ def associate(
         max_difference: of times that belong together, seconds.
         offset: added to the estimate's times, seconds.
     """
-    from gvtools.evaluation.trajectories import by_index, by_name, by_time
-
     timed = [track.stamps is not None for track in (reference, estimate)]
     named = [bool(track.names) for track in (reference, estimate)]
     doubts: tuple[str, ...] = ()
@@ -127,37 +118,37 @@ def associate(
         return (*by_name(reference.names, estimate.names), how, doubts)
     if reference.stamps is None or estimate.stamps is None:
         raise OptionError("association by time: a trajectory has no times; use name or index")
-    times = estimate.stamps
+    at, times = reference.stamps, estimate.stamps
     match = partial(by_time, max_difference=max_difference, offset=offset)
-    if found := _other_unit(reference.stamps, times, match):
+    if found := _other_unit(at, times, match):
         times = times * found[0]
         how += f" (the estimate's stamps are {found[1]} of the reference's)"
-    first, second = match(reference.stamps, times)
-    gap = float(np.median(np.abs(reference.stamps[first] - times[second] - offset)))
-    steps = [np.median(np.diff(stamps)) for stamps in (reference.stamps, times) if len(stamps) > 1]
+    first, second = match(at, times)
+    gap = float(np.median(np.abs(at[first] - times[second] - offset)))
+    steps = [np.median(np.diff(stamps)) for stamps in (at, times) if len(stamps) > 1]
     if gap > FAR * max(steps, default=np.inf):
         doubts = (
             f"times of pairs differ by {gap:.3g} s (median), and poses are {max(steps):.3g} s "
             "apart: other moments may be paired; give an offset or a smaller largest difference",
         )
-    moved = replace(estimate, stamps=times + offset)
-    doubts = doubts or _other_rate((reference, moved), (first, second), partial(match, offset=0.0))
+    else:
+        poses, again = (reference.poses, estimate.poses), partial(match, offset=0.0)
+        doubts = _other_rate(poses, (at, times + offset), rows=(first, second), match=again)
     return first, second, how, doubts
 
 
 def _other_rate(
-    tracks: tuple[Trajectory, Trajectory], rows: tuple[Rows, Rows], match: Callable[..., Any]
+    poses: tuple[Float64, Float64],
+    stamps: tuple[Float64, Float64],
+    *,
+    rows: tuple[Rows, Rows],
+    match: Match,
 ) -> tuple[str, ...]:
     """What is said where few find a partner, or a clock of another rate would mend the errors."""
-    from gvtools.evaluation.conventions import EXPLAINED, FEW, NOTABLE
-    from gvtools.evaluation.trajectories import absolute_errors
-
-    reference, estimate = tracks
-    assert reference.stamps is not None and estimate.stamps is not None
-    at, times = reference.stamps, estimate.stamps
+    at, times = stamps
 
     def error(first: Rows, second: Rows) -> float:
-        pair = reference.poses[first], estimate.poses[second]
+        pair = poses[0][first], poses[1][second]
         found = absolute_errors(*pair, refuse_mirrored=False).translation_share
         return np.inf if found is None else found.rmse
 
@@ -187,18 +178,16 @@ def _other_rate(
     )
 
 
-def _other_unit(
-    reference: NDArray[np.float64], estimate: NDArray[np.float64], match: Callable[..., Any]
-) -> tuple[float, str] | None:
+def _other_unit(at: Float64, times: Float64, match: Match) -> tuple[float, str] | None:
     """The factor under which most times find partners, where without it hardly any does."""
 
     def pairs(factor: float) -> int:
         try:
-            return len(match(reference, estimate * factor)[0])
+            return len(match(at, times * factor)[0])
         except DegenerateError:
             return 0
 
-    as_given, least = pairs(1), max(3, min(len(reference), len(estimate)) / 2)
+    as_given, least = pairs(1), max(3, min(len(at), len(times)) / 2)
     names = {1e-3: "thousandths", 1e-6: "millionths", 1e-9: "billionths"}
     names |= {10.0**n: f"10^{n} fold" for n in (3, 6, 9)}
     for factor, name in names.items():

@@ -46,13 +46,10 @@ OPAQUE = 0.5
 # distance is not drawn.
 LEAST_GAIN, LOOKED_AT, SIDE, NEAR = 2.0, 5, 160, 0.02
 # Where splats may lie: where converters leave the axes of SPZ (right, up, back) or glTF, too.
-AXES = tuple(
-    Placement(np.diag([*signs, 1.0]), how)
-    for signs, how in (
-        ((1, 1, 1), "as it is"),
-        ((1, -1, -1), "turned half around x"),
-        ((-1, -1, 1), "turned half around z"),
-    )
+AXES = (
+    Placement(np.eye(4), "as it is"),
+    Placement(np.diag([1.0, -1.0, -1.0, 1.0]), "turned half around x"),
+    Placement(np.diag([-1.0, -1.0, 1.0, 1.0]), "turned half around z"),
 )
 # The smallest fitness of a placement of splats that photographs may decide on.
 LEAST_SUPPORT = 0.25

@@ -411,10 +411,9 @@ def photographed(plan: Plan) -> Surface:
         row, column = np.nonzero(usable)
         picked = rng.permutation(len(row))[:PIXELS]
         row, column = row[picked], column[picked]
-        pixels = np.stack([column + 0.5, row + 0.5, np.ones(len(row))], axis=1)
-        rays = pixels @ np.linalg.inv(view.camera.K[0]).T
+        local = view.camera.rays()[row, column] * frame.depth[row, column, None]
         pose = view.camera.world_from_cam[0]
-        positions.append((rays * frame.depth[row, column, None]) @ pose[:3, :3].T + pose[:3, 3])
+        positions.append(local @ pose[:3, :3].T + pose[:3, 3])
         seen_from.append(np.broadcast_to(pose[:3, 3], positions[-1].shape))
     if positions:
         return Surface(np.concatenate(positions), np.concatenate(seen_from))
@@ -462,14 +461,9 @@ def tuned(plan: Plan, cache: DepthCache, directory: RunDirectory, *, console: Co
     if record is None:
         console.line(f"tuning {weights} to the context, {config.tune.length}")
         record = tune(
-            scene,
-            weights,
-            out,
-            options=config.tune,
-            completer=options,
-            seed=config.seed,
+            scene, weights, out, options=config.tune, completer=options, seed=config.seed,
             say=console.line,
-        ).to_dict()
+        ).to_dict()  # fmt: skip
     else:
         console.line(f"weights tuned before: {out}")
     directory.add_to_record(TUNING, {name: record[name] for name in record if name != "inputs"})

@@ -236,13 +236,9 @@ def open_method(
     pictures = _run_pictures(path) if (path / RECORD).is_file() else open_pictures(path)
     views = [target.picture.name for target in targets]
     matching = match_pictures(
-        pictures.names,
-        views,
-        others=others,
-        rule=rule,
+        pictures.names, views, others=others, rule=rule, what=str(path),
         alphabetical=pictures.alphabetical,
-        what=str(path),
-    )
+    )  # fmt: skip
     matched, resized, opaque = [], dict[tuple[int, int], int](), list[float]()
     for target, number in zip(targets, matching.picture_of, strict=True):
         if number is None:

@@ -239,12 +239,9 @@ class Denoiser(Recomputing):
         self.s_projector = nn.Linear(width, head_width)
         self.t_embedder = TimeEmbed(width, config.frequencies)
         self.camera_embedder = PatchEmbed(CAMERA_CHANNELS, width, config.camera_patch)
-        self.blocks = nn.ModuleList(
-            DenoiserBlock(width, config.heads, config.mlp_ratio)
-            if index < config.depth
-            else DenoiserBlock(head_width, config.head_heads, config.mlp_ratio)
-            for index in range(config.depth + config.head_depth)
-        )
+        sizes = [(width, config.heads)] * config.depth
+        sizes += [(head_width, config.head_heads)] * config.head_depth
+        self.blocks = nn.ModuleList(DenoiserBlock(*size, config.mlp_ratio) for size in sizes)
         self.final_layer = FinalLayer(head_width, config.channels)
         if config.depth_condition:
             self.depth_embedder = PatchEmbed(DEPTH_CHANNELS, width, config.camera_patch)

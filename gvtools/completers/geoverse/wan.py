@@ -87,8 +87,7 @@ class WanNetworks:
     @property
     def device(self) -> torch.device:
         """Where the weights are."""
-        device: torch.device = self.transformer.patch_embedding.weight.device
-        return device
+        return torch.device(self.transformer.patch_embedding.weight.device)
 
     @property
     def dtype(self) -> torch.dtype:
@@ -150,8 +149,7 @@ class WanNetworks:
             constant(self.vae.config[name], latents).view(-1, 1, 1, 1)
             for name in ("latents_mean", "latents_std")
         )
-        normalised: Tensor = (latents - mean) / deviation
-        return normalised
+        return torch.sub(latents, mean) / deviation
 
     def _still(self, clips: Tensor) -> Tensor:
         """The mode for clips of one frame: of every kernel in time, the last tap alone sees it."""
