@@ -337,11 +337,9 @@ def _views(frame: PosedFrame, sieve: _Sieve) -> tuple[Undistortion, ...]:
 def first_size(pictures: Iterable[Path]) -> tuple[int, int] | None:
     """Width and height of the first picture that can be read, pixels; None where none can."""
     for path in pictures:
-        try:
+        with suppress(ProjectError):
             header = read_header(path)
-        except ProjectError:
-            continue
-        return header.width, header.height
+            return header.width, header.height
     return None
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +20,7 @@ from gvtools.runs.poses import RunPoses, posed, with_poses
 from gvtools.scenes.matching import natural
 from gvtools.scenes.pixel_contradictions import COLORED, SWAPPED
 from gvtools.scenes.resized import reduced
-from gvtools.scenes.scene import Frame, Scene
+from gvtools.scenes.scene import Frame, Scene, View
 from gvtools.scenes.selection import select
 from gvtools.view_selection import evenly_spread
 from pipelines.console import Console
@@ -99,9 +100,8 @@ def make_plan(
         chosen = replace(again, ignored=chosen.ignored)
     if config.voxel is None:
         config = _with_voxel(config, at_poses, context, source=chosen.source, say=say)
-    if (config.refine.seconds, config.refine.steps) == (None, None) and not validation_rows(
-        len(context)
-    ):
+    open_end = config.refine.seconds is None and config.refine.steps is None
+    if open_end and not validation_rows(len(context)):
         config = config.replaced(refine=config.refine.replaced(seconds=UNVALIDATED_SECONDS))
     schedule = make_schedule(
         len(targets.cameras), config.views_per_round, config.rounds,
@@ -119,10 +119,8 @@ def _check(scene: Scene, config: RunSettings) -> None:
     """Refuse a project with errors, and a protocol that its completer does not have."""
     errors = [finding.message for finding in scene.findings if finding.level == "error"]
     if errors:
-        raise ProjectError(
-            f"{scene.root}: {errors[0]}"
-            + (f" (and {len(errors) - 1} more; see 'gvtools check')" if len(errors) > 1 else "")
-        )
+        more = f" (and {len(errors) - 1} more; see 'gvtools check')" if len(errors) > 1 else ""
+        raise ProjectError(f"{scene.root}: {errors[0]}{more}")
     if config.protocol == "paper" and config.completer != "geoverse":
         raise OptionError(
             f"protocol paper with completer {config.completer!r}; expected geoverse; leave one out"
@@ -474,15 +472,10 @@ def tuned(plan: Plan, cache: DepthCache, directory: RunDirectory, *, console: Co
 def with_depth(scene: Scene, names: Sequence[str], cache: DepthCache) -> Scene:
     """The context alone, its views with the depth that a run gives them."""
 
-    def loader(name: str) -> Callable[[], Frame]:
-        def load() -> Frame:
-            frame = scene[name].load()
-            return replace(frame, depth=cache.depth(scene[name], frame).depth)
+    def load(view: View) -> Frame:
+        frame = view.load()
+        return replace(frame, depth=cache.depth(view, frame).depth)
 
-        return load
-
-    views = [
-        replace(scene[name], load=loader(name), has_depth=cache.covers(scene[name]))
-        for name in names
-    ]
-    return replace(scene, views=tuple(views), points=None)
+    views = (scene[name] for name in names)
+    known = [replace(v, load=partial(load, v), has_depth=cache.covers(v)) for v in views]
+    return replace(scene, views=tuple(known), points=None)

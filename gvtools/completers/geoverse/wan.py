@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -214,12 +214,10 @@ class Visits:
         """Begin to copy a block's weights."""
         home = [tensor.data for tensor in _tensors(self.blocks[turn])]
         self.coming = [torch.empty_like(data, device=self.device) for data in home]
-        copying: AbstractContextManager[Any] = nullcontext()
         if self.aside is not None:
             # An earlier block, whose memory this may be, has to be done with it.
             self.aside.wait_stream(torch.cuda.current_stream(self.device))
-            copying = torch.cuda.stream(self.aside)
-        with copying:
+        with torch.cuda.stream(self.aside):  # None: no other one
             for copy, data in zip(self.coming, home, strict=True):
                 copy.copy_(data, non_blocking=True)
 
