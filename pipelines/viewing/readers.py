@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import unquote
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,7 @@ from gvtools.glb import GLB, GLTF_ENDS, glb_array, join_glb, read_gltf, split_gl
 from gvtools.optional import require
 from gvtools.ply import read_header
 from gvtools.sandbox import ReaderError, read_apart
+from gvtools.scenes.images import IMAGE_SUFFIXES
 from gvtools.splat_files import USD, glb_axes, told_by
 from gvtools.untrusted import PIXEL_BYTES, PIXEL_RATIO, read_bytes, read_text
 
@@ -46,14 +48,18 @@ def load_mesh(path: Path) -> trimesh.Trimesh | trimesh.PointCloud:
     if data.startswith(b"ply"):
         read_header(path)
     place: Any = path
-    back, size = np.eye(3), len(data)
+    back, size, absent = np.eye(3), len(data), list[str]()
     if data.startswith(GLB):
         place, kind = io.BytesIO(_checked_glb(path, data)), "glb"
         _, back = glb_axes(split_glb(data)[0])
     del data
     with _small_pictures(size):
-        scene = trimesh.load_scene(place, process=False, resolver=_beside(path), file_type=kind)
+        beside = _beside(path, absent)
+        scene = trimesh.load_scene(place, process=False, resolver=beside, file_type=kind)
         loaded: Any = scene.to_geometry()
+    pictures = [name for name in absent if name.lower().endswith(IMAGE_SUFFIXES)]
+    if pictures and loaded.visual.kind != "vertex":
+        raise MemoryFileError(f"{path}: its picture {pictures[0]!r} is absent; copy it beside it")
     loaded.apply_transform(rigid_poses(back))
     whole = isinstance(loaded, trimesh.PointCloud)
     if isinstance(loaded, trimesh.Trimesh) and len(loaded.faces):
@@ -82,14 +88,19 @@ def told_up(path: Path) -> NDArray[np.float64] | None:
     return told_by(comments).get("up")
 
 
-def _beside(path: Path) -> Any:
-    """What reads files that ``path`` names: such as lie below its folder, and no pipes."""
+def _beside(path: Path, absent: list[str]) -> Any:
+    """What reads files that ``path`` names below its folder, no pipes; ``absent`` gets others."""
     from PIL import Image
     from trimesh.resolvers import FilePathResolver
 
     class Beside(FilePathResolver):
         def get(self, name: str) -> bytes:
-            data = read_bytes(self.absolute(name))
+            try:
+                file = Path(self.absolute(name))
+                data = read_bytes(file if file.is_file() else Path(self.absolute(unquote(name))))
+            except OSError:
+                absent.append(name)  # trimesh goes on without it
+                raise
             # A texture in a file of its own may have the pixels that this file explains.
             Image.MAX_IMAGE_PIXELS = max(Image.MAX_IMAGE_PIXELS or 0, _most_pixels(len(data)))
             return data

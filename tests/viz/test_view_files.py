@@ -243,9 +243,11 @@ f 1/1 2/2 3/3
 def test_a_texture_is_measured_by_its_own_file(tmp_path, monkeypatch):
     monkeypatch.setattr(readers, "PIXEL_BYTES", 0)
     noise = np.random.default_rng(0).integers(0, 255, (256, 256, 3), np.uint8)
-    Image.fromarray(noise).save(tmp_path / "t.png")
-    (tmp_path / "m.mtl").write_text("newmtl a\nmap_Kd t.png\n")
+    (tmp_path / "m.mtl").write_text("newmtl a\nmap_Kd t%201.png\n")
     (tmp_path / "m.obj").write_text(TRIANGLE)
+    with pytest.raises(MemoryFileError, match=r"its picture 't%201.png' is absent"):
+        readers.load_mesh(tmp_path / "m.obj")
+    Image.fromarray(noise).save(tmp_path / "t 1.png")
     before = Image.MAX_IMAGE_PIXELS
     mesh: Any = readers.load_mesh(tmp_path / "m.obj")
     assert mesh.visual.material.image.size == (256, 256)
