@@ -48,6 +48,9 @@ GIVE = "give the pictures that the poses were computed from"
 # Views whose depth is taken, those so many places after each that it is compared with, pixels of
 # each; how far depth around one may differ, and two views' depth of one place.
 DEPTH_PROBES, DEPTH_GAPS, DEPTH_PIXELS, SMOOTH, SAME_PLACE = 5, (0, 1, 2, 4), 400, 1.05, 0.02
+# Only views that stand within this share of the depth and look almost the same way (cosine) tell: a
+# tracker's poses drift, so that right ones farther apart correlate by 0.1 to 0.6. So many tell.
+STAND, LOOK, ROUGH = 0.15, 0.9, 3
 # Views that a run looks at, and that a reason is sought for.
 PROBES, TRIED = 8, 16
 # How all detections may be moved: right and down in longer sides, from the middle in shares of the
@@ -182,7 +185,7 @@ class PixelCheck:
         """A warning where photographs and detections disagree."""
         judged = self.agreements()
         wrong = [n for n, s in judged.items() if s < AGREE]
-        if self.rough and np.median([*judged.values()] or [1]) >= AGREE:
+        if self.rough and (len(judged) < ROUGH or np.median([*judged.values()]) >= AGREE):
             return []
         # Depth of a wrong unit says of no place where it is.
         if self.rough and wrong and unit_findings(self.scene):
@@ -249,8 +252,11 @@ def _points_of_depth(scene: Scene) -> SparsePoints:
         local = (frame.depth[..., None] * camera.rays())[y, x]
         places.append(local @ pose[:3, :3].T + pose[:3, 3])
         for other in (numbers[at + gap] for gap in DEPTH_GAPS if at + gap < len(numbers)):
-            frame = load(other)
+            frame, there = load(other), scene.views[other].camera.world_from_cam[0]
             if frame is None or frame.depth is None:
+                continue
+            moved = np.linalg.norm(there[:3, 3] - pose[:3, 3])
+            if moved > STAND * np.median([*local[:, 2], 0]) or there[:3, 2] @ pose[:3, 2] < LOOK:
                 continue
             (xy,), (z,) = scene.views[other].camera.project(places[-1])
             inside = (z > 0) & (xy >= 0).all(1) & (xy < frame.depth.shape[::-1]).all(1)

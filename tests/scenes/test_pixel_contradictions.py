@@ -116,6 +116,18 @@ def test_depth_tells_where_there_are_no_tracks(room, wall_walk):
         assert all("same places by depth" in line for line in said(scene))
 
 
+def test_depth_of_views_far_apart_whose_poses_drift_tells_nothing(room, wall_walk):
+    views = []
+    for number in (0, 4, 8):
+        seen = wall_walk[number]
+        pose = seen.camera.cam_from_world.copy()
+        pose[0, :3, 3] += (0.02 * number, -0.015 * number, 0)
+        camera = replace(seen.camera, cam_from_world=pose)
+        frame = Frame(seen.rgb, seen.depth.astype(np.float32))
+        views.append(View(seen.name, camera, partial(lambda frame: frame, frame), has_depth=True))
+    assert not said(replace(room, views=tuple(views), points=None))
+
+
 def test_two_swapped_pictures_are_named_alone(room):
     rgb = [view.load().rgb for view in room]
     rgb[0], rgb[7] = rgb[7], rgb[0]
