@@ -160,10 +160,13 @@ class _Reading:
             "positions": positions - self.origin,
             "station": np.full(count, chunk.station, np.int32),
             # 1 where they are known.
-            "with_color": np.full(count, colors is not None),
-            "colors": np.zeros((count, 3), np.uint8) if colors is None else colors[usable],
+            "with_color": np.zeros(count, np.bool_),
+            "colors": np.zeros((count, 3), np.uint8),
             "intensity": np.zeros(count, np.float32) if intensity is None else intensity[usable],
         }
+        if colors is not None:
+            part["colors"] = colors[usable]
+            part["with_color"] = np.isfinite(part["colors"]).all(axis=1)
         self._parts.append(part)
         self._held += count
         if self._held > self.most:
@@ -219,4 +222,7 @@ def _colors(held: dict[str, NDArray[Any]]) -> tuple[NDArray[np.uint8], str, str]
         grey = np.full(len(intensity), GREY, np.uint8)
     rgb = rgb.copy()
     rgb[bare] = grey[:, None]
+    if by == "colour":
+        none = f"{bare.mean():.2%} of the points have no colour: grey"
+        said = f"{said}, {none}" if said else none
     return rgb, by, said
