@@ -15,6 +15,8 @@ Reading = Callable[[Picture], Picture]
 
 # A reading explains pictures where it leaves at most this share of their squared errors (3 dB).
 EXPLAINED = 0.5
+# Channels of grey pictures differ by less on average, of 255.
+GREY = 2
 # Motion is fitted to pictures of this width, in at most so many steps or up to this change.
 WIDTH, STEPS, CHANGE = 400, 60, 1e-5
 
@@ -22,8 +24,8 @@ WIDTH, STEPS, CHANGE = 400, 60, 1e-5
 def better_reading(pictures: Sequence[NDArray[np.uint8]], truths: Sequence[Frame]) -> str:
     """How pictures seem to be, other than they should be, all in one way; "" if nothing explains.
 
-    Tried are mirrored and turned pictures, exchanged channels, linear light, one factor and offset
-    of brightness, and one motion (shift, size, turn) in the picture.
+    Tried are mirrored and turned pictures, exchanged channels, negatives, linear light, one factor
+    and offset of brightness, and one motion (shift, size, turn) in the picture.
 
     >>> truth = np.random.default_rng(0).integers(0, 255, (32, 32, 3), np.uint8)
     >>> better_reading([truth[::-1]], [Frame(truth)])[:48]
@@ -54,7 +56,9 @@ def better_reading(pictures: Sequence[NDArray[np.uint8]], truths: Sequence[Frame
     best = min(left, key=left.__getitem__, default="")
     # Of pictures that do not show their truths at all, none.
     if not best or left[best] > EXPLAINED or left[best] * np.median(given) > EXPLAINED * spread**2:
-        return ""
+        vivid = [[np.ptp(x, axis=2).mean() for x in pair[:2]] for pair in pairs]
+        grey = pairs and 5 * max(own for own, _ in vivid) < 5 * GREY < np.median(vivid, axis=0)[1]
+        return "grey, where their views have colour" if grey else ""
     before, after = (-10 * np.log10(np.median(e) / 255**2) for e in (given, errors(readings[best])))
     return f"{best}: otherwise PSNR would be {min(after, 100):.1f} dB instead of {before:.1f}"
 
@@ -64,6 +68,7 @@ FIXED: dict[str, Reading] = {
     "upside down": lambda picture: picture[::-1],
     "turned by 180 degrees": lambda picture: picture[::-1, ::-1],
     "of red and blue exchanged": lambda picture: picture[..., ::-1],
+    "negatives": lambda picture: 255 - picture,
     "in linear light, without the curve of sRGB": lambda picture: srgb_bytes(picture / 255).astype(
         np.float32
     ),

@@ -39,6 +39,8 @@ def enlarged(rgb: np.ndarray) -> np.ndarray:
         (lambda rgb: rgb[::-1], "upside down"),
         (lambda rgb: rgb[::-1, ::-1], "turned by 180"),
         (lambda rgb: rgb[..., ::-1], "red and blue"),
+        (lambda rgb: 255 - rgb, "negatives"),
+        (lambda rgb: rgb[..., :1].repeat(3, 2), "grey, where"),
         (linear, "linear light"),
         (lambda rgb: 16 + rgb * (219 / 255), "another brightness"),
         (lambda rgb: np.roll(rgb, (2, 3), (0, 1)), "shifted (3"),
