@@ -125,6 +125,12 @@ def _other_turn(first: Float64, second: Float64, found: PoseErrors, *, align: st
             f"about their axis {axis} all along: other axes of the camera (OpenGL's), or another "
             "sensor's poses; figures of rotation, RPE and AUC hold this turn"
         ]
+    inverted = min(left(given.inv(), true), left(given, true.inv()))
+    if inverted < EXPLAINED * turned:
+        return [
+            "one file's rotations seem to map the other way (from world to camera, beside centres "
+            f"in the world): inverted, they are off by {inverted:.4g} degrees, not {turned:.4g}"
+        ]
     estimates, references = (
         [Rotation.from_quat(turns.as_quat()[:, order]) for order in ([1, 2, 3, 0], [3, 0, 1, 2])]
         for turns in (given, true)

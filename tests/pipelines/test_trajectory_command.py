@@ -322,6 +322,12 @@ def other_order(poses: np.ndarray) -> np.ndarray:
     return poses
 
 
+def inverted_turns(poses: np.ndarray) -> np.ndarray:
+    poses = poses.copy()
+    poses[:, :3, :3] = poses[:, :3, :3].transpose(0, 2, 1)
+    return poses
+
+
 @pytest.mark.parametrize(
     ("which", "swapped", "frame"),
     [
@@ -346,6 +352,7 @@ def test_the_other_order_of_quaternions_is_told_of_either_file(tmp_path, which, 
         (mounted, "se3", "another sensor"),
         (lambda poses: moved(poses, scale=1000), "se3", "times 0.001"),
         (other_order, "none", "other order"),
+        (inverted_turns, "se3", "rotations seem to map the other way"),
         (lambda poses: np.roll(poses, -5, axis=0), "se3", "belong 5 places later"),
         (lost, "se3", "5 poses of the estimate are exactly one"),
         (lambda poses: moved(poses, scale=1000), "sim3", ""),
