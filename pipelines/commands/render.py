@@ -26,6 +26,10 @@ if TYPE_CHECKING:
     from pipelines.console import Console
 
 
+# What a memory knows is more like its own scene's pictures than this [dB].
+OTHER_SCENE = 11
+
+
 class RenderCommand(LensArguments, LpipsArguments, SceneArguments):
     """Project a saved memory into cameras, and measure it against their pictures."""
 
@@ -99,6 +103,11 @@ class RenderCommand(LensArguments, LpipsArguments, SceneArguments):
             if rig is not None:
                 views[-1]["coverage"] = float(guidance.valid[0][rig.inside].mean())
         figures = rendering.summary(views, compared=self.against_images, no_lpips=no_lpips)
+        if (figures["psnr_valid"] or OTHER_SCENE) < OTHER_SCENE:
+            console.warn(
+                f"what {self.memory} knows is as far from the pictures of {self.cameras} "
+                f"({figures['psnr_valid']:.1f} dB) as another scene; give the run's own project"
+            )
         if poses:
             figures["poses"] = poses
         if self.json_ is not None:

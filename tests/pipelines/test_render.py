@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 
 import cv2
 import numpy as np
@@ -115,6 +116,16 @@ def test_generated_pixels_have_their_own_figures(box, tmp_path):
     # The view's own pixels, averaged in voxels of about two of them.
     assert data["psnr_generated"] > 20
     assert data["depth_rel_generated"] < 0.01
+
+
+def test_pictures_of_another_scene_are_warned_of(box, tmp_path, capsys):
+    for negative in (False, True):
+        project = shutil.copytree(box / "project", tmp_path / f"{negative}")
+        for file in project.rglob("view_*.png"):
+            picture = cv2.imread(str(file))
+            cv2.imwrite(str(file), 255 - picture if negative else picture)
+        run(box / "run", "--cameras", project, "--views", "first:2", "--against-images")
+        assert ("as another scene" in capsys.readouterr().err) == negative
 
 
 def test_without_comparing_the_figures_are_null_with_a_reason(box, tmp_path):
