@@ -54,11 +54,13 @@ STAND, LOOK, ROUGH = 0.15, 0.9, 3
 # Views that a run looks at, and that a reason is sought for.
 PROBES, TRIED = 8, 16
 # How all detections may be moved: right and down in longer sides, from the middle in shares of the
-# radius, and of it by its square, by these steps. On four real scenes no step gains more than
-# 0.001; pictures shifted by a hundredth, cropped by 1.5 % or undistorted twice gain 0.03 and more.
+# radius, of it by its square, of the width alone, and about the middle [radians], by these steps.
+# On four real scenes no step gains more than 0.001; pictures shifted by a hundredth, cropped by
+# 1.5 % or undistorted twice gain 0.03 and more.
 _SIDE = "by {:+.1%} of the longer side"
 MOVES = (f"shifted right {_SIDE}", f"shifted down {_SIDE}", "scaled by {:+.1%}",
-         "bent by {:+.1%} in the corners")  # fmt: skip
+         "bent by {:+.1%} in the corners", "wider by {:+.1%}",
+         "turned by {:+.3f} radians")  # fmt: skip
 MOVED_BY, GAIN, FITS = (0.04, 0.02, 0.01, 0.005, 0.0025), 0.02, 0.92
 # By so many pixels on average, in so many views with so many detections each in common with others.
 PIXELS, FEWEST, ENOUGH = 2.0, 4, 80
@@ -120,6 +122,7 @@ class PixelCheck:
         middle = np.array([width, height]) / 2
         off = self.points.xy[self.rows[number]] - middle
         radius = np.linalg.norm(off, axis=1, keepdims=True) / np.linalg.norm(middle)
+        off = off * [1 + move[4], 1] + move[5] * off[:, ::-1] * [-1, 1]
         placed = middle + off * (1 + move[2] + move[3] * radius**2) + move[:2] * max(width, height)
         return np.asarray(placed)
 
@@ -194,7 +197,7 @@ class PixelCheck:
         judged |= self.agreements(without=wrong)
         wrong = sorted((n for n in wrong if judged[n] < AGREE), key=lambda n: judged[n])
         findings = list[Finding]()
-        if swapped := [n for n, turned in self.swapped.items() if turned]:
+        if swapped := [n for n, turned in self.swapped.items() if turned and n not in wrong]:
             line = (
                 f"{len(swapped)} of {len(self.swapped)} photographs have red and blue the other "
                 f"way round than the points' colours, first {self.scene.views[swapped[0]].name}: "

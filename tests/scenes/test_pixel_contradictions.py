@@ -73,6 +73,11 @@ def test_pictures_that_are_all_a_little_off_are_said(room):
     assert "shifted right by +3" in line
     (line,) = seen_as(room, [cv2.resize(p[3:-3, 4:-4], (160, 120)) for p in pictures])
     assert "scaled by +" in line
+    (line,) = seen_as(room, [cv2.resize(p[:, 5:-5], (160, 120)) for p in pictures])
+    assert "wider by +6" in line
+    turn = cv2.getRotationMatrix2D((79.5, 59.5), 3, 1)
+    (line,) = seen_as(room, [cv2.warpAffine(p, turn, (160, 120)) for p in pictures])
+    assert "turned by -0.05" in line
 
 
 def test_noisy_detections_of_corners_are_no_displacement(room):
