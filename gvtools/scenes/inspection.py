@@ -389,8 +389,8 @@ def contradiction_findings(
         f"{', '.join(str(pair) for pair in found[:LISTED])}{more}; expected at most "
         f"{DISAGREEING:.0%} of the picture to differ and at least {SHARED:.0%} of the points to be "
         "shared: their poses contradict each other (an object that looks alike from two sides, "
-        "swapped pictures, or something large that moved); look at these pairs, then solve the "
-        "poses again or leave the wrong views out (--context)"
+        "swapped pictures), or something large moved, or light flickers in bands; look at these "
+        "pairs, then solve the poses again or leave the wrong views out (--context)"
     )
     return [Finding("warning", message)]
 
