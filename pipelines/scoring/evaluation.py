@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,8 +24,9 @@ from gvtools.evaluation.splits import protocol_split
 from gvtools.evaluation.statistics import LEVEL, RESAMPLES, mean_interval, mean_known
 from gvtools.files import write_json
 from gvtools.runs.digests import versions
-from gvtools.runs.layout import RECORD
+from gvtools.runs.layout import METRICS, RECORD
 from gvtools.runs.run import Run, load_memory
+from gvtools.untrusted import read_json
 from pipelines.console import Console
 from pipelines.report import nested
 from pipelines.scoring.measurement import (
@@ -48,6 +50,8 @@ if TYPE_CHECKING:
     from gvtools.features import FeatureMatcher
     from gvtools.scenes.scene import Scene
 
+# A target's photograph has changed where its PSNR has by more than this [dB].
+CHANGED = 0.5
 # Context and target views of a round, and rounds.
 PROTOCOLS = {"pass": (2, 6, 1), "long": (2, 6, 3)}
 
@@ -161,7 +165,9 @@ def evaluate_runs(
         console.line(f"{run.path}: {len(run.rounds) - 1} rounds")
         if not run.complete:
             console.warn(f"{run.path}: not every round is done; measured are those that are")
-        return evaluate_run(run, options, matcher=matcher, console=console)
+        evaluation = evaluate_run(run, options, matcher=matcher, console=console)
+        _check_photographs(run, evaluation, console=console)
+        return evaluation
 
     evaluations = [measure(run) for run in runs]
     # Runs of one name are told apart by the folders that they lie in.
@@ -171,6 +177,22 @@ def evaluate_runs(
             folder = Path(evaluation["run"]).resolve()
             evaluation["name"] = f"{folder.parent.name}/{folder.name}"
     return evaluations
+
+
+def _check_photographs(run: Run, evaluation: Mapping[str, Any], *, console: Console) -> None:
+    """Warn of targets whose PSNR was another when the run ended: their photographs have changed."""
+    # A run that is not done has no figures, and damaged ones are said where they are shown.
+    with suppress(OSError, ValueError, TypeError, KeyError):
+        own = {view["name"]: view["psnr"] for view in read_json(run.path / METRICS)["views"]}
+        now = {view["name"]: view["psnr"] for view in evaluation["images"]["views"]}
+        changed = [n for n in now if n in own and now[n] and abs(now[n] - own[n]) > CHANGED]
+        if changed:
+            first = changed[0]
+            console.warn(
+                f"{run.path}: {len(changed)} of {len(now)} target photographs are not those that "
+                f"the run was measured on (first {first}: {own[first]:.1f} dB then, "
+                f"{now[first]:.1f} now); give the project as it was (--project)"
+            )
 
 
 def write_evaluation(

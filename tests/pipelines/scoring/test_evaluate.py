@@ -182,6 +182,11 @@ def test_a_project_that_changed_or_went_is_said(small_scan, tmp_path, capsys):
     assert "no such folder" in refused(capsys, "evaluate", tmp_path / "run", "--quiet")
     words = ["evaluate", str(tmp_path / "run"), "--project", str(tmp_path / "moved"), "--quiet"]
     assert main([*words, "--parts", "images"]) == 0
+    assert "not those" not in capsys.readouterr().err
+    picture = tmp_path / "moved" / "frame-000003.color.png"
+    Image.fromarray(np.asarray(Image.open(picture))[::-1]).save(picture)
+    assert main([*words, "--parts", "images"]) == 0
+    assert "1 of 2 target photographs are not those" in capsys.readouterr().err
 
 
 def test_what_is_beside_published_rows_says_what_it_stands_on(tmp_path):
