@@ -94,6 +94,8 @@ POSE_CHECKS = (0.3, 0.6)
 MOST_GAIN = 0.7
 # Where Gaussians are added, those at least so wide are split, smaller ones are cloned [px].
 WIDE = 2.0
+# A start that was fitted before is judged by so many photographs.
+JUDGES = 10
 # Gaussians in a photograph's free space lose this share of their opacity at each step on it.
 FLOATER_FADE = 0.3
 
@@ -277,6 +279,11 @@ class Fit:
     def psnr_of(self, pictures: Mapping[int, Picture]) -> float:
         """Mean PSNR of rendered pictures against their photographs, by their numbers [dB]."""
         return -float(np.mean([self._error(row, shown) for row, shown in pictures.items()]))
+
+    def shown_psnr(self) -> float:
+        """Mean PSNR of some of the photographs, as the Gaussians show them now [dB]."""
+        rows = range(0, len(self.views), -(-len(self.views) // JUDGES))
+        return self.psnr_of({row: self._picture(row, self.cameras.pose(row)) for row in rows})
 
     def step(self, share: float) -> None:
         """Make one step, on one photograph, at a progress of ``share``."""

@@ -395,8 +395,17 @@ def fit_appearance(plan: Plan, console: Console, *, earlier: Fitted | None = Non
         fit.options = fit.options.replaced(seconds=left)
     if fit.splatter is GsplatSplat:
         console.line("fitting: on the CUDA device, by gsplat")
+    # Splats that are given may be better than what there is time for.
+    given = fit.shown_psnr() if fit.begin and earlier is None else -np.inf
+    exposures = fit.cameras.log_gains.copy()
     with _stopped_by_ctrl_c(fit, console):
         fits: Sequence[Fit] = run_fits(fit, report=_progress(console))
+    if np.isfinite(given) and (found := fit.shown_psnr()) < given:
+        console.line(
+            f"fitting: the given Gaussians are kept: {given:.2f} dB in photographs, {found:.2f} "
+            "after the fit; give more time by --refine"
+        )
+        fit.population.values, fit.cameras.log_gains[:] = fit.start.values, exposures
     if fit.cameras.with_poses:
         console.line(f"fitting: {fit.cameras.summary()}")
     if len(fits) > 1:

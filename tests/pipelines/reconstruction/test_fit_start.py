@@ -23,7 +23,7 @@ from pipelines.console import Console
 from pipelines.export.formats import ExportOptions
 from pipelines.export.splats import write_file
 from pipelines.reconstruction.fit_start import given_start
-from pipelines.reconstruction.fitting import first_gaussians, fit_views
+from pipelines.reconstruction.fitting import first_gaussians, fit_appearance, fit_views
 from pipelines.reconstruction.prepare import make_plan
 from pipelines.reconstruction.settings import RunSettings
 from pipelines.reconstruction.voxel import grid_frame
@@ -151,6 +151,20 @@ def test_a_run_begins_with_them_and_resumes_with_the_same_file_alone(scan, rows,
     words = ("reconstruct", scan, "--out", out, "--resume", "--init", file)
     settings = [word for text in SETTINGS for word in ("--set", text)]
     assert "fingerprint" in refused(capsys, *words, *settings)
+
+
+@pytest.mark.parametrize("after", [29.0, 31.0])
+def test_given_splats_are_kept_where_the_fit_ends_below_them(
+    scan, rows, tmp_path, monkeypatch, capsys, after
+):
+    told = iter([30.0, after])
+    monkeypatch.setattr(Fit, "shown_psnr", lambda fit: next(told))
+    plan = planned(scan, f"refine.init={saved(rows, tmp_path / 'given.ply')}")
+    fitted = fit_appearance(plan, Console())
+    start = started(scan, tmp_path / "given.ply").gaussians
+    same = np.array_equal(fitted.appearance.gaussians.values, start.values)
+    assert same == (after < 30) == ("the given Gaussians are kept" in capsys.readouterr().out)
+    assert next(told, None) is None
 
 
 def test_points_of_a_cloud_become_gaussians(tmp_path):
