@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
 from gvtools.errors import GvError
-from gvtools.scenes.depth_contradictions import unit_findings
+from gvtools.scenes.depth_misfits import depth_findings
 from gvtools.scenes.pixel_contradictions import PixelCheck
 from gvtools.scenes.pose_forms import pose_findings
 from gvtools.scenes.scene import Finding, Frame, Scene, SparsePoints
@@ -105,7 +105,7 @@ def inspect(scene: Scene, *, probes: int | None = None) -> SceneReport:
     findings += _doubtful_cameras(scene, errors)
     findings += pixels.findings()
     findings += pose_findings(scene)
-    findings += unit_findings(scene)
+    findings += depth_findings(scene)
     findings += contradiction_findings(
         scene,
         {item.view: item.thumbnail for item in opened},

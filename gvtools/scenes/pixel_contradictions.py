@@ -94,10 +94,10 @@ class PixelCheck:
         """Take in the photograph (H, W, 3) of a view."""
         if not len(self.rows[number]):
             return
-        shown = _shown(rgb)
-        self.values[self.rows[number]] = self._at_detections(number, shown)
+        picture = shown(rgb)
+        self.values[self.rows[number]] = self._at_detections(number, picture)
         if number in self.kept:
-            self.kept[number] = np.rint(np.clip(shown, -127, 127)).astype(np.int8)
+            self.kept[number] = np.rint(np.clip(picture, -127, 127)).astype(np.int8)
         own = self._at_detections(number, cv2.subtract(rgb[..., 0], rgb[..., 2], dtype=cv2.CV_32F))
         colors = self.points.colors[self.points.point_index[self.rows[number]]].astype(float)
         reds = np.stack([own, colors[:, 0] - colors[:, 2]])[:, np.isfinite(own)]
@@ -128,7 +128,7 @@ class PixelCheck:
 
     def _moved(self) -> str:
         """How all detections have to be moved for the photographs to agree better, "" for none."""
-        known = [number for number, shown in self.kept.items() if shown.size]
+        known = [number for number, kept in self.kept.items() if kept.size]
         if self.rough or len(known) < FEWEST:
             return ""
         # For each track another direction, the same in all views.
@@ -221,15 +221,15 @@ class PixelCheck:
 
     def _reason(self, wrong: Sequence[int]) -> str:
         """What would make wrong pictures agree, "" where nothing that is tried does."""
-        chosen, shown = wrong[:TRIED], dict[int, Grey]()
+        chosen, pictures = wrong[:TRIED], dict[int, Grey]()
         for number in {n + step for n in chosen for step in (-1, 0, 1)} & {*range(len(self.rows))}:
             if frame := frame_there(self.scene, number):
-                shown[number] = _shown(frame.rgb)
+                pictures[number] = shown(frame.rgb)
         for reason, (step, change) in CHANGES.items():
             values = self.values.copy()
             for number in wrong:
                 values[self.rows[number]] = np.nan
-                grey = shown.get(number + step)
+                grey = pictures.get(number + step)
                 if number in chosen and grey is not None and change(grey).shape == grey.shape:
                     values[self.rows[number]] = self._at_detections(number, change(grey))
             scores = self.agreements(values)
@@ -250,7 +250,7 @@ def _points_of_depth(scene: Scene) -> SparsePoints:
         frame, camera = load(numbers[at]), scene.views[numbers[at]].camera
         if frame is None or frame.depth is None:
             continue
-        y, x = _detailed(frame.rgb, frame.depth)
+        y, x = detailed(frame.rgb, frame.depth)
         pose = camera.world_from_cam[0]
         local = (frame.depth[..., None] * camera.rays())[y, x]
         places.append(local @ pose[:3, :3].T + pose[:3, 3])
@@ -273,7 +273,7 @@ def _points_of_depth(scene: Scene) -> SparsePoints:
     return SparsePoints(np.concatenate(places), colors, errors, point, view, xy)
 
 
-def _detailed(
+def detailed(
     rgb: NDArray[np.uint8], depth: NDArray[np.float32]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Rows and columns of pixels with detail around which depth is smooth, evenly spread."""
@@ -286,7 +286,7 @@ def _detailed(
     return rows[chosen], columns[chosen]
 
 
-def _shown(rgb: NDArray[np.uint8]) -> Grey:
+def shown(rgb: NDArray[np.uint8]) -> Grey:
     """(H, W) detail, as it is compared: of three by three pixels."""
     return np.asarray(cv2.blur(detail(rgb), (3, 3)), np.float32)
 

@@ -17,7 +17,7 @@ from gvtools.errors import OptionError
 from gvtools.memory.panoramas import WIDEST_FRAME, LensOptions, Rig, picture_cameras
 from gvtools.runs.digests import array_digest, fingerprint
 from gvtools.runs.poses import RunPoses, posed, with_poses
-from gvtools.scenes.depth_contradictions import unit_findings
+from gvtools.scenes.depth_misfits import depth_findings
 from gvtools.scenes.layout import is_address
 from gvtools.scenes.matching import natural
 from gvtools.scenes.pixel_contradictions import probed
@@ -363,7 +363,7 @@ def describe(plan: Plan, console: Console) -> None:
     met = (
         *probed(scene, context),
         *pose_findings(scene, context, most_pairs=2),
-        *unit_findings(scene),
+        *depth_findings(scene),
     )
     for finding in (*scene.findings, *met):
         if finding.level == "warning":
