@@ -1,17 +1,27 @@
 from __future__ import annotations
 
 import configparser
+import ctypes
+import importlib
 import os
 import re
 import subprocess
 import sys
 from fnmatch import fnmatch
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
+import numba
+import numpy as np
 import pytest
+from command_line import refused
 
 import gvtools
-from gvtools.system_libraries import LIBRARIES
+from gvtools.kernels import KernelSet, compile_side_by_side, in_threads
+from gvtools.system_libraries import LIBRARIES, advice, missing_libraries
+from pipelines import cli
+from pipelines.options import Arguments
 
 ROOT = Path(__file__).resolve().parents[1]
 # conda-forge's names where they are not PyPI's.
@@ -160,3 +170,157 @@ def test_all_modules_and_a_run_need_nothing_of_posix(platform, tmp_path):
     assert done.returncode == 0, done.stderr[-2000:]
     assert done.stdout.strip() == ""
     assert (tmp_path / "run" / "memory.npz").is_file()
+
+
+@pytest.fixture
+def bare(monkeypatch):
+    load = ctypes.CDLL
+
+    def lacking(name: str, *words: Any, **options: Any) -> object:
+        if name in ("libGL.so.1", "libusb-1.0.so.0"):
+            raise OSError(f"{name}: cannot open shared object file: No such file or directory")
+        return load(name, *words, **options)
+
+    monkeypatch.setattr(ctypes, "CDLL", lacking)
+
+
+def test_missing_libraries_are_found_by_loading_them(bare):
+    missing = missing_libraries()
+    assert {"libGL.so.1", "libusb-1.0.so.0"} <= set(missing)
+    assert "libGL.so.1 libusb-1.0.so.0" in advice(("libGL.so.1", "libusb-1.0.so.0"))
+    assert advice(("libGL.so.1", "libusb-1.0.so.0")).endswith("install -y libgl1 libusb-1.0-0")
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [(OSError("libGL.so.1: cannot open shared object file: No such file or directory"), True),
+     (ImportError("libGL.so.1: cannot open shared object file"), True),
+     (OSError("no space left on device"), False), (ValueError("libGL.so.1"), False)],
+)  # fmt: skip
+def test_a_command_names_the_libraries_that_it_lacks(bare, monkeypatch, capsys, error, told):
+    class Lacking(Arguments):
+        def run(self, console: object) -> None:
+            raise error
+
+    module = SimpleNamespace(LackingCommand=Lacking)
+    monkeypatch.setitem(sys.modules, "lacking", module)
+    status = cli.main(["lacking"], modules={"lacking": "lacking"})
+    said = capsys.readouterr().err
+    assert len(said.splitlines()) == 1
+    assert status == (2 if told else 1)
+    assert ("libGL.so.1 libusb" in said and "apt-get install -y" in said) == told
+
+
+def test_make_and_the_program_know_the_same_list():
+    done = subprocess.run(
+        [sys.executable, "-S", "-E", ROOT / "gvtools/system_libraries.py"],
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    expected = [f"{name} {LIBRARIES[name]}" for name in missing_libraries()]
+    assert done.stdout.split("\n")[:-1] == (expected or [""])
+
+
+def test_version_needs_none_of_them(bare, capsys):
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["--version"])
+    assert stop.value.code == 0
+
+
+def test_refused_commands_stay_as_they_were(bare, capsys, tmp_path):
+    assert "no such file" in refused(capsys, "view", tmp_path / "absent")
+
+
+MODULE = """
+from gvtools.kernels import compiled
+
+@compiled()
+def {name}(x):
+    return 2 * x
+
+def compile_it():
+    {name}(3)
+"""
+
+
+@pytest.mark.parametrize("count", [0, 1, 7, 1000])
+def test_threads_share_the_work(count):
+    seen = np.zeros(count, np.int64)
+
+    def part(first: int, last: int, step: int) -> int:
+        seen[first:last] += step
+        return last - first
+
+    sizes = in_threads(part, count, 2)
+    assert (seen == 2).all() and sum(sizes) == count
+    assert len(sizes) <= max(1, min(count, numba.get_num_threads()))
+
+
+def test_what_fails_in_a_thread_fails_in_the_caller():
+    with pytest.raises(ZeroDivisionError):
+        in_threads(lambda first, last: 1 // 0, 8)
+
+
+def test_other_processes_leave_kernels_in_the_cache(tmp_path, monkeypatch, capfd):
+    monkeypatch.syspath_prepend(tmp_path)
+    sets = []
+    for name in ("double_once", "double_twice"):
+        (tmp_path / f"module_{name}.py").write_text(MODULE.format(name=name), encoding="utf-8")
+        module = importlib.import_module(f"module_{name}")
+        sets.append(KernelSet(name, module.compile_it, getattr(module, name)))
+    # One that fails stops no other, and is compiled where it is called.
+    broken = KernelSet("broken", os.wait, sets[0].last)
+    assert not any(kernels.cached for kernels in sets)
+    compile_side_by_side([broken, *sets])
+    assert all(kernels.cached for kernels in sets)
+    assert capfd.readouterr() == ("", "")
+    # A file that is newer, and the same, is not compiled again; one that changed is.
+    os.utime(tmp_path / "module_double_once.py", (2**31, 2**31))
+    (tmp_path / "module_double_twice.py").write_text(
+        MODULE.format(name="double_twice") + "# changed\n", encoding="utf-8"
+    )
+    module = importlib.reload(importlib.import_module("module_double_twice"))
+    changed = KernelSet("changed", module.compile_it, module.double_twice)
+    assert sets[0].cached and not changed.cached
+    for kernels in sets:
+        assert kernels.last(3) == 6
+        assert kernels.last.stats.cache_hits.total() == 1
+
+
+def test_where_nothing_can_be_written_the_cache_is_a_folder_that_goes(tmp_path):
+    code = (
+        "from gvtools import kernels; import os; from pathlib import Path;"
+        "from gvtools.memory.store import voxel_index;"
+        "assert kernels.cached_here_alone and Path(os.environ['NUMBA_CACHE_DIR']).is_dir();"
+        # An older TBB is warned of where it comes first.
+        "import numba; numba.config.reload_config();"
+        "assert numba.config.THREADING_LAYER_PRIORITY[0] == 'omp'"
+    )
+    # As numba finds no place beside the sources and none in the home.
+    alone = {"NUMBA_CACHE_LOCATOR_CLASSES": "UserProvidedCacheLocator", "TMPDIR": str(tmp_path)}
+    subprocess.run([sys.executable, "-c", code], env={**os.environ, **alone}, check=True)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_a_cache_of_types_that_moved_is_compiled_again(tmp_path, monkeypatch):
+    source = """
+from typing import NamedTuple
+from gvtools.kernels import compiled
+
+class {name}(NamedTuple):
+    x: float
+
+Pair = {name}
+
+@compiled()
+def double(pair):
+    return 2 * pair.x
+"""
+    call = "import moved; print(moved.double(moved.Pair(1.5)))"
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), *sys.path]))
+    for name in ("Before", "Beyond"):
+        (tmp_path / "moved.py").write_text(source.format(name=name))
+        run = subprocess.run(
+            [sys.executable, "-c", call], capture_output=True, text=True, check=False
+        )
+        assert run.stdout == "3.0\n", run.stderr

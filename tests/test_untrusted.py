@@ -2,13 +2,24 @@ from __future__ import annotations
 
 import io
 import os
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from gvtools.errors import GvError, ProjectError, printable
+from gvtools import files
+from gvtools.errors import GvError, MemoryFileError, ProjectError, printable
+from gvtools.files import (
+    folder_replaced_when_written,
+    recover_folder,
+    replaced_when_written,
+    write_text,
+)
+from gvtools.sandbox import Item, ReaderError, read_apart
 from gvtools.scenes.scene import Finding
 from gvtools.untrusted import (
     is_file,
@@ -170,3 +181,142 @@ def test_text_of_windows_programs_reads_as_any_other(tmp_path, encoding):
     data = b"\xff\xfe" + text.encode("utf-16-le") if "marked" in encoding else text.encode(encoding)
     (tmp_path / "list.txt").write_bytes(data)
     assert read_text(tmp_path / "list.txt") == "1.5 rgb/ä.png\n2.5 rgb/b.png\n3\n"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    path = tmp_path / "run"
+    (path / "round_000").mkdir(parents=True)
+    (path / "round_000" / "memory").write_text("old")
+    (path / "notes.txt").write_text("mine")
+    (path / ".half.part").write_text("x")
+    return path
+
+
+def contents(path: Path) -> dict[str, str]:
+    return {str(p.relative_to(path)): p.read_text() for p in path.rglob("*") if p.is_file()}
+
+
+def replace_it(path: Path) -> None:
+    with folder_replaced_when_written(path) as new:
+        assert new.name == path.name
+        (new / "round_000").mkdir()
+        (new / "round_000" / "memory").write_text("new")
+
+
+def test_the_new_folder_takes_the_place_and_foreign_files_move_over(folder):
+    replace_it(folder)
+    assert contents(folder) == {"round_000/memory": "new", "notes.txt": "mine"}
+    assert os.listdir(folder.parent) == ["run"]
+
+
+@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt, OSError(28, "No space left")])
+def test_an_error_leaves_the_earlier_folder(folder, error):
+    before = contents(folder)
+    expected = ProjectError if isinstance(error, OSError) else error
+    with pytest.raises(expected), folder_replaced_when_written(folder) as new:
+        (new / "half").write_text("x")
+        raise error
+    assert contents(folder) == before
+    assert os.listdir(folder.parent) == ["run"]
+
+
+@pytest.mark.parametrize("moment", range(3))
+def test_a_kill_at_any_rename_leaves_one_of_both_whole(folder, monkeypatch, moment):
+    class Killed(BaseException):
+        """Nothing runs after it, as after a kill."""
+
+    before, rename, calls = contents(folder), os.rename, []
+
+    def killed(*names):
+        calls.append(names)
+        if len(calls) > moment:
+            raise Killed
+        rename(*names)
+
+    monkeypatch.setattr(files.os, "rename", killed)
+    with pytest.raises(Killed):
+        replace_it(folder)
+    monkeypatch.undo()
+    recover_folder(folder)
+    found = contents(folder)
+    assert found in (before, {"round_000/memory": "new"})
+    assert (found == before) == (moment < 2)
+    # The next replacement ends what was begun, and the user's file is there again.
+    replace_it(folder)
+    assert contents(folder) == {"round_000/memory": "new", "notes.txt": "mine"}
+    assert os.listdir(folder.parent) == ["run"]
+
+
+def test_pipes_and_open_files_get_the_bytes_and_stay_what_they_are(tmp_path):
+    pipe, file = tmp_path / "pipe", tmp_path / "file"
+    os.mkfifo(pipe)
+    with file.open("w") as opened, ThreadPoolExecutor(1) as pool:
+        read = pool.submit(pipe.read_text)
+        write_text(pipe, "a")
+        write_text(Path(f"/proc/self/fd/{opened.fileno()}"), "b")
+        assert (read.result(timeout=20), file.read_text()) == ("a", "b")
+    assert pipe.is_fifo() and sorted(tmp_path.iterdir()) == [file, pipe]
+    with pytest.raises(ProjectError, match="No space left"):
+        write_text(Path("/dev/full"), "c")
+    assert Path("/dev/full").is_char_device()
+
+
+def test_an_error_of_a_library_on_a_full_disk_is_told_as_that(tmp_path, monkeypatch):
+    def write() -> None:
+        with (
+            replaced_when_written(tmp_path / "a.las") as outer,
+            replaced_when_written(outer) as inner,
+        ):
+            inner.write_text("half")
+            raise RuntimeError("IoError")
+
+    with pytest.raises(RuntimeError):
+        write()
+    monkeypatch.setattr(files, "ALMOST_NONE", 1 << 62)
+    with pytest.raises(ProjectError, match=r"/a\.las: cannot be written \(No space left"):
+        write()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_reader_of_the_output_that_goes_is_no_error_of_the_file(tmp_path):
+    with pytest.raises(BrokenPipeError), replaced_when_written(tmp_path / "a") as temporary:
+        temporary.write_bytes(b"begun")
+        raise BrokenPipeError
+    assert not list(tmp_path.iterdir())
+
+
+def reader(path: Path, *, how: str) -> Iterator[Item]:
+    yield {}, {}
+    for number in range(2):
+        yield {"number": number}, {"values": np.arange(number + 1)}
+    if how == "memory":
+        np.ones(1 << 28)
+    elif how == "crash":
+        os.abort()
+    elif how == "word":
+        raise MemoryFileError(f"{path}: no such points")
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    (tmp_path / "a.bin").write_bytes(b"123")
+    return tmp_path / "a.bin"
+
+
+def test_items_pass_in_their_order(path):
+    items = list(read_apart(f"{__name__}:reader", path, how="whole"))
+    assert [facts["number"] for facts, _ in items] == [0, 1]
+    assert [arrays["values"].tolist() for _, arrays in items] == [[0], [0, 1]]
+
+
+@pytest.mark.parametrize(
+    ("how", "error", "said"),
+    [("memory", ReaderError, "status"), ("crash", ReaderError, "status"),
+     ("word", MemoryFileError, "no such points")],
+)  # fmt: skip
+def test_limits_crashes_and_errors_end_in_one_error(path, how, error, said):
+    items = read_apart(f"{__name__}:reader", path, how=how)
+    assert [next(items)[0]["number"] for _ in range(2)] == [0, 1]
+    with pytest.raises(error, match=said):
+        next(items)

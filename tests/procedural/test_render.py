@@ -1,15 +1,29 @@
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from reference_rays import first_surface, is_free
 
 from gvtools.cameras import Cameras, invert_rigid
+from gvtools.procedural import furnished_room as materials
 from gvtools.procedural.builder import Light, ProceduralScene, SceneBuilder
 from gvtools.procedural.layouts import scene
 from gvtools.procedural.paths import camera_path
 from gvtools.procedural.ray_cast import BALL, BOX, TUBE, cast, clearance
-from gvtools.procedural.render import Look, radiance, to_srgb
+from gvtools.procedural.render import Look, decode_srgb, encode_srgb, radiance, to_srgb
+from gvtools.procedural.textures import (
+    LONGEST,
+    PHOTOGRAPHS,
+    SIDE,
+    level_starts,
+    photograph,
+    photograph_names,
+    picture,
+    stack_levels,
+)
+from gvtools.training.views import ContextChoice, choose_context
 from gvtools.trajectories import look_at
 
 SEEDS = range(8)
@@ -242,3 +256,144 @@ def test_several_lamps_add_up_and_some_things_cast_no_shadow() -> None:
     np.testing.assert_allclose(light(lamps, shades=True), apart, rtol=1e-5, atol=1e-6)
     shadow = light(lamps, shades=False) - apart
     assert shadow.min() > -1e-6 and (shadow > 0.1).mean() > 0.01
+
+
+def test_splits_share_no_photograph() -> None:
+    train, held_out = (PHOTOGRAPHS[split] for split in ("train", "held-out"))
+    assert not set(train) & set(held_out)
+    thumbnails = {
+        name: np.sort(photograph(name).reshape(-1, 3).mean(1))[:: photograph(name).size // 300][
+            :100
+        ]
+        for split in PHOTOGRAPHS
+        for name in photograph_names(split)
+    }
+    for a in photograph_names("train"):
+        for b in photograph_names("held-out"):
+            assert not np.array_equal(thumbnails[a], thumbnails[b])
+
+
+def test_photographs_of_installed_wheels_alone() -> None:
+    for split in PHOTOGRAPHS:
+        names = photograph_names(split)
+        assert len(names) >= 6
+        for name in names:
+            image = photograph(name)
+            assert image.dtype == np.uint8 and image.shape[2] == 3
+            assert max(image.shape) <= LONGEST and image.std() > 5
+
+
+def test_pictures_are_neither_black_nor_blank() -> None:
+    rng = np.random.default_rng(0)
+    images = [picture(rng, photograph_names("train")) for _ in range(60)]
+    assert all(image.shape == (SIDE, SIDE, 3) and image.dtype == np.uint8 for image in images)
+    assert np.median([image.mean() for image in images]) > 60
+    assert np.mean([image.std() > 8 for image in images]) > 0.9
+
+
+def test_levels_are_block_means_in_linear_light() -> None:
+    rng = np.random.default_rng(0)
+    images = rng.integers(0, 256, (2, SIDE, SIDE, 3), np.uint8)
+    texels = stack_levels(list(images))
+    linear = decode_srgb(images).astype(np.float64)
+    starts = level_starts(SIDE)
+    for level in range(len(starts) - 1):
+        side = SIDE >> level
+        block = 1 << level
+        expected = linear.reshape(2, side, block, side, block, 3).mean((2, 4))
+        found = texels[:, starts[level] : starts[level + 1]].reshape(2, side, side, 3)
+        np.testing.assert_allclose(found, expected, atol=2e-6)
+
+
+def test_room_materials_have_their_colour_and_size() -> None:
+    rng = np.random.default_rng(0)
+    color = (0.5, 0.6, 0.7)
+    for image in (materials.paint(color), materials.tiled("brick", color)):
+        np.testing.assert_allclose(image.mean((0, 1)) / 255, color, atol=0.03)
+    boards = materials.planks(color, rng)
+    assert boards.std() > materials.paint(color).std()
+    for image in (boards, materials.globe("moon"), materials.picture("rocket")[0]):
+        assert image.shape == (materials.SIDE, materials.SIDE, 3) and image.dtype == np.uint8
+
+
+def test_colour_codes_round_trip_below_the_roll_off() -> None:
+    codes = np.arange(0, 215, dtype=np.uint8)
+    np.testing.assert_array_equal(encode_srgb(decode_srgb(codes)), codes)
+    bright = encode_srgb(np.linspace(0.6, 5, 50).astype(np.float32))
+    assert (np.diff(bright.astype(int)) >= 0).all()
+
+
+PICTURE = (48, 64)
+
+
+@pytest.fixture(scope="module")
+def paths() -> list[tuple[ProceduralScene, Cameras]]:
+    found = []
+    for seed in range(24):
+        rng = np.random.default_rng([seed, 9])
+        place = scene(rng, ("train", "held-out")[seed % 2])
+        found.append((place, camera_path(rng, place.geometry, views=8, size=PICTURE)))
+    return found
+
+
+def test_cameras_stand_in_free_space_and_see_something(paths) -> None:
+    for place, cameras in paths:
+        assert is_free(place.geometry, cameras.centers).all()
+        # Not inside a hull either: nobody stands under a table.
+        bare = place.geometry._replace(first_cutter=0 * place.geometry.first_cutter)
+        assert is_free(bare, cameras.centers).all()
+        depth = cast(place.geometry, cameras.resized(16, 12)).depth
+        assert depth.min() > 0.02 * depth.mean()
+        rotation = cameras.cam_from_world[:, :3, :3]
+        gram = rotation @ rotation.swapaxes(1, 2)
+        np.testing.assert_allclose(gram, np.broadcast_to(np.eye(3), gram.shape), atol=1e-12)
+        assert (np.linalg.det(rotation) > 0).all()
+        fov = 2 * np.degrees(np.arctan(32 / cameras.K[0, 0, 0]))
+        assert 50 <= fov <= 80
+        # Upright, up to the slant of a hand: the world's up is the image's up.
+        assert (rotation[:, 1, 2] < 0).all()
+
+
+def test_paths_move_and_turn(paths) -> None:
+    travel, turn = [], []
+    for _, cameras in paths:
+        centers = cameras.centers
+        depth = np.linalg.norm(np.ptp(centers, axis=0))
+        travel.append(depth)
+        forward = cameras.cam_from_world[:, 2, :3]
+        turn.append(np.degrees(np.arccos(np.clip(forward[0] @ forward[-1], -1, 1))))
+    assert np.quantile(travel, 0.1) > 0.01 and np.median(travel) > 0.3
+    assert np.quantile(turn, 0.9) > 45 and np.median(turn) < 60
+
+
+def test_the_same_generator_gives_the_same_path() -> None:
+    place = scene(np.random.default_rng(1), "train")
+    first, again = (
+        camera_path(np.random.default_rng(2), place.geometry, views=8, size=PICTURE)
+        for _ in range(2)
+    )
+    assert np.array_equal(first.cam_from_world, again.cam_from_world)
+
+
+@pytest.mark.parametrize(
+    ("rule", "count", "expected"),
+    [
+        ("first", 3, {(0, 1, 2)}),
+        ("ends", 1, {(0,)}),
+        ("ends", 2, {(0, 7)}),
+        ("ends", 4, {(0, 2, 5, 7)}),
+        ("every", 4, {(0, 2, 4, 6), (1, 3, 5, 7)}),
+        ("every", 2, {(i, i + 4) for i in range(4)}),
+    ],
+)
+def test_context_rules(rule: Any, count: int, expected: set[tuple[int, ...]]) -> None:
+    rng = np.random.default_rng(0)
+    assert {choose_context(rng, 8, count, rule=rule) for _ in range(60)} == expected
+
+
+def test_context_counts_come_in_groups() -> None:
+    options = ContextChoice(group=4)
+    counts = np.array([options.count([0, 1], index) for index in range(400)]).reshape(-1, 4)
+    assert (counts == counts[:, :1]).all()
+    assert {int(c) for c in counts[:, 0]} == {1, 2, 3, 4}
+    assert np.bincount(counts[:, 0])[1:].min() > 10

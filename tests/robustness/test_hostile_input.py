@@ -6,20 +6,27 @@ mutations of each reader, is ``python -m hostile`` (docs/robustness.md).
 
 from __future__ import annotations
 
+import ast
+import json
 import mmap
+import shutil
 import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from hostile import judge
+from hostile import judge, samples
 from hostile.__main__ import CORPUS, FFMPEG, corpus, lines, slug
 from hostile.judge import FAILED, OTHER, REFUSED, SAME, Bench, limited
 from hostile.mutations import Mutation, Special
 from hostile.readers import READERS, Reader, data_sets
+from hostile.samples import indexed_tensors, shards
 
-from gvtools.errors import ProjectError
+from gvtools.errors import CheckpointError, ProjectError
+from gvtools.networks.tensors import TensorFiles
+from gvtools.scenes.project import open_project
+from gvtools.scenes.shards import open_shards
 
 ROOT = Path(__file__).parents[2]
 # Beside the corpus a few mutations of every reader, so that the table itself is known to work.
@@ -132,3 +139,191 @@ def mapped(count: int) -> Any:
 def refuse(words: str) -> Any:
     """Raise an error of these words."""
     raise ProjectError(words)
+
+
+FOLDERS = ("gvtools", "pipelines", "viz", "benchmarks", "examples", "tools", "data_specs")
+FILES = sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py"))
+# A function that goes to a process of our own over a pipe, to compile kernels there.
+OWN_PIPE = {"gvtools/kernels.py"}
+# Its exceptions are caught by name; torch itself unpickles, weights only.
+ERRORS_ALONE = {"gvtools/networks/tensors.py"}
+MODULES = {"pickle", "cPickle", "dill", "cloudpickle", "joblib", "shelve", "marshal", "jsonpickle"}
+CALLS = {"load", "loads", "eval", "exec", "unsafe_load", "full_load", "read_pickle", "safe_load",
+         "safe_load_all"}  # fmt: skip
+OPTIONS = {"allow_pickle", "weights_only"}
+
+
+def complaints(source: str, name: str = "x.py") -> list[str]:
+    """What a module's source does that could run what a file says."""
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, (ast.Import, ast.ImportFrom)):
+            modules = (
+                [a.name for a in node.names] if isinstance(node, ast.Import) else [node.module]
+            )
+            bad = {str(module).split(".")[0] for module in modules} & MODULES
+            if bad and name not in OWN_PIPE | ERRORS_ALONE:
+                found.append(f"{name}:{node.lineno} imports {bad}")
+        if not isinstance(node, ast.Call):
+            continue
+        said = {k.arg: ast.unparse(k.value) for k in node.keywords if k.arg in OPTIONS}
+        if not said and getattr(node.func, "attr", getattr(node.func, "id", "")) not in CALLS:
+            continue
+        called = ast.unparse(node.func)
+        where = f"{name}:{node.lineno} {called}"
+        if called in ("np.load", "numpy.load") and said.get("allow_pickle") != "False":
+            found.append(f"{where} without allow_pickle=False")
+        if said.get("allow_pickle", "False") != "False":
+            found.append(f"{where} allows pickle")
+        if called == "torch.load" and said.get("weights_only") != "True":
+            found.append(f"{where} without weights_only=True")
+        if called in ("eval", "exec", "yaml.load", "yaml.unsafe_load", "yaml.full_load"):
+            found.append(where)
+        if called in ("pickle.load", "pickle.loads", "pd.read_pickle"):
+            found.append(where)
+        if called in ("yaml.safe_load", "yaml.safe_load_all") and name != "gvtools/untrusted.py":
+            found.append(f"{where}; use gvtools.untrusted.parse_yaml")
+    return found
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "import pickle",
+        "from joblib import load",
+        "np.load(path)",
+        "np.load(path, allow_pickle=True)",
+        "np.save(path, x, allow_pickle=True)",
+        "torch.load(path)",
+        "torch.load(path, weights_only=False)",
+        "eval(text)",
+        "yaml.load(text, Loader=yaml.Loader)",
+        "yaml.safe_load(text)",
+    ],
+)
+def test_the_check_finds_what_it_looks_for(source):
+    assert complaints(source)
+
+
+def test_sound_calls_pass_the_check():
+    sound = "np.load(p, allow_pickle=False); torch.load(p, weights_only=True); model.eval()"
+    assert complaints(sound) == []
+
+
+def test_no_file_is_unpickled_or_run():
+    assert len(FILES) > 300
+    names = [path.relative_to(ROOT).as_posix() for path in FILES]
+    found = [
+        complaint
+        for path, name in zip(FILES, names, strict=True)
+        for complaint in complaints(path.read_text(encoding="utf-8"), name)
+    ]
+    assert found == []
+    assert set(names) >= OWN_PIPE | ERRORS_ALONE  # no exception outlives its reason
+
+
+OUT = "lies outside of"
+
+
+@pytest.fixture
+def secret(tmp_path):
+    """A picture that belongs to nobody's project."""
+    return samples.save(tmp_path / "outside" / "secret.png", samples.pixels())
+
+
+def spellings(secret):
+    """Names by which a file in ``tmp_path/scan`` or a folder in it may try to reach it."""
+    up = ["../" * depth + "outside/secret.png" for depth in (1, 2, 3)]
+    return [*up, "images/../../outside/secret.png", str(secret)]
+
+
+@pytest.mark.parametrize("row", range(5))
+@pytest.mark.parametrize("key", ["file_path", "depth_file_path", "mask_path"])
+def test_transforms(tmp_path, secret, key, row):
+    samples.transforms(tmp_path / "scan")
+    file = tmp_path / "scan" / "transforms.json"
+    data = json.loads(file.read_text())
+    data["frames"][1][key] = spellings(secret)[row]
+    file.write_text(json.dumps(data))
+    with pytest.raises(ProjectError, match=OUT):
+        open_project(tmp_path / "scan")
+
+
+def test_an_image_folder_that_the_user_names_may_lie_anywhere(tmp_path):
+    samples.transforms(tmp_path / "scan")
+    shutil.move(tmp_path / "scan" / "images", tmp_path / "pictures")
+    file = tmp_path / "scan" / "transforms.json"
+    file.write_text(file.read_text().replace("images/", "../pictures/"))
+    with pytest.raises(ProjectError, match=OUT):
+        open_project(tmp_path / "scan")
+    scene = open_project(tmp_path / "scan", images=tmp_path / "pictures")
+    assert scene.names == ("a.png", "b.png")
+    scene.views[0].load()
+
+
+@pytest.mark.parametrize("name", ["rgb.txt", "depth.txt"])
+def test_lists_of_tum(tmp_path, secret, name):
+    samples.tum(tmp_path / "scan")
+    file = tmp_path / "scan" / name
+    for spelling in spellings(secret)[:1] + spellings(secret)[3:]:
+        lines = file.read_text().splitlines()
+        lines[1] = f"{lines[1].split()[0]} {spelling}"
+        file.write_text("\n".join(lines))
+        with pytest.raises(ProjectError, match=OUT):
+            open_project(tmp_path / "scan")
+
+
+def test_images_of_colmap(tmp_path, secret):
+    samples.colmap(tmp_path / "scan", text=True)
+    file = tmp_path / "scan" / "sparse" / "0" / "images.txt"
+    text = file.read_text()
+    name = sorted(p.name for p in (tmp_path / "scan" / "images").rglob("*.png"))[0]
+    for spelling in spellings(secret)[1:]:
+        file.write_text(text.replace(name, spelling))
+        with pytest.raises(ProjectError, match=OUT):
+            open_project(tmp_path / "scan")
+
+
+@pytest.mark.parametrize("make", [samples.transforms, samples.tum, samples.colmap])
+def test_a_picture_that_is_a_link_into_a_store_is_followed(tmp_path, make):
+    make(tmp_path / "scan")
+    expected = [view.load().rgb.sum() for view in open_project(tmp_path / "scan")]
+    for number, file in enumerate(sorted((tmp_path / "scan").rglob("*.png"))):
+        blob = tmp_path / "blobs" / str(number)
+        blob.parent.mkdir(exist_ok=True)
+        file.rename(blob)
+        file.symlink_to(blob)
+    assert [view.load().rgb.sum() for view in open_project(tmp_path / "scan")] == expected
+
+
+def test_links_inside_and_a_linked_image_folder_are_followed(tmp_path):
+    samples.transforms(tmp_path / "scan")
+    images = tmp_path / "scan" / "images"
+    (images / "a.png").rename(images / "c.png")
+    (images / "a.png").symlink_to(images / "c.png")
+    (tmp_path / "alias").symlink_to(tmp_path / "scan")
+    assert open_project(tmp_path / "alias").names == ("a.png", "b.png")
+    samples.colmap(tmp_path / "model")
+    shutil.move(tmp_path / "model" / "images", tmp_path / "elsewhere")
+    (tmp_path / "model" / "images").symlink_to(tmp_path / "elsewhere")
+    # The folder itself is the user's own link, no file's.
+    open_project(tmp_path / "model").views[0].load()
+
+
+def test_an_index_of_tensors(tmp_path):
+    indexed_tensors(tmp_path)
+    file = next(tmp_path.glob("*.index.json"))
+    shutil.copy(tmp_path / "model-1.safetensors", tmp_path.parent / "other.safetensors")
+    for name in ("../other.safetensors", str(tmp_path.parent / "other.safetensors")):
+        file.write_text(json.dumps({"weight_map": {"a": name}}))
+        with pytest.raises((CheckpointError, ProjectError), match=OUT):
+            TensorFiles.find(tmp_path)
+
+
+def test_an_index_of_shards(tmp_path):
+    shards(tmp_path)
+    file = tmp_path / "shards" / "index.json"
+    file.write_text(file.read_text().replace("shard-000000.tar", "../shard-000000.tar"))
+    collection = open_shards(tmp_path / "shards")
+    with pytest.raises(ProjectError, match=OUT):
+        collection.read(collection.names[0])

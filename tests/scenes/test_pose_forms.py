@@ -9,8 +9,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 from walls import blotches, camera_at, photograph, write_project
 
+from gvtools.cameras import Cameras, invert_rigid
 from gvtools.scenes.pose_forms import pose_findings
 from gvtools.scenes.project import open_project
+from gvtools.scenes.registration import register_depth
 
 FLIP, MIRROR = np.diag([1.0, -1.0, -1.0, 1.0]), np.diag([1.0, 1.0, -1.0, 1.0])
 
@@ -82,3 +84,96 @@ def test_focal_lengths_of_pictures_that_were_cropped(tmp_path):
     for path, said in ((file, "focal lengths +2"), (file.parent / "bent.json", "k1 +0.")):
         (found,) = pose_findings(open_project(path))
         assert "another lens fits" in found.message and said in found.message
+
+
+DEPTH_K = np.array([[100.0, 0, 64.5], [0, 100, 48.5], [0, 0, 1]])
+COLOR_K = np.array([[90.0, 0, 63], [0, 91, 47], [0, 0, 1]])
+SIZE = (96, 128)
+
+
+def turned(degrees, translation):
+    matrix = np.eye(4)
+    turns = Rotation.from_euler("YZ", [degrees / 2, degrees], degrees=True)
+    matrix[:3, :3], matrix[:3, 3] = turns.as_matrix(), translation
+    return matrix
+
+
+def plane_depth(K, cam_from_plane_frame, normal, offset, size):
+    """z-depth of the plane normal . X = offset, given in the depth camera's frame."""
+    height, width = size
+    rays = Cameras(K[None], np.eye(4)[None], np.array([width]), np.array([height]), ()).rays()
+    rotation, shift = cam_from_plane_frame[:3, :3], cam_from_plane_frame[:3, 3]
+    n = rotation @ normal
+    return (offset + n @ shift) / (rays @ n)
+
+
+@pytest.mark.parametrize("degrees", [0, 3, 12])
+@pytest.mark.parametrize("normal", [(0, 0, 1), (0.4, -0.2, 1), (0, 1.2, 0.5)])
+@pytest.mark.parametrize("zoom", [1, 2.5])
+def test_a_plane_stays_a_closed_plane(degrees, normal, zoom):
+    normal = np.array(normal, float) / np.linalg.norm(normal)
+    move = turned(degrees, (-0.05, 0.02, 0.03))
+    depth = plane_depth(DEPTH_K, np.eye(4), normal, 2.0, SIZE)
+    seen = (depth > 0.3) & (depth < 12)
+    depth = np.where(seen, depth, 0).astype(np.float32)
+    K = COLOR_K * np.array([[zoom], [zoom], [1]])
+    size = (int(SIZE[0] * zoom), int(SIZE[1] * zoom))
+    result = register_depth(depth, DEPTH_K, K, color_from_depth=move, width=size[1], height=size[0])
+    expected = plane_depth(K, move, normal, 2.0, size)
+    filled = result > 0
+    assert filled.mean() > 0.3
+    np.testing.assert_allclose(result[filled], expected[filled], rtol=0.06)
+    # Every colour pixel whose surface point was measured, well inside, has to be filled.
+    height, width = size
+    rays = Cameras(K[None], np.eye(4)[None], np.array([width]), np.array([height]), ()).rays()
+    points = (rays * expected[..., None]).reshape(-1, 3)
+    back = invert_rigid(move)
+    local = (points @ back[:3, :3].T + back[:3, 3]) @ DEPTH_K.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        column = np.floor(local[:, 0] / local[:, 2]).reshape(size)
+        row = np.floor(local[:, 1] / local[:, 2]).reshape(size)
+    inside = (column >= 1) & (column < SIZE[1] - 1) & (row >= 1) & (row < SIZE[0] - 1)
+    inside &= (expected > 0) & (local[:, 2] > 0).reshape(size)
+    core = np.zeros(SIZE, bool)
+    core[1:-1, 1:-1] = (
+        seen[1:-1, 1:-1] & seen[:-2, 1:-1] & seen[2:, 1:-1] & seen[1:-1, :-2] & seen[1:-1, 2:]
+    )
+    measured = np.zeros(size, bool)
+    measured[inside] = core[row[inside].astype(int), column[inside].astype(int)]
+    assert measured.sum() > 1000
+    steep = np.abs(normal[2]) < 0.5  # has neighbours farther apart than one surface allows
+    if steep:
+        assert filled[measured].mean() > 0.98
+        assert np.median(np.abs(result - expected)[filled & measured]) < 1e-4
+    else:
+        assert filled[measured].all()
+        np.testing.assert_allclose(result[measured], expected[measured], rtol=1e-5)
+
+
+def test_silhouette_neither_grows_nor_leaks():
+    depth = np.full(SIZE, 4.0, np.float32)
+    depth[30:70, 40:90] = 1.5
+    shift = np.eye(4)
+    shift[0, 3] = -0.06
+    result = register_depth(
+        depth, DEPTH_K, DEPTH_K, color_from_depth=shift, width=SIZE[1], height=SIZE[0]
+    )
+    # Both planes face the cameras, so each only shifts, by f * b / z = 4 and 1.5 pixels.
+    front = np.zeros(SIZE, bool)
+    front[30:70, 36:86] = True
+    np.testing.assert_allclose(result[front], 1.5, rtol=1e-6)
+    assert (np.abs(result[~front] - 1.5) > 1).all()
+    # What the square hid from the depth camera stays empty: columns 86 to 88.
+    assert (result[30:70, 86:88] == 0).all()
+    np.testing.assert_allclose(result[30:70, 89:126], 4, rtol=1e-6)
+    assert (result[:, 127:] == 0).all()
+
+
+def test_nothing_behind_the_camera():
+    behind = np.eye(4)
+    behind[2, 3] = -10
+    depth = np.full(SIZE, 2.0)
+    result = register_depth(
+        depth, DEPTH_K, DEPTH_K, color_from_depth=behind, width=SIZE[1], height=SIZE[0]
+    )
+    assert not result.any()

@@ -5,10 +5,13 @@ from dataclasses import replace
 from typing import Any
 
 import geoverse_models as micro
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
+from gvtools.cameras import Cameras
+from gvtools.completers import ContextView
 from gvtools.completers.geoverse.conditioning import (
     LOG_DEPTH_LIMIT,
     HintConfig,
@@ -20,6 +23,8 @@ from gvtools.completers.geoverse.conditioning import (
     feature_mask,
     fill_holes,
 )
+from gvtools.completers.geoverse.denoiser import Conditions, DenoiserBlock
+from gvtools.completers.geoverse.views import model_size, view_batch
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -273,3 +278,214 @@ def test_statistics_there_and_back():
     expected = (raw.movedim(1, -1) - statistics.mean.double()) / deviation
     torch.testing.assert_close(latent, expected.movedim(-1, 1))
     torch.testing.assert_close(statistics.denormalise(latent), raw)
+
+
+def blob(camera: Cameras, point: np.ndarray, sigma: float) -> np.ndarray:
+    (((x, y),),), _ = camera.project(point[None])
+    columns = np.arange(int(camera.width[0])) + 0.5
+    rows = np.arange(int(camera.height[0]))[:, None] + 0.5
+    dot = np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / (2 * sigma**2))
+    return np.repeat(dot[..., None], 3, axis=2).astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    ("context_size", "target_size"),
+    [
+        ((120, 160), (120, 160)),
+        ((200, 90), (120, 160)),
+        ((150, 150), (160, 100)),
+        ((61, 83), (77, 77)),
+    ],
+)  # fmt: skip
+def test_cameras_follow_pictures_that_are_cropped_and_resized(context_size, target_size):
+    point = np.array([0.05, -0.1, 3.2])
+    views = []
+    for seed in range(2):
+        camera = micro.cameras(1, size=context_size, seed=seed)
+        rgb = blob(camera, point, max(context_size) / 20)
+        views.append(ContextView(f"photo_{seed}", camera, rgb))
+    cameras = micro.cameras(2, size=target_size, seed=5)
+    known = micro.guidance(2, size=target_size, share=1.1)
+    dots = np.stack([blob(camera, point, max(target_size) / 20) for camera in cameras])
+    known = replace(known, cameras=cameras, rgb=dots)
+    size = model_size(*target_size, longest=96, patch=8)
+    batch, joined = view_batch(views, known, size)
+    assert (
+        batch.size == size and (joined.height == size[0]).all() and (joined.width == size[1]).all()
+    )
+    local = joined.cam_from_world[0] @ np.append(point, 1)
+    unit = np.linalg.norm(joined.centers - joined.centers[0], axis=1).max()
+    world = torch.from_numpy(np.append(local[:3] / unit, 1)).float()
+    seen = (batch.cam_from_world[0] @ world)[:, :3]
+    pixel = torch.einsum("vij,vj->vi", batch.K[0], seen / seen[:, 2:])[:, :2].numpy()
+    expected, _ = joined.project(point[None])
+    np.testing.assert_allclose(pixel, expected[:, 0], atol=1e-3)
+    y, x = np.mgrid[: size[0], : size[1]] + 0.5
+    for view in range(4):
+        dot = batch.images[0, view, 0].double().numpy() ** 2  # the tails are cut off at the rim
+        centroid = np.array([(dot * x).sum(), (dot * y).sum()]) / dot.sum()
+        np.testing.assert_allclose(centroid, pixel[view], atol=0.15)
+
+
+@pytest.mark.parametrize("size", [(24, 32), (16, 24), (48, 64), (72, 40)])
+def test_projected_depth_is_never_averaged_between_two_surfaces(size):
+    rng = np.random.default_rng(0)
+    known = micro.guidance(2, share=0.7)
+    depth = np.where(rng.random(known.depth.shape) < 0.5, 1.0, 5.0).astype(np.float32)
+    depth *= known.valid
+    context = micro.context_views(1)
+    wall = np.where(rng.random((30, 40)) < 0.5, 2.0, 8.0).astype(np.float32)
+    context = [replace(context[0], depth=wall)]
+    batch, joined = view_batch(context, replace(known, depth=depth), size)
+    unit = np.linalg.norm(joined.centers - joined.centers[0], axis=1).max()
+    found = batch.depth[0].numpy() * unit
+    for views, surfaces in ((found[:1], (2, 8)), (found[1:], (0, 1, 5))):
+        gap = np.min([np.abs(views - surface) for surface in surfaces], axis=0)
+        assert gap.max() < 1e-5
+        assert all((np.abs(views - surface) < 1e-5).any() for surface in surfaces)
+    assert torch.equal(batch.valid[0, 1:], batch.depth[0, 1:] > 0)
+    assert batch.valid[0, 0].all()
+
+
+def test_a_projections_colour_is_that_of_its_valid_pixels_alone():
+    known = micro.guidance(1, size=(48, 64), share=0.8)
+    red = np.zeros_like(known.rgb)
+    red[..., 0] = 0.75
+    damaged = replace(
+        known,
+        rgb=np.where(known.valid[..., None], red, np.float32(np.nan)),
+        depth=np.where(known.valid, known.depth, np.float32(np.nan)),
+    )
+    batch, _ = view_batch(micro.context_views(1), damaged, (24, 32))
+    seen = batch.valid[0, 1, 0]
+    assert 0.5 < seen.float().mean() < 1
+    colour = batch.images[0, 1]
+    torch.testing.assert_close(colour[0][seen], torch.full_like(colour[0][seen], 0.75))
+    assert not colour[1:].any() and not colour[:, ~seen].any()
+    assert batch.depth.isfinite().all()
+
+
+LAYERS = micro.LAYERS
+
+
+@torch.no_grad()
+def test_depth_reaches_every_view_through_its_embedder_alone():
+    net = micro.denoiser()
+    x, t, known = micro.conditions()
+    assert known.depth is not None
+    other = known.depth.clone()
+    other[:, -1, 0, :8, :8] += 1  # the first token of the last view
+    found, changed = net(x, t, known), net(x, t, replace(known, depth=other))
+    assert ((found - changed).abs().amax((2, 3, 4)) > 1e-6).all()
+    (s, head), (s2, head2) = (net.embed(x, replace(known, depth=d)) for d in (known.depth, other))
+    token = torch.zeros(s.shape[:3], dtype=torch.bool)
+    token[:, -1, 0] = True
+    assert torch.equal((s != s2).any(-1), token)
+    assert torch.equal(head, head2)
+    # Without the condition it is as a depth of zero everywhere but for the embedder's bias.
+    net.depth_embedder.proj.bias.zero_()
+    assert torch.equal(
+        net(x, t, replace(known, depth=None)),
+        net(x, t, replace(known, depth=torch.zeros_like(known.depth))),
+    )
+
+
+@torch.no_grad()
+def test_context_views_come_first_and_have_their_own_embedders():
+    net = micro.denoiser()
+    x, _, known = micro.conditions(context=2, targets=3)
+    before = net.embed(x, known)
+    for name in ("s_embedder_ref", "x_embedder_ref"):
+        getattr(net, name).proj.bias += 1
+    for old, new in zip(before, net.embed(x, known), strict=True):
+        change = (new - old).abs().amax((0, 2, 3))
+        assert (change[:2] > 0.5).all() and not change[2:].any()
+
+
+@torch.no_grad()
+def test_one_time_a_sample_is_the_same_time_for_its_views():
+    net = micro.denoiser().double()
+    x, t, known = micro.conditions(dtype=torch.float64)
+    views = x.shape[1]
+    expected = net(x, t, known)
+    found = net(x, t[:, None].expand(-1, views), known)
+    torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-12)
+    later = t[:, None].repeat(1, views)
+    later[:, -1] = 0.1
+    assert (net(x, later, known) - expected).abs().max() > 1e-3
+
+
+def permuted(known: Conditions, order: list[int]) -> Conditions:
+    assert known.depth is not None
+    camera = replace(
+        known.camera,
+        map=known.camera.map[:, order],
+        cam_from_world=known.camera.cam_from_world[:, order],
+        K=known.camera.K[:, order],
+    )
+    return replace(
+        known, latents=known.latents[:, order], camera=camera, depth=known.depth[:, order]
+    )
+
+
+@pytest.mark.parametrize("order", [[0, 1, 4, 2, 3], [1, 0, 2, 3, 4]])
+@torch.no_grad()
+def test_permuted_views_give_permuted_results(order):
+    net = micro.denoiser().double()
+    x, t, known = micro.conditions(dtype=torch.float64)
+    expected = net(x, t, known)[:, order]
+    found = net(x[:, order], t, permuted(known, order))
+    torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9)
+    # Views differ, and a target is no context view.
+    assert (net(x, t, known) - expected).abs().max() > 0.1
+    swapped = [2, 1, 0, 3, 4]
+    there = net(x[:, swapped], t, permuted(known, swapped))
+    assert (there - net(x, t, known)[:, swapped]).abs().max() > 0.01
+
+
+@pytest.mark.parametrize("invert_K", [True, False])
+@torch.no_grad()
+def test_attention_does_not_see_the_world_frame(invert_K):
+    net = micro.denoiser(replace(micro.DENOISER, invert_K=invert_K)).double()
+    x, t, known = micro.conditions(dtype=torch.float64)
+    world = torch.eye(4).double()
+    world[:3, :3] = torch.from_numpy(micro.rotation((1, 2, -1), 0.8))
+    world[:3, 3] = torch.tensor([0.5, -2.0, 1.0])
+    expected = net(x, t, known)
+
+    def seen_from(poses: Tensor) -> Tensor:
+        return net(x, t, replace(known, camera=replace(known.camera, cam_from_world=poses)))
+
+    found = seen_from(known.camera.cam_from_world @ world)
+    torch.testing.assert_close(found, expected, rtol=1e-8, atol=1e-8)
+    # Moving all cameras changes nothing, bringing them together does.
+    assert (seen_from(world.expand(2, 5, 4, 4)) - expected).abs().max() > 0.01
+
+
+@torch.no_grad()
+def test_streams_stay_in_full_precision_under_autocast():
+    net = micro.denoiser()
+    x, t, known = micro.conditions()
+    seen: list[tuple[torch.dtype, torch.dtype]] = []
+    for module in net.modules():
+        if isinstance(module, DenoiserBlock):
+            module.register_forward_hook(lambda m, a, out: seen.append((a[0].dtype, out.dtype)))
+    expected = net(x, t, known)
+    seen.clear()
+    with torch.autocast("cpu", torch.bfloat16):
+        found = net(x, t, known)
+    assert seen == [(torch.float32, torch.float32)] * len(net.blocks)
+    error = (found.float() - expected).norm() / expected.norm()
+    assert 1e-6 < error < 0.03
+
+
+def test_only_the_encoder_is_conditioned_on_the_source():
+    cascade = micro.denoiser(micro.config().cascade)
+    x, _, known = micro.conditions()
+    source = torch.randn_like(x)
+    given = replace(known, source=source, depth=None)
+    (s, head), (s2, head2) = (
+        cascade.embed(x, given),
+        cascade.embed(x, replace(given, source=source + 1)),
+    )
+    assert torch.equal(head, head2) and not torch.equal(s, s2)
