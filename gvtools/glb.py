@@ -23,6 +23,10 @@ TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<
 NUMBERS = {np.dtype(kind): number for number, kind in TYPES.items()}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 ITEMS = {width: name for name, width in WIDTHS.items()}
+# The node by which an exported glTF stands upright.
+UPRIGHT = "gvtools_upright"
+# What glTF and USD tell to be up where an export did not know it.
+UNKNOWN = [0.0, 0.0, 0.0]
 
 
 def read_gltf(path: Path) -> tuple[dict[str, Any], bytes]:
@@ -211,3 +215,50 @@ def srgb_bytes(linear: NDArray[np.float64]) -> NDArray[np.uint8]:
     linear = np.clip(linear, 0, 1)
     curved = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
     return np.rint(255 * curved).astype(np.uint8)
+
+
+def unit(told: Any, size: int = 3) -> NDArray[np.float64] | None:
+    """A direction or a quaternion of length 1; None for what it is not, as of other programs."""
+    try:
+        vector = np.asarray(told, np.float64)
+    except (TypeError, ValueError, OverflowError):
+        return None
+    length = float(np.linalg.norm(vector)) if vector.shape == (size,) else 0.0
+    return vector / length if 0 < length < np.inf else None
+
+
+def turn_back(turn: Any) -> NDArray[np.float64]:
+    """(3, 3) from the upright axes of an exported file to the input's, see ``turn_upright``."""
+    turn = unit(turn, 4)
+    if turn is None:
+        return np.eye(3)
+    # Without scipy, which the child process may not load any more.
+    cross = np.cross(np.eye(3), turn[:3])
+    return np.asarray(np.eye(3) - 2 * turn[3] * cross + 2 * cross @ cross)
+
+
+def glb_axes(tree: Mapping[str, Any]) -> tuple[NDArray[np.float64] | None, NDArray[np.float64]]:
+    """(3,) what is up in a glTF: what a node's extras say, else y, as the standard has it.
+
+    It is in the axes that the scene had before an export turned it upright; beside it (3, 3) from
+    the scene's axes to those.
+
+    >>> glb_axes({"nodes": [{"extras": {"up": [0, 0, 2]}}]})[0]
+    array([0., 0., 1.])
+    """
+    nodes = list(drawn_nodes(dict(tree)))
+    for node, matrix in nodes:
+        told = extras if isinstance(extras := node.get("extras"), dict) else {}
+        up = unit(told.get("up"))
+        if told.get("up") == UNKNOWN:
+            return None, np.eye(3)
+        if up is not None:
+            shown = unit(matrix[:3, :3] @ up)
+            # A node taken out of the one that turns it has the axes from before.
+            turned = shown is not None and shown[1] > shown @ up
+            back = turn_back(told.get("turn") if turned else None)
+            return None if shown is None else back @ shown, back
+    # Many programs keep the node that turns, but no extras.
+    turns = [matrix[:3, :3] for node, matrix in nodes if node.get("name") == UPRIGHT]
+    back = turns[0].T / np.cbrt(np.linalg.det(turns[0])) if turns else np.eye(3)
+    return back[:, 1], back

@@ -22,7 +22,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from gvtools.cameras import rigid_poses
 from gvtools.errors import GvError, MemoryFileError, OptionError
-from gvtools.glb import GLTF_ENDS, drawn_nodes, glb_numbers, read_gltf
+from gvtools.glb import (
+    GLTF_ENDS,
+    UNKNOWN,
+    drawn_nodes,
+    glb_axes,
+    glb_numbers,
+    read_gltf,
+    turn_back,
+    unit,
+)
 from gvtools.optional import installed, require
 from gvtools.ply import read_header, read_ply
 from gvtools.sandbox import Item, ReaderError, read_apart
@@ -58,10 +67,6 @@ KSPLAT_HEAD, KSPLAT_SECTION = 4096, 1024
 KSPLAT_RANGE = 1.5
 # glTF's extension, whose name the attributes' names begin with, and its colours that are read.
 KHR, SRGB = "KHR_gaussian_splatting", "srgb_rec709_display"
-# The node by which an exported glTF stands upright.
-UPRIGHT = "gvtools_upright"
-# What glTF and USD tell to be up where an export did not know it.
-UNKNOWN = [0.0, 0.0, 0.0]
 # Of a GLB, in which the extensions that it uses are named.
 GLB_HEAD = 1 << 20
 # Of a Gaussian in a glTF, in bytes.
@@ -249,22 +254,12 @@ def told_by(comments: Iterable[str]) -> dict[str, Any]:
             with suppress(ValueError):
                 vector = np.array([float(number) for number in value.split()])
                 if vector.shape == (3,) and np.isfinite(vector).all():
-                    told[name] = vector if name == "origin" else _unit(vector)
+                    told[name] = vector if name == "origin" else unit(vector)
         elif name == "splatrendermode:":
             told["mode"] = value.strip() if value.strip() in MODES else ""
         elif name == "antialiased":
             told["mode"] = "mip" if value.strip() == "1" else ""
     return told
-
-
-def _unit(told: Any, size: int = 3) -> Float64 | None:
-    """A direction or a quaternion of length 1; None for what it is not, as of other programs."""
-    try:
-        vector = np.asarray(told, np.float64)
-    except (TypeError, ValueError, OverflowError):
-        return None
-    length = float(np.linalg.norm(vector)) if vector.shape == (size,) else 0.0
-    return vector / length if 0 < length < np.inf else None
 
 
 def _read_splat(path: Path) -> Splats:
@@ -287,7 +282,7 @@ def _read_sog(path: Path) -> Splats:
     values = _rows(
         parts["positions"], parts["log_scales"], parts["quaternions"], logits=logits, sh=parts["sh"]
     )
-    return _splats(values, up=_unit(meta.get("up")), mode="mip" if meta.get("antialias") else "")
+    return _splats(values, up=unit(meta.get("up")), mode="mip" if meta.get("antialias") else "")
 
 
 def _read_ksplat(path: Path) -> Splats:
@@ -482,43 +477,6 @@ def _read_glb(path: Path) -> Splats:
     return _splats(values, center=center, up=up)
 
 
-def _turn_back(turn: Any) -> Float64:
-    """(3, 3) from the upright axes of an exported file to the input's, see ``turn_upright``."""
-    turn = _unit(turn, 4)
-    if turn is None:
-        return np.eye(3)
-    # Without scipy, which the child process may not load any more.
-    cross = np.cross(np.eye(3), turn[:3])
-    return np.asarray(np.eye(3) - 2 * turn[3] * cross + 2 * cross @ cross)
-
-
-def glb_axes(tree: Mapping[str, Any]) -> tuple[Float64 | None, Float64]:
-    """(3,) what is up in a glTF: what a node's extras say, else y, as the standard has it.
-
-    It is in the axes that the scene had before an export turned it upright; beside it (3, 3) from
-    the scene's axes to those.
-
-    >>> glb_axes({"nodes": [{"extras": {"up": [0, 0, 2]}}]})[0]
-    array([0., 0., 1.])
-    """
-    nodes = list(drawn_nodes(dict(tree)))
-    for node, matrix in nodes:
-        told = extras if isinstance(extras := node.get("extras"), dict) else {}
-        up = _unit(told.get("up"))
-        if told.get("up") == UNKNOWN:
-            return None, np.eye(3)
-        if up is not None:
-            shown = _unit(matrix[:3, :3] @ up)
-            # A node taken out of the one that turns it has the axes from before.
-            turned = shown is not None and shown[1] > shown @ up
-            back = _turn_back(told.get("turn") if turned else None)
-            return None if shown is None else back @ shown, back
-    # Many programs keep the node that turns, but no extras.
-    turns = [matrix[:3, :3] for node, matrix in nodes if node.get("name") == UPRIGHT]
-    back = turns[0].T / np.cbrt(np.linalg.det(turns[0])) if turns else np.eye(3)
-    return back[:, 1], back
-
-
 def _glb_rows(tree: dict[str, Any], body: bytes, attributes: Mapping[str, int]) -> Float32:
     def array(name: str) -> Float32:
         return glb_numbers(tree, body, attributes[name])
@@ -543,7 +501,7 @@ def _read_usd(path: Path) -> Splats:
     facts, parts = zip(*read_apart(USD, path), strict=True)
     placed = [place_gaussians(part["values"], part["matrix"]) for part in parts if "values" in part]
     values, center = _joined(placed)
-    return _splats(values, center=center, up=_unit(facts[0].get("up")))
+    return _splats(values, center=center, up=unit(facts[0].get("up")))
 
 
 def usd(path: Path) -> Iterator[Item]:
@@ -560,7 +518,7 @@ def usd(path: Path) -> Iterator[Item]:
         raise MemoryFileError("damaged, or names other files; expected one USD layer")
     cache, stage = UsdGeom.XformCache(), Usd.Stage.Open(layer)
     told, axis = layer.customLayerData, UsdGeom.GetStageUpAxis(stage)
-    back, up = _turn_back(told.get("turn")), _unit(told.get("up"))
+    back, up = turn_back(told.get("turn")), unit(told.get("up"))
     if not {"turn", "up"} & {*told}:
         # Many programs keep the prim that turns, but no data of the layer.
         turns = [np.array(cache.GetLocalToWorldTransform(prim))[:3, :3]

@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.errors import MemoryFileError
-from gvtools.glb import drawn_nodes, glb_colors, glb_numbers, read_gltf
+from gvtools.glb import drawn_nodes, glb_axes, glb_colors, glb_numbers, read_gltf
 from gvtools.kernels import compiled
 from gvtools.ply import point_vertices, read_header
 from gvtools.ranges import color_names, intensity_names, packed_names
 from gvtools.scans.points import CHUNK, GENERATED, Chunk, ScanFile, Station
-from gvtools.splat_files import glb_axes, holds_splats, read_splats
+from gvtools.splat_files import holds_splats, read_splats
 
 # A number and what parts it from the next one; what one takes at most.
 LEAST_TEXT, MOST_TEXT = 2, 64

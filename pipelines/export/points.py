@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 
 from gvtools.errors import GvError
 from gvtools.files import replaced_when_written
-from gvtools.glb import pack_glb
+from gvtools.glb import UNKNOWN, UPRIGHT, pack_glb
 from gvtools.memory.ply import export_memory_ply
 from gvtools.ply import up_comment
 from gvtools.runs.run import load_run
-from gvtools.splat_files import UNKNOWN, UPRIGHT, USD_ROOT
+from gvtools.splat_files import USD_ROOT
 from gvtools.splats import box_middle
 from pipelines.export.formats import ExportOptions
 from pipelines.export.source import ExportSource

@@ -20,12 +20,21 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import rigid_poses
 from gvtools.errors import MemoryFileError
-from gvtools.glb import GLB, GLTF_ENDS, glb_array, join_glb, read_gltf, split_glb, srgb_bytes
+from gvtools.glb import (
+    GLB,
+    GLTF_ENDS,
+    glb_array,
+    glb_axes,
+    join_glb,
+    read_gltf,
+    split_glb,
+    srgb_bytes,
+)
 from gvtools.optional import require
 from gvtools.ply import read_header
 from gvtools.sandbox import ReaderError, read_apart
 from gvtools.scenes.images import IMAGE_SUFFIXES
-from gvtools.splat_files import USD, glb_axes, told_by
+from gvtools.splat_files import USD, told_by
 from gvtools.untrusted import PIXEL_BYTES, PIXEL_RATIO, read_bytes, read_text
 
 if TYPE_CHECKING:
