@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from gvtools.cameras import Cameras
 from gvtools.errors import GvError
 from gvtools.scenes.depth_misfits import depth_findings
+from gvtools.scenes.matching import named
 from gvtools.scenes.pixel_contradictions import PixelCheck
 from gvtools.scenes.pose_forms import pose_findings
 from gvtools.scenes.scene import Finding, Frame, Scene, SparsePoints
@@ -27,8 +28,9 @@ Float64 = NDArray[np.float64]
 FOCAL = (0.1, 50.0)
 # Pictures whose grey levels deviate less than this show nothing.
 BLANK = 0.5
-# Mean reprojection error, pixels, above which a model is no good one.
-REPROJECTION = 4.0
+# A view's mean reprojection error, pixels, above which its camera is wrong, of so many detections;
+# from half of it on where others, of the lower quarter, have so many times less.
+REPROJECTION, DETECTIONS, TIMES_USUAL = 4.0, 10, 3.0
 
 
 @dataclass(frozen=True)
@@ -102,7 +104,7 @@ def inspect(scene: Scene, *, probes: int | None = None) -> SceneReport:
         findings.append(Finding("warning", "all cameras stand at the same place: no parallax"))
     errors = reprojection_errors(scene)
     findings += _views_without_depth(scene)
-    findings += _doubtful_cameras(scene, errors)
+    findings += camera_findings(scene, errors)
     findings += pixels.findings()
     findings += pose_findings(scene)
     findings += depth_findings(scene)
@@ -212,7 +214,7 @@ def _views_without_depth(scene: Scene) -> list[Finding]:
     return [Finding("info", message)]
 
 
-def _doubtful_cameras(scene: Scene, errors: np.ndarray) -> list[Finding]:
+def camera_findings(scene: Scene, errors: np.ndarray) -> list[Finding]:
     """Intrinsics that no camera has, and poses that the sparse points contradict."""
     findings = []
     K = np.array([view.camera.K[0] for view in scene.views]).reshape(-1, 3, 3)
@@ -227,12 +229,18 @@ def _doubtful_cameras(scene: Scene, errors: np.ndarray) -> list[Finding]:
             f"first {odd[0]}"
         )
         findings.append(Finding("warning", message))
-    known = errors[np.isfinite(errors)]
-    mean = float(known.mean()) if known.size else 0.0
-    if mean > REPROJECTION:
+    points = scene.points
+    rows = [] if points is None else points.rows_of_views(len(scene))
+    told = [n for n, own in enumerate(rows) if np.isfinite(errors[own]).sum() >= DETECTIONS]
+    means = np.array([np.nanmean(errors[rows[n]]) for n in told])
+    usual = float(np.quantile(means, 0.25)) if told else 0.0
+    high = means > min(REPROJECTION, max(REPROJECTION / 2, TIMES_USUAL * usual))
+    if high.any():
+        names = named([scene.views[n].name for n in np.array(told)[high]])
         message = (
-            f"the sparse points miss their detections by {mean:.3g} pixels on average; expected "
-            f"below {REPROJECTION:g}: poses or intrinsics are wrong"
+            f"the sparse points miss their detections by {means[high].mean():.3g} pixels on "
+            f"average in {high.sum()} of {len(told)} views ({names}); expected below "
+            f"{REPROJECTION:g}, and as in the others: poses or intrinsics of these are wrong"
         )
         findings.append(Finding("warning", message))
     return findings

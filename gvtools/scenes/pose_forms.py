@@ -39,9 +39,11 @@ JUDGED = 120
 # 0.98, of a tracker's poses 0.85 with changes of less than 0.08.
 LONGER, STEPS_OF_LENS, GAIN = (0.7, 0.8, 0.9, 1.1, 1.25, 1.45), (0.16, 0.08, 0.04), 0.005
 FITS, BENT, LARGE = 0.9, 0.82, 0.1
+# Views whose focal length differs by more than this share from the usual one may be wrong alone.
+UNUSUAL = 0.02
 # Views farther apart are not looked at where a pair moves by this share.
 ENOUGH = 0.08
-FLIP, NO_CHANGE = OPENCV_FROM_OPENGL, np.zeros(2)
+FLIP, NO_CHANGE = OPENCV_FROM_OPENGL, np.zeros(3)
 MIRRORED = [np.outer(signs, signs) for signs in ((1, -1, 1, 1), (1, 1, -1, 1))]
 
 
@@ -140,12 +142,16 @@ def pose_contradiction(
         return None
     cameras = scene.cameras
     scale = np.minimum(SIDE / np.maximum(cameras.width, cameras.height), 1)
-    pairs = _pairs(scene, chosen, scale, most_pairs=most_pairs)
+    focal = cameras.K[:, 0, 0] * scale
+    others = np.abs(focal[:, None] / focal[chosen] - 1) > UNUSUAL
+    usual = focal[chosen[int(others[chosen].sum(0).argmin())]]
+    odd = np.abs(focal / usual - 1) > UNUSUAL
+    pairs = _pairs(scene, chosen, scale, odd=odd, most_pairs=most_pairs)
     poses = cameras.cam_from_world
 
     def share(form: Callable[[Float64], Float64] = np.asarray, lens: Float64 = NO_CHANGE) -> float:
         K = cameras.K.copy()
-        K[:, (0, 1), (0, 1)] *= 1 + lens[0]
+        K[:, (0, 1), (0, 1)] *= 1 + lens[0] + lens[2] * odd[:, None]
         changed = [np.array([form(poses[view]) for view in pair.views]) for pair in pairs]
         found = (
             pair.share(K, both, scale=scale, near=near, k1=lens[1])
@@ -156,12 +162,15 @@ def pose_contradiction(
     if sum(len(pair.xy[0]) for pair in pairs) < JUDGED:
         return None
     now = share()
-    starts = [NO_CHANGE, *(np.array([times - 1, 0]) for times in LONGER)]
+    starts = [NO_CHANGE, *(axis * (times - 1) for times in LONGER for axis in np.eye(3)[::2])]
     nearest = max(starts, key=lambda start: share(lens=start))
     best, lens = climbed(partial(share, np.asarray), nearest, STEPS_OF_LENS, gain=GAIN)
     if now >= WRONG and (best < FITS or now >= BENT * best or np.abs(lens).max() < LARGE):
         return None
     way = f"focal lengths {lens[0]:+.0%}, k1 {lens[1]:+.2f}"
+    if lens[2]:
+        unusual = [scene.views[view].name for view in chosen if odd[view]]
+        way = f"focal lengths of {len(unusual)} views, first {unusual[0]}, {lens[2]:+.0%}; {way}"
     tried = {f"another lens fits, as of cropped pictures or wrong distortion ({way})": best}
     tried |= {reason: share(form) for reason, form in FORMS.items()}
     form = max(tried, key=lambda reason: tried[reason])
@@ -176,17 +185,25 @@ def pose_contradiction(
     return PoseContradiction(line, FORMS.get(form) if fits else None)
 
 
-def _pairs(scene: Scene, chosen: Sequence[int], scale: Float64, *, most_pairs: int) -> list[_Pair]:
-    """A few pairs of views, evenly spread, that show the same from places apart."""
+def _pairs(
+    scene: Scene, chosen: Sequence[int], scale: Float64, *, odd: NDArray[np.bool_], most_pairs: int
+) -> list[_Pair]:
+    """A few pairs of views, evenly spread, that show the same from places apart.
+
+    Where there are odd ones among them, one of each pair is.
+    """
     matcher, features = SiftMatcher(max_features=1500), dict[int, Features | None]()
     pairs = []
-    ends = np.linspace(0, len(chosen) - 2, most_pairs)
-    for row in sorted({*ends.round().astype(int).tolist()}):
+    unlike = odd[chosen]
+    starts = np.flatnonzero(np.diff(unlike)) if unlike.any() else np.arange(len(chosen) - 1)
+    ends = np.linspace(0, len(starts) - 1, most_pairs).round().astype(int)
+    for row in sorted({*starts[ends].tolist()}):
         found = None
-        for step in STEPS:
-            if row + step >= len(chosen):
-                break
-            views = chosen[row], chosen[row + step]
+        others = [row + step for step in STEPS if row + step < len(chosen)]
+        for other in others:
+            if unlike.any() and unlike[row] == unlike[other]:
+                continue
+            views = chosen[row], chosen[other]
             for view in views:
                 if view not in features:
                     features[view] = _features(scene, view, scale[view], matcher=matcher)

@@ -18,6 +18,7 @@ from gvtools.memory.panoramas import WIDEST_FRAME, LensOptions, Rig, picture_cam
 from gvtools.runs.digests import array_digest, fingerprint
 from gvtools.runs.poses import RunPoses, posed, with_poses
 from gvtools.scenes.depth_misfits import depth_findings
+from gvtools.scenes.inspection import camera_findings, reprojection_errors
 from gvtools.scenes.layout import is_address
 from gvtools.scenes.matching import natural
 from gvtools.scenes.pixel_contradictions import probed
@@ -361,6 +362,7 @@ def describe(plan: Plan, console: Console) -> None:
         )
     scene, context = plan.scene, plan.context
     met = (
+        *camera_findings(scene, reprojection_errors(scene)),
         *probed(scene, context),
         *pose_findings(scene, context, most_pairs=2),
         *depth_findings(scene),

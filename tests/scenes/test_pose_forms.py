@@ -86,6 +86,17 @@ def test_focal_lengths_of_pictures_that_were_cropped(tmp_path):
         assert "another lens fits" in found.message and said in found.message
 
 
+@pytest.mark.parametrize(("every", "times"), [(2, 1.2), (3, 0.85)])
+def test_focal_lengths_that_are_wrong_in_part_of_the_frames(room, every, times):
+    data = json.loads(room.read_text())
+    for frame in data["frames"][1::every]:
+        frame |= {key: times * frame[key] for key in ("fl_x", "fl_y")}
+    file = room.with_name("changed.json")
+    file.write_text(json.dumps(data))
+    (found,) = pose_findings(open_project(file))
+    assert "focal lengths of " in found.message
+
+
 DEPTH_K = np.array([[100.0, 0, 64.5], [0, 100, 48.5], [0, 0, 1]])
 COLOR_K = np.array([[90.0, 0, 63], [0, 91, 47], [0, 0, 1]])
 SIZE = (96, 128)
