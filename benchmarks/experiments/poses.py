@@ -7,7 +7,7 @@ pictures and those of another scene then show what comes from being told alone.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,14 +19,26 @@ from benchmarks.experiments.options import ExperimentOptions
 from benchmarks.experiments.rows import geoverse
 from gvtools.completers.geoverse.conditioning import encode_views
 from gvtools.completers.geoverse.model import GeoVerse
+from gvtools.errors import DegenerateError
 from gvtools.evaluation.tables import Column, Table
-from gvtools.networks.depth_anything.geometry_head import ViewGeometry
-from gvtools.networks.depth_anything.rays import poses_least_squares
+from gvtools.networks.depth_anything.geometry_head import ViewGeometry, camera_centres, rigid
 from gvtools.training.samples import TrainingBatch, collate
 from gvtools.training.small_model_stages import scene_unit
 from gvtools.training.views import ContextChoice, ProceduralViews
 
 READS = ("weights", "scenes", "size", "seed")
+
+
+# Share of the largest singular value below which the rays of a view do not span three directions.
+RANK = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class RayCameras:
+    """Cameras read from ray maps, float64 on the CPU."""
+
+    world_from_cam: Tensor  # (..., V, 4, 4) rigid, in the rays' frame and units
+    K: Tensor  # (..., V, 3, 3), pixels
 
 
 def run(options: ExperimentOptions) -> tuple[dict[str, Any], list[Table]]:
@@ -129,3 +141,65 @@ def _errors(geometry: ViewGeometry, batch: TrainingBatch) -> Tensor:
         torch.linalg.norm(centres - centres.mean(0), dim=-1),
     )
     return torch.stack(columns, dim=-1)[1:]
+
+
+@torch.no_grad()
+def poses_least_squares(
+    ray: Tensor,  # (..., V, h, w, 6); the first view is the reference
+    confidence: Tensor | None = None,  # (..., V, h, w) > 0, the weights w; None for equal ones
+    *,
+    size: tuple[int, int],  # (H, W) of the images that K is for, pixels
+    subsample: int = 4,  # step between cells
+    # Where in a cell its ray passes: 0 is published, 0.5 gives K in this project's convention (the
+    # first pixel's centre at 0.5). Poses are the same.
+    cell_offset: float = 0.0,
+) -> RayCameras:
+    """Poses by a linear fit of each view's directions, as Geometric Latent Diffusion takes them.
+
+    H of every view minimises Σ (w |H (x, y, 1)ᵀ - direction|)² over every ``subsample``-th cell;
+    K is H⁻¹ of the first view, R the rotation nearest to H_v K, the centre the weighted mean of all
+    origins. Rays with noise leave small numbers in K's lower triangle; they stay.
+    """
+    height, width = ray.shape[-3:-1]
+    ray, weight = _precise(ray, confidence)
+    centre = camera_centres(ray, weight)
+    y, x = torch.meshgrid(
+        torch.arange(0, height, subsample, dtype=ray.dtype) + cell_offset,
+        torch.arange(0, width, subsample, dtype=ray.dtype) + cell_offset,
+        indexing="ij",
+    )
+    cell = torch.stack((x, y, torch.ones_like(x)), dim=-1).flatten(0, 1)
+    weight = weight[..., ::subsample, ::subsample].flatten(-2)[..., None]
+    direction = ray[..., ::subsample, ::subsample, :3].flatten(-3, -2)
+    left, right = weight * cell, weight * direction
+    _check_rank(left, "cells with weight")
+    H = torch.linalg.lstsq(left, right).solution.mT
+    _check_rank(H, "directions")
+    K = torch.linalg.inv(H[..., :1, :, :])
+    rotation = nearest_rotation(H @ K)
+    K = K / K[..., 2:, 2:]
+    K = torch.tensor([size[1] / width, size[0] / height, 1], dtype=K.dtype)[:, None] * K
+    return RayCameras(rigid(rotation, centre), K.expand_as(H))
+
+
+def nearest_rotation(matrix: Tensor) -> Tensor:
+    """The rotation nearest to each (..., 3, 3) matrix in the Frobenius norm."""
+    u, _, vh = torch.linalg.svd(matrix)
+    sign = torch.linalg.det(u @ vh).sign()
+    return torch.cat((u[..., :2], u[..., 2:] * sign[..., None, None]), dim=-1) @ vh
+
+
+def _check_rank(rows: Tensor, what: str) -> None:
+    spread = torch.linalg.svdvals(rows)
+    if not bool((spread[..., 2] > RANK * spread[..., 0]).all()):
+        raise DegenerateError(f"{what} of a view do not span three dimensions; no pose follows")
+
+
+def _precise(ray: Tensor, confidence: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Rays and weights, float64 on the CPU: the fits are small and want the digits."""
+    ray = ray.detach().to("cpu", torch.float64)
+    if not bool(torch.isfinite(ray).all()):
+        raise DegenerateError("the ray map holds NaN or infinity; no pose follows")
+    if confidence is None:
+        return ray, torch.ones_like(ray[..., 0])
+    return ray, confidence.detach().to("cpu", torch.float64)

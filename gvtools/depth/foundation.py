@@ -24,14 +24,13 @@ from gvtools.depth.options import FoundationOptions
 from gvtools.depth.source import DepthMap, depth_of_points
 from gvtools.errors import CheckpointError, DegenerateError, OptionError
 from gvtools.networks.compute import autocast, inference_type
-from gvtools.networks.depth_anything.geometry_head import ViewGeometry
+from gvtools.networks.depth_anything.geometry_head import ViewGeometry, camera_centres
 from gvtools.networks.depth_anything.network import (
     DepthAnything3,
     find_weights,
     load_depth_anything,
     relative_cameras,
 )
-from gvtools.networks.depth_anything.rays import camera_centres
 from gvtools.scenes.scene import Frame, Scene, View
 from gvtools.similarity import align_depth_scale
 

@@ -30,7 +30,7 @@ from gvtools.completers.geoverse.flow import (
 from gvtools.completers.geoverse.model import GeoVerse, Prepared
 from gvtools.completers.geoverse.objective import flow_matching_loss, objective
 from gvtools.networks.compute import set_recompute
-from gvtools.networks.depth_anything.rays import camera_centres
+from gvtools.networks.depth_anything.geometry_head import camera_centres
 from gvtools.training.options import DenoiserStageOptions, ReflowStageOptions
 from gvtools.training.samples import Draws, TrainingBatch
 

@@ -8,15 +8,12 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from benchmarks.experiments.poses import nearest_rotation, poses_least_squares
 from gvtools.completers.geoverse.conditioning import HintConfig, ViewBatch, encode_views
 from gvtools.errors import DegenerateError
 from gvtools.networks.depth_anything.encoder import patch_rays
+from gvtools.networks.depth_anything.geometry_head import camera_centres
 from gvtools.networks.depth_anything.network import DepthAnything3
-from gvtools.networks.depth_anything.rays import (
-    camera_centres,
-    nearest_rotation,
-    poses_least_squares,
-)
 
 SIZE = (84, 112)
 GRID = (24, 32)

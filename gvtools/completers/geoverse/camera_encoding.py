@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from gvtools.networks.depth_anything.rays import rigid
+from gvtools.networks.depth_anything.geometry_head import rigid
 
 # (x, y) added to column and row. The half pixel to the left is an oddity of the published weights.
 GLD_PIXEL_OFFSET = (-0.5, 0.5)

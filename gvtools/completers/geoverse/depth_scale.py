@@ -20,8 +20,7 @@ from gvtools.completers.base import ScaleAlignment, ScaleStatus
 from gvtools.completers.geoverse.objective import center_similarity
 from gvtools.completers.push_pull import push_pull
 from gvtools.errors import DegenerateError
-from gvtools.networks.depth_anything.geometry_head import ViewGeometry
-from gvtools.networks.depth_anything.rays import camera_centres
+from gvtools.networks.depth_anything.geometry_head import ViewGeometry, camera_centres
 from gvtools.similarity import ScaleFit, align_depth_scale
 
 # Fewer centres fit each other by chance: of four at random, one set in a hundred correlates by more

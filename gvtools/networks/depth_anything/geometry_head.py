@@ -13,6 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from gvtools.errors import DegenerateError
 from gvtools.networks.compute import Recomputing
 
 
@@ -276,3 +277,23 @@ def _with_positions(x: Tensor, image: tuple[int, int], *, ratio: float = 0.1) ->
     along_y = tables[1][:, None].expand(-1, width, -1)
     table = torch.cat((along_x, along_y), dim=-1).permute(2, 0, 1)
     return x + ratio * table.to(x.dtype)
+
+
+def camera_centres(ray: Tensor, confidence: Tensor | None = None) -> Tensor:
+    """(..., 3) mean of the origins of each view's rays (..., h, w, 6), weighted; differentiable."""
+    origin = ray[..., 3:]
+    if confidence is None:
+        return origin.mean(dim=(-3, -2))
+    total = confidence.sum(dim=(-2, -1))
+    if not bool((total > 0).all() & (confidence >= 0).all() & torch.isfinite(total).all()):
+        raise DegenerateError(
+            "ray confidences are negative, not finite, or 0 all over a view; expected weights"
+        )
+    return (origin * confidence[..., None]).sum(dim=(-3, -2)) / total[..., None]
+
+
+def rigid(rotation: Tensor, translation: Tensor) -> Tensor:
+    """(..., 4, 4) of (..., 3, 3) and (..., 3)."""
+    top = torch.cat((rotation, translation[..., None]), dim=-1)
+    last = torch.eye(4, dtype=top.dtype, device=top.device)[3:].expand(*top.shape[:-2], 1, 4)
+    return torch.cat((top, last), dim=-2)

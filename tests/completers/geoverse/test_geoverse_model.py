@@ -34,8 +34,8 @@ from gvtools.completers.geoverse.weights import (
     untrained_branches,
 )
 from gvtools.errors import CheckpointError
+from gvtools.networks.depth_anything.geometry_head import camera_centres
 from gvtools.networks.depth_anything.network import DepthAnything3
-from gvtools.networks.depth_anything.rays import camera_centres
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 INJECTIONS = ("none", "control", "shared")
