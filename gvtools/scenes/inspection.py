@@ -284,6 +284,8 @@ NEIGHBORS = 6
 SIDE, WINDOW, SHIFT = 48, 9, 3
 # A window has contrast from this standard deviation, grey levels, and agrees from this correlation.
 CONTRAST, AGREE = 4.0, 0.5
+# Rows of one are as bright as those of the other, up to these factors.
+GAINS = (0.6, 1.7)
 # Pictures can be compared when this share of them has contrast, and contradict each other when more
 # than the second share of that disagrees. On six real scenes it is at most 0.03.
 COMPARABLE, DISAGREEING = 0.3, 0.15
@@ -437,9 +439,13 @@ def disagreement(
     so that ending early never turns a pair into a contradiction or back. Most pairs agree at once,
     unshifted.
     """
-    x = a.grey - a.grey.mean()
+    x = a.grey
     y, valid = _carried(b, H, a.grey.shape)
     mask = (valid & a.valid).astype(np.float32)
+    # A lamp that flickers lights other rows in each picture, or columns of turned ones.
+    for axis in (0, 1):
+        light = [(mask * picture).sum(axis, keepdims=True) for picture in (x, y)]
+        y = y * np.clip(light[0] / np.maximum(light[1], 1), *GAINS)
     weight = np.maximum(_window(mask), 1e-6)
     mean_y = _window(mask * y) / weight
     var_y = np.maximum(_window(mask * y * y) / weight - mean_y**2, 0)
@@ -491,7 +497,7 @@ def _carried(
     """The second picture seen from the first's orientation, and where it is known."""
     size = shape[1], shape[0]
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    grey = cv2.warpPerspective(b.grey - b.grey.mean(), H, size, flags=flags)
+    grey = cv2.warpPerspective(b.grey, H, size, flags=flags)
     valid = cv2.warpPerspective(b.valid.astype(np.float32), H, size, flags=flags)
     return np.asarray(grey, np.float32), valid > 0.99
 

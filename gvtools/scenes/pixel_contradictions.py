@@ -30,6 +30,9 @@ Grey = NDArray[np.float32]
 # mirrored it is 0.5 at most, and cropped by a tenth at each border 0.2 to 0.6 in the middle of a
 # scene's views.
 TRACKS, AGREE = 20, 0.65
+# Pictures of a longer side below this many pixels have less detail: what they lack of it, times
+# the second, is taken off.
+SMALL, LESS = 200, 0.35
 # Nothing is told by detail of a smaller deviation than this, grey levels.
 CONTRAST = 2.0
 # Detail is what a blur over this share of the longer side takes away.
@@ -80,6 +83,8 @@ class PixelCheck:
         self.values = np.full(len(self.points.point_index), np.nan)
         self.kept = dict.fromkeys(self.most_in_common(range(len(scene))), np.zeros((0, 0), np.int8))
         self.swapped = dict[int, bool]()
+        sides = [max(*view.camera.width, *view.camera.height) for view in scene.views]
+        self.agree = AGREE - LESS * max(0, 1 - max(sides, default=SMALL) / SMALL)
 
     def most_in_common(self, numbers: Iterable[int]) -> list[int]:
         """The few views among ``numbers`` that have most tracks in common with one of them."""
@@ -187,15 +192,15 @@ class PixelCheck:
     def findings(self) -> list[Finding]:
         """A warning where photographs and detections disagree."""
         judged = self.agreements()
-        wrong = [n for n, s in judged.items() if s < AGREE]
-        if self.rough and (len(judged) < ROUGH or np.median([*judged.values()]) >= AGREE):
+        wrong = [n for n, s in judged.items() if s < self.agree]
+        if self.rough and (len(judged) < ROUGH or np.median([*judged.values()]) >= self.agree):
             return []
         # Depth of a wrong unit says of no place where it is.
         if self.rough and wrong and unit_findings(self.scene):
             return []
         # Right ones that were compared with wrong ones are cleared.
         judged |= self.agreements(without=wrong)
-        wrong = sorted((n for n in wrong if judged[n] < AGREE), key=lambda n: judged[n])
+        wrong = sorted((n for n in wrong if judged[n] < self.agree), key=lambda n: judged[n])
         findings = list[Finding]()
         if swapped := [n for n, turned in self.swapped.items() if turned and n not in wrong]:
             line = (
@@ -213,7 +218,7 @@ class PixelCheck:
         place = "the same places by depth" if self.rough else "detections"
         message = (
             f"{len(wrong)} of {len(judged)} photographs do not show what their cameras saw "
-            f"({len(wrong) / len(judged):.0%}; correlation at {place} below {AGREE:g}): "
+            f"({len(wrong) / len(judged):.0%}; correlation at {place} below {self.agree:.2g}): "
             f"{names}{self._reason(wrong) or (moved and f'; they are {moved}')}; renumbered, "
             f"mirrored, cropped or turned pictures give wrong results: {GIVE}"
         )
@@ -234,7 +239,7 @@ class PixelCheck:
                     values[self.rows[number]] = self._at_detections(number, change(grey))
             scores = self.agreements(values)
             fit = [scores[number] for number in chosen if number in scores]
-            if fit and np.median(fit) > AGREE:
+            if fit and np.median(fit) > self.agree:
                 return f"; {reason}"
         return ""
 
@@ -287,8 +292,9 @@ def detailed(
 
 
 def shown(rgb: NDArray[np.uint8]) -> Grey:
-    """(H, W) detail, as it is compared: of three by three pixels."""
-    return np.asarray(cv2.blur(detail(rgb), (3, 3)), np.float32)
+    """(H, W) detail, as it is compared: of three by three pixels, without bands of light."""
+    found = np.asarray(cv2.blur(detail(rgb), (3, 3)), np.float32)
+    return np.asarray(found - found.mean(1, keepdims=True))
 
 
 def detail(rgb: NDArray[np.uint8]) -> Grey:

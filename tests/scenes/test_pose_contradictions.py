@@ -46,14 +46,17 @@ def camera_at(center: np.ndarray, rotation: np.ndarray) -> Cameras:
     return Cameras.pinhole(WIDTH, HEIGHT, focal=FOCAL, cam_from_world=pose)
 
 
-def walk(views: int = 12, *, spread: float = 0.02, wrong: tuple[int, ...] = ()) -> Scene:
+def walk(
+    views: int = 12, *, spread: float = 0.02, wrong: tuple[int, ...] = (), lit: float = 0.0
+) -> Scene:
     """Two views at each of places ``spread`` apart; those of ``wrong`` saw the other wall."""
     rng = np.random.default_rng(3)
     made = []
     for i in range(views):
         rotation = turned(*rng.uniform(-3, 3, 3))
         camera = camera_at(np.array([spread * (i // 2), *rng.uniform(-0.02, 0.02, 2)]), rotation)
-        rgb = wall_picture(camera, WALLS[i in wrong])
+        band = (np.arange(HEIGHT) // 12 + i) % 2
+        rgb = wall_picture(camera, WALLS[i in wrong]) * (1 - lit * band[:, None, None])
         exposure = rng.uniform(0.6, 1.1)
         rgb = np.clip(255 * (rgb / 255.0) ** rng.uniform(0.8, 1.4) * exposure, 0, 255)
         frame = Frame(rgb.astype(np.uint8), np.full((HEIGHT, WIDTH), FAR, np.float32))
@@ -81,6 +84,7 @@ def test_exposure_and_small_turns_are_no_contradiction() -> None:
     scene = walk()
     assert contradiction_messages(scene) == []
     assert contradiction_messages(without_depth(scene)) == []
+    assert contradiction_messages(walk(lit=0.45)) == []
 
 
 def test_half_of_the_views_with_poses_of_the_other_side_are_told() -> None:
