@@ -16,7 +16,6 @@ from gvtools.completers import (
     ContextView,
     ScaleAlignment,
     ScaleStatus,
-    available,
     create,
     register,
 )
@@ -68,14 +67,6 @@ def painter():
 
 def _camera(width: int = 8) -> Cameras:
     return Cameras.pinhole(width, 6, focal=10)
-
-
-# One that reads weights is created with a folder of them, in its own tests.
-@pytest.mark.parametrize("name", [name for name in available() if name != "geoverse"])
-def test_every_registered_name_creates_a_completer_of_that_name(name):
-    completer = create(name)
-    assert isinstance(completer, Completer)
-    assert completer.name == name
 
 
 def test_listing_the_completers_imports_none_of_them():
@@ -344,15 +335,6 @@ def test_the_radius_of_a_hole_is_its_inner_one(radius):
     valid = guidance_with(radius).valid[0]
     # The middle pixel lies that far from the rim.
     assert hole_radius(valid) == pytest.approx(radius / 100, abs=1e-6)
-
-
-def test_the_radius_at_the_ends():
-    full = np.ones((HEIGHT, WIDTH), bool)
-    assert hole_radius(full) == 0
-    assert hole_radius(~full) == float("inf")
-    strip = full.copy()
-    strip[:, :10] = False
-    assert hole_radius(strip) == pytest.approx(0.1)
 
 
 def test_small_holes_go_to_the_cheap_one_and_the_rest_stay_as_they_were():

@@ -10,7 +10,7 @@ from consistency_scene import real_pictures
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
-from walls import HEIGHT, WALLS, WIDTH, blotches, camera_at, photograph
+from walls import HEIGHT, WALLS, WIDTH, Float64, Take, blotches, camera_at, photograph
 
 from gvtools.cameras import Cameras
 from gvtools.errors import CheckpointError, DegenerateError, ShapeError
@@ -27,7 +27,36 @@ from gvtools.evaluation.pose_probe import (
 from gvtools.evaluation.posed_picture import PosedPicture
 from gvtools.features import SiftMatcher, mutual_nearest
 
-pytest_plugins = ("wall_fixtures",)
+
+@pytest.fixture(scope="session")
+def textures() -> list[Float64]:
+    rng = np.random.default_rng(7)
+    return [blotches(rng) for _ in WALLS]
+
+
+@pytest.fixture(scope="session")
+def take(textures: list[Float64]) -> Take:
+    def taken(camera: Cameras, claim: Cameras | None = None) -> PosedPicture:
+        picture = photograph(camera, textures)
+        # No depth: what a generated picture is.
+        return dataclasses.replace(picture, camera=claim or camera, depth=None)
+
+    return taken
+
+
+@pytest.fixture(scope="session")
+def context(textures: list[Float64]) -> list[PosedPicture]:
+    cameras = [
+        camera_at((0.25 * i - 0.5, 0.1 * (i % 2), 0.1 * i), turn=(3 * i - 4, 10 - 6 * i, 2 * i),
+                  name=f"c{i}")
+        for i in range(5)
+    ]  # fmt: skip
+    return [photograph(camera, textures) for camera in cameras]
+
+
+@pytest.fixture(scope="session")
+def probe(context: list[PosedPicture]) -> PoseProbe:
+    return PoseProbe(context)
 
 
 def test_a_picture_is_located_where_it_was_taken(probe, take):

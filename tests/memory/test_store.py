@@ -11,7 +11,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from memory_scenes import camera, plane_view, points, random_memory, random_points
+from memory_scenes import camera, plane_view, random_memory, random_points
 
 from gvtools.errors import DegenerateError, OptionError, ShapeError
 from gvtools.memory.spatial_memory import MemoryOptions, SpatialMemory, TiledMemory
@@ -134,12 +134,6 @@ def test_a_device_that_is_not_there_is_refused():
     if not torch.cuda.is_available():
         with pytest.raises(OptionError, match="where Open3D finds CUDA"):
             random_memory(1).to("cuda:0")
-
-
-@pytest.mark.parametrize("number", [-1, 65536])
-def test_a_round_out_of_range_is_refused(number):
-    with pytest.raises(OptionError, match="expected 0 to 65535"):
-        SpatialMemory(0.1).fuse(points([(0, 0, 1)]), round=number)
 
 
 def test_a_deep_copy_and_a_recoloured_one_leave_the_memory_alone():

@@ -27,8 +27,6 @@ from pipelines.cli import COMMANDS, build_parser, main
 from pipelines.commands.arguments import SceneArguments
 from pipelines.commands.weights import WeightsCommand
 
-pytestmark = pytest.mark.usefixtures("unpainted")
-
 RUN = ("--context", "first:2", "--targets", "range:2-5", "--views-per-round", "2", "--quiet")
 
 

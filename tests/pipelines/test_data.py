@@ -326,8 +326,6 @@ def test_shards_that_cannot_be_are_one_line(arguments, complaint, download, tmp_
     assert complaint in refused(capsys, "data", *words)
 
 
-pytestmark = pytest.mark.usefixtures("unpainted")
-
 ADDRESS = "spec:7-Scenes:wall/seq-01"
 
 

@@ -35,8 +35,6 @@ from pipelines.reconstruction.settings import RunSettings
 from pipelines.rendering import FilmRenderer, film_cameras, write_film
 from pipelines.spherical_metadata import mark_mp4
 
-pytestmark = pytest.mark.usefixtures("unpainted")
-
 
 @pytest.fixture(scope="module")
 def box(tmp_path_factory):

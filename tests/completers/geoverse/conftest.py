@@ -1,4 +1,4 @@
-"""Weights folders that the tests of the generative core share, and copies of them to damage."""
+"""One thread for all tests of the generative core; weights folders, and copies to be damaged."""
 
 from __future__ import annotations
 
@@ -8,6 +8,11 @@ from pathlib import Path
 import geoverse_models as micro
 import pytest
 from geoverse_folders import PLAIN, write_source
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _one_thread(one_thread: None) -> None:
+    pass
 
 
 @pytest.fixture(scope="session")

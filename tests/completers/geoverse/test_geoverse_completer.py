@@ -38,7 +38,7 @@ from pipelines.cli import main
 pytest.importorskip("safetensors", reason="weights are read with safetensors")
 
 
-pytestmark = pytest.mark.usefixtures("one_thread", "unpainted")
+pytestmark = pytest.mark.usefixtures("unpainted")
 
 
 def complete(

@@ -26,8 +26,6 @@ from gvtools.completers.geoverse.conditioning import (
 from gvtools.completers.geoverse.denoiser import Conditions, DenoiserBlock
 from gvtools.completers.geoverse.views import model_size, view_batch
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 PAPER = HintConfig()
 KNOWN_CAMERAS = HintConfig(cameras=True)
 

@@ -35,7 +35,6 @@ def test_wrong_ranges_in_a_file_are_refused():
         from_json(GeoVerseConfig, [data] * 1000)
 
 
-@pytest.mark.usefixtures("one_thread")
 def test_views_decoded_at_once_change_the_memory_alone(monkeypatch):
     batch = micro.batch(2, context=2, targets=3)
     whole = micro.model(micro.config(decode_views=100)).generate(batch).decoded

@@ -6,7 +6,7 @@ import geoverse_models as micro
 import numpy as np
 import pytest
 import torch
-from random_poses import cameras, rigid
+from scipy.spatial.transform import Rotation
 
 from gvtools.cameras import Cameras, invert_rigid
 from gvtools.completers.base import ScaleStatus
@@ -30,8 +30,30 @@ from gvtools.completers.geoverse.views import resample_depth
 from gvtools.networks.compute import attend
 from gvtools.networks.depth_anything.geometry_head import ViewGeometry
 
+
+def rigid(count: int, *, seed: int = 0, reach: float = 1.0) -> torch.Tensor:
+    """(count, 4, 4) random rigid poses, positions up to ``reach`` from the origin."""
+    rng = np.random.default_rng(seed)
+    pose = np.tile(np.eye(4), (count, 1, 1))
+    pose[:, :3, :3] = Rotation.random(count, random_state=seed).as_matrix()
+    pose[:, :3, 3] = rng.uniform(-reach, reach, (count, 3))
+    return torch.from_numpy(pose)
+
+
+def cameras(
+    batch: int = 2, views: int = 3, dtype: torch.dtype = torch.float64
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Poses (batch, views, 4, 4) and intrinsics (batch, views, 3, 3) for 84 x 112 pixels."""
+    pose = rigid(batch * views, seed=5).unflatten(0, (batch, views))
+    rng = np.random.default_rng(6)
+    K = np.tile(np.eye(3), (batch, views, 1, 1))
+    K[..., 0, 0], K[..., 1, 1] = rng.uniform(70, 130, (2, batch, views))
+    K[..., 0, 2], K[..., 1, 2] = 56 + rng.uniform(-5, 5, (2, batch, views))
+    return pose.to(dtype), torch.from_numpy(K).to(dtype)
+
+
 ALIGNMENTS = ("centres", "hint", "field")
-pytestmark = pytest.mark.usefixtures("one_thread")
+
 
 SIZE = (30, 40)
 
@@ -411,17 +433,6 @@ def test_without_cameras_only_the_mask_and_what_the_mode_keeps_is_left(mode, pos
     assert given.map[:, :, 1:].any()
 
 
-def test_autocast_and_half_precision_leave_the_map_in_single():
-    pose, K = cameras(dtype=torch.float32)
-    exact = camera_condition(pose, K, ENCODED, context=1)
-    with torch.autocast("cpu", dtype=torch.bfloat16):
-        under = camera_condition(pose, K, ENCODED, context=1)
-    torch.testing.assert_close(under.map, exact.map, rtol=0, atol=0)
-    torch.testing.assert_close(under.cam_from_world, exact.cam_from_world, rtol=0, atol=0)
-    half = camera_condition(pose.bfloat16(), K.bfloat16(), ENCODED, context=1)
-    assert half.map.dtype == half.cam_from_world.dtype == torch.float32
-
-
 PICTURE = (84, 112)
 GRID = (3, 4)
 
@@ -502,17 +513,3 @@ def test_keys_of_a_coarser_grid_lie_at_the_centres_of_their_tokens():
     torch.testing.assert_close(coarse.sin[:, :, 0], torch.stack((x, y), -1).sin())
     fine = Projective(pose, K, PICTURE, grid=GRID, head_dim=8)
     torch.testing.assert_close(coarse.key_matrix, fine.key_matrix)
-
-
-def test_half_precision_rounds_the_result_only():
-    pose, K = cameras(dtype=torch.float32)
-    encoding = Projective(pose, K, PICTURE, grid=GRID, head_dim=24)
-    assert encoding.matrix.dtype == encoding.cos.dtype == torch.float32
-    x = tokens(24, dtype=torch.bfloat16)
-    for method in (encoding.query, encoding.key, encoding.value, encoding.output):
-        low = method(x)
-        assert low.dtype == torch.bfloat16
-        torch.testing.assert_close(low, method(x.float()).bfloat16(), rtol=0, atol=0)
-        with torch.autocast("cpu", dtype=torch.bfloat16):
-            under = method(x.float())
-        torch.testing.assert_close(under, method(x.float()), rtol=0, atol=0)

@@ -37,7 +37,6 @@ from gvtools.errors import CheckpointError
 from gvtools.networks.depth_anything.geometry_head import camera_centres
 from gvtools.networks.depth_anything.network import DepthAnything3
 
-pytestmark = pytest.mark.usefixtures("one_thread")
 INJECTIONS = ("none", "control", "shared")
 BOUNDS = (1.0, 0.7, 0.5, 0.2, 0.0)
 

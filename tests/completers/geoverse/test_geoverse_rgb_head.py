@@ -152,7 +152,6 @@ def test_chunks_change_neither_pictures_nor_gradients(chunk):
         torch.testing.assert_close(parts, whole)
 
 
-pytestmark = pytest.mark.usefixtures("one_thread")
 REFINER = RefinerConfig(widths=(8, 16))
 
 

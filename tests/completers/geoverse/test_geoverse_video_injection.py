@@ -20,7 +20,6 @@ from gvtools.completers.geoverse.video_injection import (
 )
 from gvtools.errors import OptionError
 
-pytestmark = pytest.mark.usefixtures("one_thread")
 LAYERS = micro.LAYERS
 
 
@@ -58,14 +57,6 @@ def gradients(case: Case) -> dict[str, set[bool]]:
         assert parameter.grad is not None
         found.setdefault(name.split(".")[0], set()).add(bool(parameter.grad.any()))
     return found
-
-
-def test_a_fresh_branch_leaves_the_denoiser_as_it_is():
-    case = Case()
-    residuals = case.residuals()
-    assert set(residuals) == set(LAYERS)
-    assert not any(residual.any() for residual in residuals.values())
-    assert torch.equal(case.velocity(residuals), case.velocity())
 
 
 def test_the_outputs_learn_first_and_the_rest_of_the_branch_after_them():

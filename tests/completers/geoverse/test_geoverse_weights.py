@@ -40,8 +40,6 @@ from gvtools.errors import CheckpointError, GvError, ProjectError
 from gvtools.networks.config_json import to_json
 from gvtools.networks.tensors import STORED_TYPES, TensorFiles, save_tensors
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 
 @cache
 def empty() -> GeoVerse:

@@ -63,15 +63,6 @@ def test_a_slanted_plane_is_measured(slanted, stereo):
     assert (found.confidence > 0).all() and (found.confidence <= 1).all()
 
 
-def test_the_same_twice_and_after_other_views(slanted, stereo):
-    scene = slanted.scene
-    second = PlaneSweepStereo(scene, options=OPTIONS, views=scene.names)
-    second.depth(scene, scene["v0"], scene["v0"].load())
-    one, two = (each.depth(scene, scene["v2"], scene["v2"].load()) for each in (stereo, second))
-    np.testing.assert_array_equal(one.depth, two.depth)
-    np.testing.assert_array_equal(one.confidence, two.confidence)
-
-
 def test_other_views_are_never_looked_at(slanted):
     def forbidden() -> Frame:
         raise AssertionError("a held-out picture was read")

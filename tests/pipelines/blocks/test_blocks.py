@@ -38,8 +38,6 @@ from pipelines.reconstruction.fitting import Fitted
 from pipelines.reconstruction.plan import Plan
 from pipelines.reconstruction.settings import RunSettings
 
-pytestmark = pytest.mark.usefixtures("unpainted")
-
 QUIET = Console(quiet=True)
 # The last view sees what no other does.
 CONTEXT, TARGETS = "not:every:6+3", "every:6+3"

@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pycolmap
@@ -10,10 +11,10 @@ import pytest
 import torch
 from box_project import fused
 from export_runs import Y_UP, export_run, glb_colors
+from numpy.typing import NDArray
 from PIL import Image
-from plain_splats import draw, read_splats
 from plyfile import PlyData
-from reference_gaussians import rotations
+from reference_gaussians import harmonics, rotations
 
 from gvtools.errors import OptionError, ProjectError
 from gvtools.memory.ply import export_memory_ply
@@ -23,6 +24,91 @@ from gvtools.runs.run import load_appearance
 from gvtools.scenes.project import open_project
 from pipelines.export.formats import FORMATS
 from pipelines.rendering import render_view
+
+NEAR, DILATION, MOST, LEAST = 0.01, 0.3, 0.99, 1 / 255
+
+
+def read_splats(path: Path) -> dict[str, NDArray[np.float64]]:
+    """Positions, sizes, rotations, opacities and harmonics (N, H, 3) of a splat PLY."""
+    vertex = PlyData.read(str(path))["vertex"]
+
+    def stacked(*names: str) -> NDArray[np.float64]:
+        return np.stack([np.asarray(vertex[name], np.float64) for name in names], axis=1)
+
+    rest = sum(each.name.startswith("f_rest") for each in vertex.properties)
+    dc = stacked(*(f"f_dc_{k}" for k in range(3)))[:, None]
+    sh = [dc]
+    if rest:
+        of_channel = stacked(*(f"f_rest_{k}" for k in range(rest))).reshape(len(dc), 3, -1)
+        # Readers take 45 coefficients; none above degree 2 is used.
+        assert rest == 45 and not of_channel[:, :, 8:].any()
+        sh.append(of_channel[:, :, :8].transpose(0, 2, 1))
+    return {
+        "positions": stacked("x", "y", "z"),
+        "sizes": np.exp(stacked(*(f"scale_{k}" for k in range(3)))),
+        "rotations": stacked(*(f"rot_{k}" for k in range(4))),
+        "opacities": 1 / (1 + np.exp(-np.asarray(vertex["opacity"], np.float64))),
+        "harmonics": np.concatenate(sh, axis=1),
+    }
+
+
+def draw(
+    splats: dict[str, NDArray[np.float64]],
+    cam_from_world: NDArray[np.float64],
+    K: NDArray[np.float64],
+    *,
+    size: tuple[int, int],
+) -> NDArray[np.float64]:
+    """(H, W, 3) colours, 0 to 1, of a camera (4, 4), (3, 3) of width and height ``size``."""
+    width, height = size
+    R, t = cam_from_world[:3, :3], cam_from_world[:3, 3]
+    points = splats["positions"] @ R.T + t
+    order = np.argsort(points[:, 2], kind="stable")
+    order = order[points[order, 2] > NEAR]
+    x, y, z = points[order].T
+    xy = np.stack([K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]], axis=1)
+    V = _covariances(splats, order, points[order], R=R, K=K, size=size)
+    colors = _colors(splats, order, eye=-R.T @ t)
+    opacities = splats["opacities"][order]
+    image, clear = np.zeros((height, width, 3)), np.ones((height, width))
+    reach = np.sqrt(np.maximum(2 * np.log(np.maximum(opacities / LEAST, 1e-9)), 0))[:, None]
+    half = reach * np.sqrt(np.stack([V[:, 0, 0], V[:, 1, 1]], axis=1))
+    first = np.maximum(np.floor(xy - half), 0).astype(int)
+    last = np.minimum(np.ceil(xy + half) + 1, size).astype(int)
+    conics = np.linalg.inv(V)
+    for i in np.flatnonzero((first < last).all(axis=1) & (opacities > LEAST)):
+        columns = np.arange(first[i, 0], last[i, 0]) + 0.5 - xy[i, 0]
+        rows = np.arange(first[i, 1], last[i, 1])[:, None] + 0.5 - xy[i, 1]
+        a, b, c = conics[i, 0, 0], conics[i, 0, 1], conics[i, 1, 1]
+        q = a * columns**2 + 2 * b * columns * rows + c * rows**2
+        alpha = np.minimum(opacities[i] * np.exp(-q / 2), MOST)
+        alpha[alpha < LEAST] = 0
+        where = slice(first[i, 1], last[i, 1]), slice(first[i, 0], last[i, 0])
+        image[where] += (clear[where] * alpha)[..., None] * colors[i]
+        clear[where] *= 1 - alpha
+    return np.clip(image, 0, 1)
+
+
+def _covariances(splats, order, points, *, R, K, size):
+    """(M, 2, 2) in the picture [px^2]."""
+    x, y, z = points.T
+    ends = [1.3 * side / 2 / f for side, f in zip(size, (K[0, 0], K[1, 1]), strict=True)]
+    ux, uy = np.clip(x / z, -ends[0], ends[0]), np.clip(y / z, -ends[1], ends[1])
+    J = np.zeros((len(points), 2, 3))
+    J[:, 0, 0], J[:, 1, 1] = K[0, 0] / z, K[1, 1] / z
+    J[:, 0, 2], J[:, 1, 2] = -J[:, 0, 0] * ux, -J[:, 1, 1] * uy
+    turns = rotations(torch.from_numpy(splats["rotations"][order])).numpy()
+    M = J @ R @ (turns * splats["sizes"][order][:, None])
+    return M @ M.transpose(0, 2, 1) + DILATION * np.eye(2)
+
+
+def _colors(splats, order, *, eye):
+    """(M, 3) as seen from a point."""
+    sh = splats["harmonics"][order]
+    away = splats["positions"][order] - eye
+    away /= np.linalg.norm(away, axis=1, keepdims=True)
+    basis = harmonics(torch.from_numpy(away)).numpy()[:, : sh.shape[1]]
+    return np.maximum(0.5 + np.einsum("mh,mhc->mc", basis, sh), 0)
 
 
 @pytest.fixture(scope="module")

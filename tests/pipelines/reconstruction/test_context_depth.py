@@ -17,8 +17,6 @@ from gvtools.errors import DegenerateError
 from gvtools.scenes.scene import Frame, Scene, View
 from pipelines.cli import main
 
-pytestmark = pytest.mark.usefixtures("unpainted")
-
 RUN = ("--targets", "range:3-4", "--views-per-round", "1", "--context", "first:3",
        "--refine", "0", "--set", "refine.poses=false",
        "--depth", "plane-sweep", "--quiet")  # fmt: skip

@@ -43,8 +43,6 @@ from pipelines.reconstruction.prepare import make_plan
 from pipelines.reconstruction.run import _empty_memory
 from pipelines.reconstruction.settings import RunSettings
 
-pytestmark = pytest.mark.usefixtures("unpainted")
-
 SETTINGS = ("context=first:8", "targets=range:8-9", "views_per_round=1", "depth=auto",
             "fusion.max_psnr_drop_db=none", "refine.most_gaussians=2000")  # fmt: skip
 # Fewer show so little that the blend takes all of the memory's detail.

@@ -16,8 +16,6 @@ from gvtools.depth.stereo.plane_sweep import PlaneSweepStereo
 from gvtools.errors import DegenerateError
 from pipelines.cli import main
 
-pytestmark = pytest.mark.usefixtures("unpainted")
-
 RUN = ("--context", "every:2", "--targets", "range:1-1", "--completer", "none", "--refine", "0",
        "--set", "refine.poses=false", "--depth", "plane-sweep", "--set", "stereo.max_side=64",
        "--voxel", "0.03", "--quiet")  # fmt: skip

@@ -11,8 +11,6 @@ from gvtools.memory.store import tile_set
 from pipelines.cli import main
 from pipelines.reconstruction import run as runs
 
-pytestmark = pytest.mark.usefixtures("unpainted")
-
 SETTINGS = (
     "context=first:3", "targets=range:3-5", "views_per_round=2", "completer=inpaint",
     "refine.steps=0", "savings.pixel_binning=0", "fusion.max_psnr_drop_db=none",

@@ -20,8 +20,6 @@ from pipelines.console import Console
 from pipelines.reconstruction.run import reconstruct
 from pipelines.reconstruction.settings import RunSettings
 
-pytestmark = pytest.mark.usefixtures("unpainted")
-
 CONTEXT = [f"frame-{i:06d}.color.png" for i in (0, 2, 4, 6)]
 TARGETS = [f"frame-{i:06d}.color.png" for i in (1, 3, 5, 7)]
 SAME = 60.0

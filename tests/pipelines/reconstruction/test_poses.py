@@ -19,8 +19,6 @@ from gvtools.runs.run import at_run_poses, load_memory, load_run
 from gvtools.scenes.project import open_project
 from pipelines.reconstruction import prepare
 
-pytestmark = pytest.mark.usefixtures("unpainted")
-
 SETTINGS = ("context=first:8", "targets=range:8-9", "views_per_round=1", "refine.steps=0",
             "refine.poses=true")  # fmt: skip
 POSES = "round_000/poses.npz"

@@ -20,8 +20,6 @@ from gvtools.settings import dotted, with_values
 from pipelines.cli import main
 from pipelines.reconstruction.settings import PAPER, RunSettings
 
-pytestmark = pytest.mark.usefixtures("unpainted")
-
 SETTINGS = ("context=first:2", "targets=range:2-5", "views_per_round=2", "completer=inpaint")
 
 

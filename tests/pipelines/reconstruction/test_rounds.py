@@ -24,7 +24,6 @@ from gvtools.errors import OptionError, ShapeError
 from gvtools.guidance import Guidance, concatenate
 from gvtools.kernels import parallel_kernels_may_overlap
 from gvtools.memory.spatial_memory import FuseReport, SpatialMemory
-from gvtools.runs.layout import target_stems
 from gvtools.runs.run import load_run
 from gvtools.scenes.project import open_project
 from gvtools.scenes.transforms import read_camera_path, write_transforms
@@ -328,14 +327,6 @@ def test_the_schedule_takes_targets_in_order(targets, size, rounds, expected):
     assert all(len(rows) <= size for rows in schedule)
 
 
-def test_targets_with_alike_names_have_files_of_their_own():
-    names = ("a.png", "a.jpg", "sub/a.png", "sub__a.png", "b.png", "interpolate_0001")
-    stems = target_stems(names)
-    assert len({stem.lower() for stem in stems}) == len(names)
-    assert not any("/" in stem for stem in stems)
-    assert stems[4:] == ("b", "interpolate_0001")
-
-
 def test_points_of_held_out_views_are_used_and_said_so_or_left_out(tmp_path):
     scan = write_colmap_scan(tmp_path / "scan", views=4, points=10)
     scene = open_project(scan)
@@ -350,8 +341,6 @@ def test_points_of_held_out_views_are_used_and_said_so_or_left_out(tmp_path):
     assert strict.scene.points is not None
     assert len(strict.scene.points.positions) == 0
 
-
-pytestmark = pytest.mark.usefixtures("unpainted")
 
 SCALE = 2.0
 

@@ -13,7 +13,7 @@ from tiny_scan import write_scan
 from pipelines.cli import main
 from pipelines.tuning import tune as tuning
 
-pytestmark = pytest.mark.usefixtures("one_thread", "unpainted")
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 VIEWS = ("--context", "first:6", "--targets", "range:7-8", "--views-per-round", "1")
 CORE = ("--completer", "geoverse", "--set", "effort.inpaint_below=0", "--refine", "0",

@@ -21,8 +21,6 @@ from pipelines.reconstruction.prepare import make_plan
 from pipelines.reconstruction.settings import RunSettings
 from pipelines.reconstruction.voxel import SCALES, automatic_voxel, sufficient_scale
 
-pytestmark = pytest.mark.usefixtures("unpainted")
-
 
 class Never:
     """A source that must not be asked."""

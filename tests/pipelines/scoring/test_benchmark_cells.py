@@ -46,8 +46,6 @@ from pipelines.scoring.benchmark_scenes import (
     split_of_scene,
 )
 
-pytestmark = pytest.mark.usefixtures("unpainted")
-
 
 def cell(root, out, **changes) -> BenchmarkCell:
     values = {"benchmark": "few-view", "root": root, "scene": "scan", "views": 3, "seconds": None,

@@ -15,8 +15,6 @@ from gvtools.runs.run import load_run
 from gvtools.scenes.project import open_project
 from pipelines.cli import main
 
-pytestmark = pytest.mark.usefixtures("unpainted")
-
 RUN = ("--context", "first:3", "--views-per-round", "2", "--quiet",
        "--refine", "0", "--set", "refine.poses=false")  # fmt: skip
 

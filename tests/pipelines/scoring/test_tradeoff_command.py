@@ -17,8 +17,6 @@ from pipelines.reconstruction.settings import RunSettings
 from pipelines.scoring import tradeoff
 from pipelines.scoring.tradeoff import EQUAL, changed
 
-pytestmark = pytest.mark.usefixtures("unpainted")
-
 # Another edge than the first guess, as if it had been measured.
 WIDER = ("--set", "fusion.voxel_scale=1.25", "--set", "refine.seconds=0",
          "--set", "refine.poses=false")  # fmt: skip

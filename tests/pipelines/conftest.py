@@ -1,4 +1,4 @@
-"""The figures of the small run, shared by tests of scores."""
+"""What the tests of commands share: figures that are not painted, and those of the small run."""
 
 from __future__ import annotations
 
@@ -8,6 +8,11 @@ import pytest
 from figures import unpainted_figures
 
 from pipelines.cli import main
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _unpainted(unpainted: None) -> None:
+    pass
 
 
 @pytest.fixture(scope="session")
