@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
 from functools import cached_property
@@ -26,6 +26,7 @@ from gvtools.completers.base import create, run_completer
 from gvtools.errors import OptionError
 from gvtools.evaluation.images import FIGURES, view_figures
 from gvtools.evaluation.lpips_distance import Lpips
+from gvtools.evaluation.picture_readings import better_reading
 from gvtools.files import replaced_when_written
 from gvtools.guidance import Guidance
 from gvtools.memory.panoramas import Rig
@@ -34,7 +35,7 @@ from gvtools.memory.splat.api import SplatOptions
 from gvtools.optional import require
 from gvtools.runs.run import at_run_poses, load_appearance, load_memory, said_of_path
 from gvtools.runs.target_files import to_bytes, write_png
-from gvtools.scenes.scene import Frame
+from gvtools.scenes.scene import Frame, Scene
 from gvtools.scenes.transforms import read_camera_path
 from gvtools.trajectories import PATHS, named_path
 from pipelines.options import check_ending
@@ -42,6 +43,11 @@ from pipelines.reconstruction.rounds import CachedProjection, Clock, complete_ta
 from pipelines.reconstruction.settings import RunSettings
 from pipelines.spherical_metadata import mark_mp4, write_panorama
 from viz.viewer.render import picture_of
+
+# Pictures beside a view's own fit what is shown where so much of the squared error is left.
+NEARER = 0.7
+# What a memory knows is more like its own scene's pictures than this [dB].
+OTHER_SCENE = 11
 
 
 def render_view(
@@ -123,6 +129,38 @@ def measure(
         depth=guidance.depth[0],
         lpips=lpips,
     )
+
+
+def other_pictures(
+    scene: Scene | None, shown: Mapping[str, Guidance], *, psnr: float | None
+) -> str:
+    """What a project's pictures seem to be that are not those of views that are shown, or ""."""
+    if scene is None or not shown:
+        return ""
+    if psnr is not None and psnr < OTHER_SCENE:
+        return f"of another scene ({psnr:.1f} dB where the memory is known)"
+    pictures, truths, ratios = [], [], []
+    for name, guidance in shown.items():
+        rgb, valid, at = to_bytes(guidance.rgb[0]), guidance.valid[0], scene.names.index(name)
+        if not (valid.any() and 0 < at < len(scene) - 1):
+            continue
+        own, *beside = (scene.views[at + step].load() for step in (0, 1, -1))
+        pictures.append(rgb)
+        truths.append(Frame(own.rgb, mask=valid))
+        left = [
+            np.square(np.subtract(frame.rgb, rgb, dtype=np.float32)[valid]).mean()
+            if frame.rgb.shape == rgb.shape else np.inf
+            for frame in (own, *beside)
+        ]  # fmt: skip
+        ratios.append(np.array(left[1:]) / max(left[0], 1))
+    least = np.median(ratios, axis=0) if ratios else np.ones(2)
+    if min(least) < NEARER:
+        way = "after" if least[0] < least[1] else "before"
+        return (
+            f"renumbered: what is shown is nearer to the picture {way} each view's own "
+            f"({-10 * np.log10(min(least)):.1f} dB)"
+        )
+    return better_reading(pictures, truths)
 
 
 def summary(

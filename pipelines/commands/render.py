@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from pydantic import Field
 
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from pipelines.console import Console
 
 
-# What a memory knows is more like its own scene's pictures than this [dB].
-OTHER_SCENE = 11
+# Views of which it is looked at whether other pictures fit them better.
+LOOKED = 8
 
 
 class RenderCommand(LensArguments, LpipsArguments, SceneArguments):
@@ -68,6 +68,7 @@ class RenderCommand(LensArguments, LpipsArguments, SceneArguments):
         from gvtools.memory.panoramas import WIDEST_STILL
         from gvtools.runs.run import load_appearance, load_memory
         from pipelines import rendering
+        from pipelines.scoring.measurement import evenly
 
         if self.out is None and not self.against_images:
             raise OptionError("--out: nothing would be left; give a folder, or --against-images")
@@ -88,7 +89,8 @@ class RenderCommand(LensArguments, LpipsArguments, SceneArguments):
         lpips, no_lpips = self.open_lpips() if self.against_images else (None, None)
         # The first projection compiles or loads the kernels and is not timed.
         memory.project(cameras[0], options=options)
-        views = []
+        views, shown = [], dict[str, Any]()
+        looked = [cameras.names[row] for row in evenly(len(cameras), LOOKED)]
         for camera in console.track(list(cameras), "rendering"):
             (name,) = camera.names
             guidance, seconds = rendering.render_view(
@@ -96,6 +98,7 @@ class RenderCommand(LensArguments, LpipsArguments, SceneArguments):
                 fill=rendering.filled if self.complete else None,
             )  # fmt: skip
             frame = scene[name].load() if scene is not None and self.against_images else None
+            shown |= {} if frame is None or name not in looked else {name: guidance}
             if self.out is not None:
                 panorama = self.lens == "equirectangular"
                 rendering.write_view(self.out, stems[name], guidance, panorama=panorama)
@@ -103,11 +106,8 @@ class RenderCommand(LensArguments, LpipsArguments, SceneArguments):
             if rig is not None:
                 views[-1]["coverage"] = float(guidance.valid[0][rig.inside].mean())
         figures = rendering.summary(views, compared=self.against_images, no_lpips=no_lpips)
-        if (figures["psnr_valid"] or OTHER_SCENE) < OTHER_SCENE:
-            console.warn(
-                f"what {self.memory} knows is as far from the pictures of {self.cameras} "
-                f"({figures['psnr_valid']:.1f} dB) as another scene; give the run's own project"
-            )
+        if other := rendering.other_pictures(scene, shown, psnr=figures["psnr_valid"]):
+            console.warn(f"the pictures of {self.cameras} seem to be {other}")
         if poses:
             figures["poses"] = poses
         if self.json_ is not None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -118,6 +119,21 @@ def test_generated_pixels_have_their_own_figures(box, tmp_path):
     assert data["depth_rel_generated"] < 0.01
 
 
+def test_pictures_that_are_renumbered_or_mirrored_are_warned_of(box, tmp_path, capsys):
+    files = sorted((box / "project").rglob("view_*.png"))
+    for said in ("", "renumbered: what is shown is nearer to the picture after", "mirrored"):
+        project = shutil.copytree(box / "project", tmp_path / (said[:4] or "own"))
+        for file, after in pairwise(files):
+            there = project / file.relative_to(box / "project")
+            if said.startswith("renumbered"):
+                shutil.copy(file, there.with_name(after.name))
+            elif said:
+                Image.fromarray(np.asarray(Image.open(file))[:, ::-1]).save(there)
+        run(box / "run", "--cameras", project, "--against-images")
+        warned = capsys.readouterr().err
+        assert said in warned and bool(said) == ("seem to be" in warned)
+
+
 def test_pictures_of_another_scene_are_warned_of(box, tmp_path, capsys):
     for negative in (False, True):
         project = shutil.copytree(box / "project", tmp_path / f"{negative}")
@@ -125,7 +141,7 @@ def test_pictures_of_another_scene_are_warned_of(box, tmp_path, capsys):
             picture = np.asarray(Image.open(file))
             Image.fromarray(255 - picture if negative else picture).save(file)
         run(box / "run", "--cameras", project, "--views", "first:2", "--against-images")
-        assert ("as another scene" in capsys.readouterr().err) == negative
+        assert ("of another scene" in capsys.readouterr().err) == negative
 
 
 def test_without_comparing_the_figures_are_null_with_a_reason(box, tmp_path):

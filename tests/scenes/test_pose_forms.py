@@ -53,6 +53,17 @@ def test_the_form_of_poses_is_told_by_the_photographs(room, change, reason):
     assert all("do not fit the photographs" in line and reason in line for line in found)
 
 
+def test_pictures_that_are_renumbered(room):
+    data = json.loads(room.read_text())
+    paths = [frame["file_path"] for frame in data["frames"]]
+    for frame, path in zip(data["frames"], [*paths[1:], paths[0]], strict=True):
+        frame["file_path"] = path
+    file = room.with_name("changed.json")
+    file.write_text(json.dumps(data))
+    (found,) = pose_findings(open_project(file))
+    assert "each fits the pose of the next one" in found.message
+
+
 def test_axes_of_cameras_that_go_sideways(tmp_path):
     # Epipolar lines are nearly those of the other axes; what is seen lies behind these cameras.
     textures = [blotches(np.random.default_rng(3 + wall)) for wall in range(3)]
