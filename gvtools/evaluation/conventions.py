@@ -17,9 +17,10 @@ Float64 = NDArray[np.float64]
 FEW, HELD = 8, 3
 # A reading explains an error where it leaves less than this share of it; errors are worth it from
 # this share of the path's extent, and from so many degrees.
-EXPLAINED, NOTABLE, TURNED = 0.2, 0.01, 10.0
-# Places by which an estimate may be late or early, and rows of each path that are compared then.
-PLACES, ROWS = 60, 500
+EXPLAINED, NOTABLE, TURNED = 0.2, 0.002, 10.0
+# Places by which an estimate may be late or early, rows of each path that are compared then, and
+# rows at which a clock may jump.
+PLACES, ROWS, JUMPS = 60, 500, 60
 # Where the path's spread across itself is less than so many errors, the turn of the fit is open.
 ACROSS = 10.0
 
@@ -71,6 +72,12 @@ def wrong_conventions(
                 f"{moved[0]:.4g} instead of {left:.4g}; clocks that differ (--offset), or frames "
                 "that are numbered otherwise"
             )
+        elif (jump := _clock_jump(first, second, align=align))[0] < EXPLAINED * left:
+            notes.append(
+                f"a clock seems to jump near pose {jump[1]} of {len(first)}: the estimate's poses "
+                f"belong {jump[2]:+d} places before it and {jump[3]:+d} after; ATE would be "
+                f"{jump[0]:.4g} instead of {left:.4g}; correct the time stamps of one part"
+            )
     centers = first[:, :3, 3] - first[:, :3, 3].mean(axis=0)
     across = np.linalg.svd(centers, compute_uv=False)[1] / np.sqrt(len(first))
     if found.rotation_deg.rmse > TURNED and left * ACROSS < across:
@@ -88,8 +95,9 @@ def wrong_conventions(
 
 
 def _moved_in_time(first: Float64, second: Float64, *, align: str) -> tuple[float, int]:
-    """The least ATE of an estimate some places later (or earlier: below 0), and how many."""
-    tried = [(np.inf, 0)]
+    """The least ATE of an estimate some places later, or 0 (earlier: below), and how many."""
+    still = absolute_errors(first, second, align=align, refuse_mirrored=False).translation
+    tried = [(np.inf if still is None else still.rmse, 0)]
     for places in range(1, min(PLACES, len(first) // 3) + 1):
         every = max(1, (len(first) - places) // ROWS)
         for sign, late, early in ((1, first, second), (-1, second, first)):
@@ -97,6 +105,27 @@ def _moved_in_time(first: Float64, second: Float64, *, align: str) -> tuple[floa
             found = absolute_errors(*pair[::sign], align=align, refuse_mirrored=False)
             if found.translation is not None:
                 tried.append((found.translation.rmse, sign * places))
+    return min(tried)
+
+
+def _clock_jump(first: Float64, second: Float64, *, align: str) -> tuple[float, int, int, int]:
+    """The least ATE with other places from some row on; the row, the places before and after."""
+    count, part = len(first), len(first) // 4
+    ends = slice(0, part), slice(count - part, count)
+    before, after = (_moved_in_time(first[e], second[e], align=align)[1] for e in ends)
+    tried = [(np.inf, 0, before, after)]
+    for row in (
+        np.linspace(part, count - part, JUMPS).astype(int).tolist() if before != after else []
+    ):
+        own = np.arange(count)
+        other = own + np.where(own < row, before, after)
+        # Beside the jump there are poses that the other path lacks.
+        kept = (np.abs(own - row) > abs(after - before)) & (other >= 0) & (other < count)
+        found = absolute_errors(
+            first[other[kept]], second[own[kept]], align=align, refuse_mirrored=False
+        )
+        if found.translation is not None:
+            tried.append((found.translation.rmse, row, before, after))
     return min(tried)
 
 

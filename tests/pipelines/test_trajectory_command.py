@@ -322,6 +322,12 @@ def other_order(poses: np.ndarray) -> np.ndarray:
     return poses
 
 
+def jumped(poses: np.ndarray) -> np.ndarray:
+    """From the middle on, two places earlier."""
+    half = len(poses) // 2
+    return np.concatenate([poses[:half], np.roll(poses, 2, axis=0)[half:]])
+
+
 def inverted_turns(poses: np.ndarray) -> np.ndarray:
     poses = poses.copy()
     poses[:, :3, :3] = poses[:, :3, :3].transpose(0, 2, 1)
@@ -354,6 +360,7 @@ def test_the_other_order_of_quaternions_is_told_of_either_file(tmp_path, which, 
         (other_order, "none", "other order"),
         (inverted_turns, "se3", "rotations seem to map the other way"),
         (lambda poses: np.roll(poses, -5, axis=0), "se3", "belong 5 places later"),
+        (jumped, "se3", "places before it and -2 after"),
         (lost, "se3", "5 poses of the estimate are exactly one"),
         (lambda poses: moved(poses, scale=1000), "sim3", ""),
         (lambda poses: disturbed(poses, metres=0.3, degrees=10), "se3", ""),
