@@ -79,7 +79,8 @@ def read_poses(path: str | Path, *, layout: str = "auto", lost: bool = False) ->
             with or without a number or time in front, or a line for each row), "euroc" (CSV:
             nanoseconds, x, y, z, qw, qx, qy, qz, and more that is not read) or "auto": the columns
             that the head names, else what the numbers tell.
-        lost: whether lines with NaN or infinity, for which a tracker was lost, are left out.
+        lost: whether lines with NaN or infinity, for which a tracker was lost, are left out; of
+            matrices that order alone tells apart they are NaN.
 
     Returns:
         N poses in the order of the file, with stamps for TUM and EuRoC. Rotations that are off by
@@ -100,16 +101,18 @@ def read_poses(path: str | Path, *, layout: str = "auto", lost: bool = False) ->
     """
     path = Path(path)
     form, rows = _form(path, layout)
-    kept = [row for row in rows if not (lost and _LOST.intersection(map(str.lower, row[1])))]
-    left_out = len(rows) - len(kept)
-    if not kept:
+    told = [not (lost and _LOST.intersection(map(str.lower, words))) for _, words in rows]
+    left_out = told.count(False)
+    if not any(told):
         raise ProjectError(
             f"{path}: all {len(rows)} poses hold NaN or infinity; expected finite ones"
         )
-    rows = kept
+    rows = [row for row, kept in zip(rows, told, strict=True) if kept]
     stamps, poses = _read(rows, form.columns, more=form.more, path=path)
     if form.columns is None and len(rows[0][1]) % 4 == 0:
-        return Trajectory(poses)
+        every = np.full((len(told), 4, 4), np.nan)
+        every[told] = poses
+        return Trajectory(every)
     unit = form.unit or unit_of(stamps)
     poses[:, :3, 3] *= form.metres
     seconds = stamps * _UNITS.get(unit, (1.0,))[0]

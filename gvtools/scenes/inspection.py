@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import product
 from math import hypot
@@ -130,8 +130,24 @@ def inspect(scene: Scene, *, probes: int | None = None) -> SceneReport:
         metric=scene.metric,
         path_length=float(np.linalg.norm(np.diff(centers, axis=0), axis=1).sum()),
         extent=float(np.ptp(centers, axis=0).max()),
-        findings=tuple(findings),
+        findings=tuple(_of_kinds(findings)),
     )
+
+
+def _of_kinds(findings: Sequence[Finding]) -> list[Finding]:
+    """The findings, those that say the same of several files as one."""
+    kinds = dict[tuple[str, str], list[Finding]]()
+    for finding in findings:
+        file, _, text = finding.message.partition(": ")
+        same = text if "/" in file and text else finding.message
+        kinds.setdefault((finding.level, same), []).append(finding)
+    merged = []
+    for (level, text), alike in kinds.items():
+        files = [each.message.partition(": ")[0] for each in alike]
+        line = f"{len(files)} files ({named(files)}): {text}"
+        dropped = sum(each.dropped for each in alike)
+        merged.append(alike[0] if len({*files}) == 1 else Finding(level, line, dropped))
+    return merged
 
 
 def reprojection_errors(scene: Scene) -> np.ndarray:

@@ -17,7 +17,7 @@ from gvtools.scenes.collection import SceneCollection, of_scenes
 from gvtools.scenes.colmap_model import find_model
 from gvtools.scenes.images import ALPHA, IMAGE_SUFFIXES
 from gvtools.scenes.layout import ARCHIVES, FORM, SPEC, is_address
-from gvtools.scenes.matching import named
+from gvtools.scenes.matching import named, pictures_in
 from gvtools.scenes.phones import POLYCAM, RECORD3D, SCANNER_APP, STRAY_SCANNER
 from gvtools.scenes.photographs import Photograph
 from gvtools.scenes.rgbd import RgbdOptions
@@ -194,6 +194,10 @@ def _unknown(path: Path) -> ProjectError:
                 f"that map the other way); else {advice}"
             )
         return UnposedError(path, f"{unposed} RGB-D frames without poses", advice)
+    for lens in sorted(p for form in ("", "*/", "*/*/") for p in path.glob(f"{form}sensor.yaml")):
+        if count := len(pictures_in(lens.parent / "data")):
+            line = f"{count} pictures of a EuRoC recording, whose lens and poses are not read"
+            return UnposedError(path, line, _capture(lens.parent / "data"))
     entries = sorted(entry.name + "/" * entry.is_dir() for entry in path.iterdir())
     there = (place for form in ("*/", "dense/*/", "*.r3d", "*.zip") for place in path.glob(form))
     inside = [str(place) for place in sorted(there) if is_project(place)]

@@ -26,7 +26,9 @@ from gvtools.errors import ProjectError
 from gvtools.scenes.calibration import (
     Float64,
     finite_array,
+    number_table,
     opencv_lens,
+    opencv_pose,
     pinhole,
 )
 from gvtools.scenes.images import DEPTH_SUFFIXES, IMAGE_SUFFIXES
@@ -40,7 +42,7 @@ from gvtools.scenes.matching import (
     pose_at,
     times_in,
 )
-from gvtools.scenes.photographs import NO_POSE, PosedFrame
+from gvtools.scenes.photographs import NO_POSE, PosedFrame, first_size
 from gvtools.scenes.rgbd import (
     Recording,
     RgbdFolder,
@@ -218,7 +220,7 @@ def _stamped_files(path: Path) -> list[tuple[float, str]]:
 # Where exporters like ScanNet's put each kind; poses that are named camera-from-world are not read.
 FOLDERS = {
     "color": ("color", "colour", "rgb", "image", "images"),
-    "depth": ("depth", "depths", "depth_map", "depth_maps"),
+    "depth": ("depth_filtered", "depth", "depths", "depth_map", "depth_maps"),
     "pose": ("pose", "poses", "camera_pose", "camera_poses", "c2w", "cam2world", "cam_to_world"),
 }
 
@@ -300,7 +302,7 @@ class _Redwood(_ScanNet):
         if logs[0].suffix == ".log":
             numbers, poses = read_log(logs[0])
         else:
-            poses = list(read_poses(logs[0]).poses)
+            poses = list(read_poses(logs[0], lost=True).poses)
             numbers = list(range(len(poses)))
             findings.append(Finding("info", f"poses: {logs[0].name}, one a picture in order"))
         fits = len(set(numbers)) == len(numbers) and all(0 <= i < len(frames) for i in numbers)
@@ -313,6 +315,28 @@ class _Redwood(_ScanNet):
         for row, number, pose in zip(rows, numbers, poses, strict=True):
             frames[row] = replace(frames[row], pose=pose, where=f"{logs[0]}, pose {number}")
         return replace(recording, frames=frames, findings=findings)
+
+
+class _NeuralRgbd(_Redwood):
+    """Poses have OpenGL's axes, and the principal point is in the middle."""
+
+    name = "NeuralRGBD"
+    holds = "images, depth, poses.txt, focal.txt", "images, depth, focal.txt"
+
+    def matches(self, root: Path, *, posed: bool = True) -> bool:
+        return (root / "focal.txt").is_file() and super().matches(root, posed=posed)
+
+    def calibration(self, root: Path, options: RgbdOptions) -> Recording:
+        focal = float(number_table(root / "focal.txt", 1)[0, 0])
+        size = first_size(frame.image for frame in self.frames(root, options)) or (0, 0)
+        K = pinhole([focal, focal, size[0] / 2, size[1] / 2])
+        return super().calibration(root, under(options, color_K=K))
+
+    def posed(self, recording: Recording, *, strict: bool) -> Recording:
+        read = super().posed(recording, strict=strict)
+        poses = (None if frame.pose is None else opencv_pose(frame.pose) for frame in read.frames)
+        turned = [replace(f, pose=pose) for f, pose in zip(read.frames, poses, strict=True)]
+        return replace(read, frames=turned)
 
 
 class _Replica(_Redwood):
@@ -406,8 +430,10 @@ def read_log(path: Path) -> tuple[list[int], list[Float64]]:
 
 SEVENSCENES_FOLDER, SCANNET_FOLDER = _SevenScenes(), _ScanNet()
 # ScanNet before Redwood: both have colour and depth folders.
-_FOLDERS = (SEVENSCENES_FOLDER, _Tum(), SCANNET_FOLDER, _Redwood(), _Replica(), _RtabMap())
-SEVENSCENES, TUM, SCANNET, REDWOOD, REPLICA, RTABMAP = LAYOUTS = tuple(
+_FOLDERS = (
+    SEVENSCENES_FOLDER, _Tum(), SCANNET_FOLDER, _NeuralRgbd(), _Redwood(), _Replica(), _RtabMap()
+)  # fmt: skip
+SEVENSCENES, TUM, SCANNET, _, REDWOOD, REPLICA, RTABMAP = LAYOUTS = tuple(
     Layout.of_folder(folder.name, folder.holds[0], matches=folder.matches, read=folder.read)
     for folder in _FOLDERS
 )

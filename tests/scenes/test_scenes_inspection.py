@@ -53,16 +53,16 @@ def test_report_of_a_scan(tmp_path):
 
 def test_truncated_picture_is_found_by_opening(tmp_path):
     root = sevenscenes(tmp_path)
-    path = root / "frame-000001.color.png"
-    save(path, np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3), dtype=np.uint8))
-    path.write_bytes(path.read_bytes()[:-3000])
-    scene = SEVENSCENES.read(root)
-    report = inspect(scene)
-    assert not report.ok
-    assert report.views_opened == 2
-    errors = [finding.message for finding in report.findings if finding.level == "error"]
-    assert len(errors) == 1
-    assert "frame-000001.color.png: unreadable" in errors[0]
+    said = "frame-000001.color.png: unreadable", "2 files (", "frame-000002.color.png): unreadable"
+    for number, expected in ((1, said[:1]), (2, said[1:])):
+        path = root / f"frame-{number:06}.color.png"
+        save(path, np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3), dtype=np.uint8))
+        path.write_bytes(path.read_bytes()[:-3000])
+        report = inspect(SEVENSCENES.read(root))
+        assert not report.ok
+        assert report.views_opened == 3 - number
+        (error,) = (item.message for item in report.findings if item.level == "error")
+        assert all(part in error for part in expected)
 
 
 def depth_findings(scene):

@@ -94,6 +94,10 @@ def test_pictures_without_cameras_are_told_from_unknown_folders(tmp_path):
         save(tmp_path / f"{index}.jpg", ramp())
     with pytest.raises(ProjectError, match=r"3 pictures without cameras; .* gvtools capture"):
         open_project(tmp_path)
+    save(tmp_path / "mav0/cam0/data/1403715273262142976.png", ramp())
+    (tmp_path / "mav0/cam0/sensor.yaml").write_text("sensor_type: camera")
+    with pytest.raises(ProjectError, match=r"EuRoC recording.* gvtools capture .*/cam0/data"):
+        open_project(tmp_path)
     video = tmp_path / "walk.mp4"
     video.touch()
     with pytest.raises(ProjectError, match=r"a video without cameras; .* gvtools capture"):

@@ -455,6 +455,21 @@ def rtabmap(root):
     (root / "flat_camera_poses.txt").write_text("\n".join(rows))
 
 
+def test_neural_rgbd_has_poses_of_opengl_and_nan_where_tracking_was_lost(tmp_path):
+    root = redwood(tmp_path / "recording")
+    before = REDWOOD.read(root).cameras.world_from_cam
+    for path in root.glob("*.log"):
+        path.unlink()
+    poses = before @ np.diag([1.0, -1, -1, 1])
+    poses[1] = np.nan
+    np.savetxt(root / "poses.txt", poses.reshape(-1, 4))
+    (root / "focal.txt").write_text("91.5")
+    scene = open_project(root)
+    np.testing.assert_allclose(scene.cameras.world_from_cam, before[[0, 2]], atol=1e-9)
+    np.testing.assert_allclose(scene.cameras.K[0, :2, 2], [WIDTH / 2 + 0.5, HEIGHT / 2 + 0.5])
+    assert scene.cameras.K[0, 0, 0] == 91.5 and "NaN in their pose" in messages(scene)
+
+
 def bundlefusion(root):
     """As 7-Scenes, with the sensor's own head."""
     sevenscenes(root)
