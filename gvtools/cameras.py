@@ -84,10 +84,22 @@ class Cameras:
 
         ``cam_from_world`` is (4, 4), rigid, in scene units; None is the identity.
         """
-        K = np.array([[[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]], np.float64)
-        pose = np.eye(4) if cam_from_world is None else np.asarray(cam_from_world, np.float64)
-        sizes = np.array([width]), np.array([height])
-        return Cameras(K, pose[None], *sizes, (name,) if name else ())
+        K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+        pose = np.eye(4) if cam_from_world is None else cam_from_world
+        return Cameras.alike(K, pose, size=(width, height), names=(name,) if name else ())
+
+    @staticmethod
+    def alike(
+        K: ArrayLike, cam_from_world: ArrayLike, *, size: tuple[int, int], names: Sequence[str] = ()
+    ) -> Cameras:
+        """Cameras of one size, (width, height) in pixels, at (V, 4, 4) or (4, 4) poses.
+
+        ``K`` is (V, 3, 3), or (3, 3) for all of them.
+        """
+        K, poses = np.asarray(K, np.float64), np.asarray(cam_from_world, np.float64)
+        poses = poses[None] if poses.ndim == 2 else poses
+        K = np.repeat(K[None], len(poses), axis=0) if K.ndim == 2 else K
+        return Cameras(K, poses, np.array(size[0]), np.array(size[1]), tuple(names))
 
     def __len__(self) -> int:
         return len(self.K)

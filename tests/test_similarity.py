@@ -9,7 +9,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from gvtools.cameras import Cameras, concatenate
+from gvtools.cameras import Cameras, concatenate, rigid_poses
 from gvtools.errors import ShapeError
 from gvtools.similarity import (
     COLLINEAR,
@@ -117,9 +117,7 @@ def test_poses_are_aligned_by_the_motion_of_their_world():
     poses = np.tile(np.eye(4), (6, 1, 1))
     poses[:, :3, :3] = Rotation.random(6, random_state=0).as_matrix()
     poses[:, :3, 3] = rng.normal(size=(6, 3))
-    motion = np.eye(4)
-    motion[:3, :3] = Rotation.from_rotvec([0.3, -1.1, 0.4]).as_matrix()
-    motion[:3, 3] = [3, -20, 5]
+    motion = rigid_poses(Rotation.from_rotvec([0.3, -1.1, 0.4]).as_matrix(), [3, -20, 5])
     np.testing.assert_allclose(align_poses(poses, poses @ motion), motion, atol=1e-12)
 
 
@@ -257,11 +255,9 @@ def test_depth_scales_of_any_size_are_found(power):
 
 
 def looking(centre: tuple[float, float, float], angle: float, name: str) -> Cameras:
-    pose = np.eye(4)
-    pose[:3, :3] = rotation((0, 1, 0), angle).T
-    pose[:3, 3] = -pose[:3, :3] @ np.array(centre)
-    K = np.array([[40.0, 0, 20], [0, 40, 15], [0, 0, 1]])
-    return Cameras(K[None], pose[None], np.array([40]), np.array([30]), (name,))
+    axes = rotation((0, 1, 0), angle).T
+    pose = rigid_poses(axes, -axes @ np.array(centre))
+    return Cameras.pinhole(40, 30, focal=40.0, cam_from_world=pose, name=name)
 
 
 def views(*cameras: Cameras) -> Cameras:

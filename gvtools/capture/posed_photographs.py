@@ -195,7 +195,7 @@ def decode_cameras(encoding: Tensor, size: tuple[int, int], *, names: tuple[str,
     half = np.array(size[::-1]) / 2
     K[:, :2, 2] = half
     K[:, [0, 1], [0, 1]] = half / np.tan(np.clip(values[:, [8, 7]], 0.05, 3.0) / 2)
-    return Cameras(K, invert_rigid(pose), np.array(size[1]), np.array(size[0]), names)
+    return Cameras.alike(K, invert_rigid(pose), size=(size[1], size[0]), names=names)
 
 
 def _rows(

@@ -194,7 +194,7 @@ def _from_arrays(arrays: Arrays) -> Predictions:
     if not (usable and (K[:, [0, 1], [0, 1]] > 0).all()):
         raise ValueError(f"{len(poses)} poses, and K of shape {K.shape}, not finite or not above 0")
     K = np.where([[1, 0, 1], [0, 1, 1], [0, 0, 1]], K, 0).astype(np.float64)
-    cameras = Cameras(K, rigid, np.array(width), np.array(height), ())
+    cameras = Cameras.alike(K, rigid, size=(width, height))
     seen = sample_points(depth if depth is not None else world, sure)
     stretched = not to_world and not np.allclose(K[:, 0, 0], K[:, 1, 1], rtol=1e-6)
     shown = None if pictures is None else pictures.astype(np.uint8)

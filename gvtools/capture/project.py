@@ -396,8 +396,7 @@ def _level(model: pycolmap.Reconstruction) -> None:
     images = [image for image in model.images.values() if image.has_pose]
     poses = np.tile(np.eye(4), (len(images), 1, 1))
     poses[:, :3] = [image.cam_from_world().matrix() for image in images]
-    one = np.array(1)
-    cameras = Cameras(np.tile(np.eye(3), (len(images), 1, 1)), poses, one, one, ())
+    cameras = Cameras.alike(np.eye(3), poses, size=(1, 1))
     turn = Rotation.align_vectors([[0.0, 0.0, 1.0]], [level_up(cameras)])[0]
     shift = -turn.apply(cameras.centers.mean(axis=0))
     model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(turn.as_quat()), shift))

@@ -95,8 +95,8 @@ def _all_beyond(depth, row, column, least):
 
 def compile_check() -> None:
     """Call the kernels once."""
-    side, depth = np.array([4]), np.ones((4, 4), np.float32)
-    camera = Cameras(np.eye(3)[None], np.eye(4)[None], side, side, ("any",))
+    depth = np.ones((4, 4), np.float32)
+    camera = Cameras.alike(np.eye(3), np.eye(4), size=(4, 4))
     contradictions(depth, camera, [(2 * depth, camera)])
 
 

@@ -113,13 +113,12 @@ class Rig:
     def cameras(self, picture: Cameras) -> Cameras:
         """The faces' cameras of a picture's camera, a batch of one, with the names of faces."""
         (name,) = picture.names
-        return concatenate([
-            Cameras(
-                face.K[None], face.pose(picture.cam_from_world[0])[None],
-                np.array([face.size[0]]), np.array([face.size[1]]), (face_name(name, face.face),),
-            )
-            for face in self.faces
-        ])  # fmt: skip
+        (pose,) = picture.cam_from_world
+        parts = []
+        for face in self.faces:
+            names = (face_name(name, face.face),)
+            parts.append(Cameras.alike(face.K, face.pose(pose), size=face.size, names=names))
+        return concatenate(parts)
 
     def faces_of(self, pictures: Iterable[Cameras]) -> list[Cameras]:
         """The faces' cameras of all pictures', each a batch of one."""

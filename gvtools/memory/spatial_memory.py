@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gvtools.cameras import Cameras
+from gvtools.cameras import Cameras, rigid_poses
 from gvtools.errors import DegenerateError, GvError, MemoryFileError, OptionError, ShapeError
 from gvtools.memory import fusion
 from gvtools.memory.back_projection import BackProjectionOptions, back_project
@@ -298,14 +298,13 @@ class SpatialMemory(Store):
         view = column.get("view", np.zeros(count)).astype(np.int64)
         spacing = column.get("spacing", np.full(count, distance)).astype(np.float32)
         confidence = column.get("confidence", np.ones(count)).astype(np.float32)
-        pose = np.eye(4)
-        pose[:3, 3] = -self.frame.to_world(columns["positions"].mean(axis=0, dtype=float)[None])[0]
+        (middle,) = self.frame.to_world(columns["positions"].mean(axis=0, dtype=float)[None])
+        pose = rigid_poses(np.eye(3), -middle)
         keys = np.stack([round_, generated, scanned, view], axis=1)
         groups, group = np.unique(keys, axis=0, return_inverse=True)
         for i, (number, made, by_scan, row) in enumerate(groups.tolist()):
             label = f"{name} {row}" if "view" in column else name
-            one = np.ones(1, np.int64)
-            camera = Cameras(np.eye(3)[None], pose[None], one, one, (label,))
+            camera = Cameras.alike(np.eye(3), pose, size=(1, 1), names=(label,))
             rows = np.flatnonzero(group.reshape(-1) == i)
             points = PointSet(
                 columns["positions"][rows], colors[rows], confidence[rows],

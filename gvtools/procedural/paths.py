@@ -187,6 +187,5 @@ def _looking(place: Float64, forward: Float64) -> Float64:
 
 
 def _cameras(K: Float64, poses: Float64, size: tuple[int, int]) -> Cameras:
-    height, width = (np.array(side) for side in size)
     names = tuple(f"{i:02d}" for i in range(len(poses)))
-    return Cameras(np.repeat(K[None], len(poses), axis=0), poses, width, height, names)
+    return Cameras.alike(K, poses, size=size[::-1], names=names)

@@ -122,7 +122,7 @@ def _path(
     aim = np.column_stack([size[:2] / 2 - 0.5 * axis, np.full(len(angle), 0.95)])
     poses = invert_rigid(look_at(eye, aim, up=[0.0, 0.0, 1.0]))
     K = np.repeat(K[None], len(poses), axis=0)
-    return Cameras(K, poses, np.array(width), np.array(height), context + targets)
+    return Cameras.alike(K, poses, size=(width, height), names=context + targets)
 
 
 def photograph_room(

@@ -65,9 +65,7 @@ def motorcycle_cameras(width: int, height: int) -> Cameras:
     right[0, 2] += OFFSET
     pose = np.repeat(np.eye(4)[None], 2, axis=0)
     pose[1, 0, 3] = -BASELINE
-    return Cameras(
-        np.stack([left, right]), pose, np.full(2, width), np.full(2, height), (LEFT, RIGHT)
-    )
+    return Cameras.alike(np.stack([left, right]), pose, size=(width, height), names=(LEFT, RIGHT))
 
 
 def depth_from_disparity(disparity: NDArray[np.floating]) -> Float64:

@@ -130,10 +130,8 @@ def read_picture(folder: Path, kind: str, stem: str) -> NDArray[np.uint8]:
 def entry_camera(entry: Mapping[str, Any]) -> Cameras:
     """The camera, a batch of one, of a target's entry in a report."""
     stored = entry["camera"]
-    return Cameras(
-        np.array(stored["K"])[None], np.array(stored["cam_from_world"])[None],
-        np.array([stored["width"]]), np.array([stored["height"]]), (entry["name"],),
-    )  # fmt: skip
+    size = stored["width"], stored["height"]
+    return Cameras.alike(stored["K"], stored["cam_from_world"], size=size, names=(entry["name"],))
 
 
 def completed_picture(run: Path, number: int, name: str) -> Path | None:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.cameras import Cameras
+from gvtools.cameras import Cameras, rigid_poses
 from gvtools.memory.spatial_memory import FuseReport, SpatialMemory
 from gvtools.memory.store.views import PointSet
 from gvtools.scans.points import Scan
@@ -84,7 +84,5 @@ def point_spacing(positions: NDArray[np.float64]) -> tuple[NDArray[np.float64], 
 
 def _camera(name: str, center: NDArray[np.float64]) -> Cameras:
     """A camera of one pixel at a station's place (3,), since a view needs one."""
-    one = np.ones(1, np.int64)
-    pose = np.eye(4)
-    pose[:3, 3] = -center
-    return Cameras(np.eye(3)[None], pose[None], one, one, (name,))
+    pose = rigid_poses(np.eye(3), -center)
+    return Cameras.alike(np.eye(3), pose, size=(1, 1), names=(name,))

@@ -359,9 +359,9 @@ class Photograph:
 
     def view(self) -> View:
         """The photograph as a view that loads lazily."""
-        width, height = map(np.array, self.lens.size)
-        poses = np.asarray(self.cam_from_world, np.float64)[None]
-        camera = Cameras(self.lens.K[None], poses, width, height, (self.name,))
+        camera = Cameras.alike(
+            self.lens.K, self.cam_from_world, size=self.lens.size, names=(self.name,)
+        )
         paths = (self.frame.image, self.frame.mask, self.frame.depth)
         files = tuple(dict.fromkeys(path for path in paths if path is not None))
         return View(self.name, camera, self.load, self.frame.depth is not None, files)

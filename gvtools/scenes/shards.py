@@ -339,13 +339,8 @@ def _check_size(tar: Path, listed: ListedShard) -> None:
 
 
 def _view(tar: Path, record: ViewRecord) -> View:
-    camera = Cameras(
-        np.array(record.K)[None],
-        np.array(record.cam_from_world)[None],
-        np.array([record.width]),
-        np.array([record.height]),
-        (record.name,),
-    )
+    size = record.width, record.height
+    camera = Cameras.alike(record.K, record.cam_from_world, size=size, names=(record.name,))
     return View(record.name, camera, partial(_load, tar, record), record.has_depth, (tar,))
 
 

@@ -65,13 +65,12 @@ def walls(size: Float64, voxel: float) -> list[PointSet]:
 
 def inside_camera(size: Float64, *, turn: float, width: int, height: int) -> Cameras:
     """A level camera near the middle of the box, turned by ``turn`` radians about y."""
-    focal = 0.82 * width
-    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
     cosine, sine = np.cos(turn), np.sin(turn)
     rotation = np.array([[cosine, 0, -sine], [0, 1, 0], [sine, 0, cosine]])
     center = 0.08 * size * np.array([np.cos(turn), np.sin(3 * turn), np.sin(turn)])
     pose = rigid_poses(rotation, -rotation @ center)
-    return Cameras(K[None], pose[None], np.array([width]), np.array([height]), (f"{turn:.4f}",))
+    focal = 0.82 * width
+    return Cameras.pinhole(width, height, focal=focal, cam_from_world=pose, name=f"{turn:.4f}")
 
 
 def photograph(size: Float64, camera: Cameras) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:

@@ -177,9 +177,7 @@ def compare_splatting(
 
 def one_pixel_rows(count: int, *, repeat: int) -> list[Comparison]:
     """One-pixel projection into 504x504 of points in view, in voxel order and shuffled."""
-    K = np.array([[400.0, 0, 252], [0, 400.0, 252], [0, 0, 1]])
-    side = np.array([ONE_PIXEL_SIDE])
-    camera = Cameras(K[None], np.eye(4)[None], side, side, ("front",))
+    camera = Cameras.pinhole(ONE_PIXEL_SIDE, ONE_PIXEL_SIDE, focal=400.0, name="front")
     points = procedural_cloud.layers_in_view(count, camera)
     return compare_one_pixel(points, camera, repeat=repeat)
 

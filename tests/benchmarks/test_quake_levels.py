@@ -10,7 +10,7 @@ from benchmarks.experiments.level_render import STORED_LIGHT, LevelScene
 from benchmarks.experiments.level_textures import Pictures, shown_pictures
 from benchmarks.experiments.level_walks import unjudged, write_walks
 from benchmarks.experiments.quake_levels import Archives, read_level
-from gvtools.cameras import Cameras
+from gvtools.cameras import Cameras, rigid_poses
 from gvtools.errors import ProjectError
 from gvtools.scenes.project import open_project
 from gvtools.training.samples import Observation, project_observation
@@ -30,9 +30,8 @@ def scene(archives) -> LevelScene:
 def looking(direction: tuple[float, float, float], place: tuple[float, float, float]) -> Cameras:
     z = np.array(direction, float)
     x = np.array([1.0, 0, 0]) if abs(z[2]) > 0.5 else np.cross(z, [0, 0, 1])
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([x, np.cross(z, x), z])
-    pose[:3, 3] = -pose[:3, :3] @ place
+    axes = np.stack([x, np.cross(z, x), z])
+    pose = rigid_poses(axes, -axes @ place)
     return Cameras.pinhole(48, 48, focal=24.0, cam_from_world=pose)
 
 

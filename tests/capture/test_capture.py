@@ -37,6 +37,8 @@ from pipelines.commands import capture
 from pipelines.commands.capture import open_or_capture
 from pipelines.console import Console
 
+pytestmark = pytest.mark.usefixtures("unpainted")
+
 
 @pytest.fixture(scope="session")
 def captured(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -210,7 +212,6 @@ def test_pairs_are_found_by_what_pictures_look_like(room: Path, tmp_path: Path) 
 
 # Source, project and masks of a capture.
 Asked = tuple[Path, Path, Path | None]
-pytestmark = pytest.mark.usefixtures("unpainted")
 
 
 @pytest.fixture

@@ -308,7 +308,7 @@ def cameras() -> Cameras:
     poses[:, :3, 3] = np.arange(9).reshape(3, 3)
     K = np.array([[40.0, 0, WIDTH / 2], [0, 44.0, HEIGHT / 2], [0, 0, 1]])
     names = tuple(f"{row}.png" for row in range(V))
-    return Cameras(np.tile(K, (V, 1, 1)), poses, np.array(WIDTH), np.array(HEIGHT), names)
+    return Cameras.alike(K, poses, size=(WIDTH, HEIGHT), names=names)
 
 
 @pytest.fixture(scope="module")

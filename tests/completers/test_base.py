@@ -316,7 +316,7 @@ def guidance_with(*radii: int) -> Guidance:
     pose = np.tile(np.eye(4), (count, 1, 1))
     K = np.tile(np.array([[60.0, 0, WIDTH / 2], [0, 60.0, HEIGHT / 2], [0, 0, 1]]), (count, 1, 1))
     names = tuple(f"r{radius}_{i}" for i, radius in enumerate(radii))
-    cameras = Cameras(K, pose, np.full(count, WIDTH), np.full(count, HEIGHT), names)
+    cameras = Cameras.alike(K, pose, size=(WIDTH, HEIGHT), names=names)
     y, x = np.indices((HEIGHT, WIDTH))
     away = np.hypot(y - HEIGHT // 2, x - WIDTH // 2)
     valid = np.stack([away >= radius for radius in radii])

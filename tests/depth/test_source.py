@@ -10,7 +10,7 @@ import pytest
 from scenes_workspace import workspace
 from tiny_scan import write_scan
 
-from gvtools.cameras import Cameras
+from gvtools.cameras import Cameras, rigid_poses
 from gvtools.depth import choice
 from gvtools.depth.choice import ColmapPatchMatch, choose_source, rough_source
 from gvtools.depth.options import StereoOptions
@@ -36,12 +36,13 @@ from gvtools.scenes.rgbd_layouts import SEVENSCENES
 from gvtools.scenes.scene import Frame, Scene, SparsePoints, View
 from pipelines.cli import main
 
+pytestmark = pytest.mark.usefixtures("unpainted")
+
 HEIGHT, WIDTH, FAR = 40, 60, 3.0
 
 
 def camera(x: float = 0.0, name: str = "one") -> Cameras:
-    pose = np.eye(4)
-    pose[0, 3] = -x
+    pose = rigid_poses(np.eye(3), (-x, 0, 0))
     return Cameras.pinhole(WIDTH, HEIGHT, focal=50, cam_from_world=pose, name=name)
 
 
@@ -130,9 +131,6 @@ def test_recorded_depth_is_dropped_and_counted_where_masks_let_it_speak(first, o
     wrong = (with_blob() < FAR) & first & others
     assert (alone.contradicted, checked.contradicted) == (0, wrong.sum())
     np.testing.assert_array_equal(checked.depth, np.where(wrong, 0, with_blob()))
-
-
-pytestmark = pytest.mark.usefixtures("unpainted")
 
 
 class Computed:
@@ -340,8 +338,7 @@ CELLS = np.random.default_rng(3).integers(40, 200, (64, 64, 3), dtype=np.uint8)
 
 
 def camera_at(x: float = 0.0) -> Cameras:
-    pose = np.eye(4)
-    pose[0, 3] = -x
+    pose = rigid_poses(np.eye(3), (-x, 0, 0))
     return Cameras.pinhole(80, 60, focal=80, cam_from_world=pose, name="c")
 
 

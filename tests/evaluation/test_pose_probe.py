@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from walls import HEIGHT, WALLS, WIDTH, Float64, Take, blotches, camera_at, photograph
 
-from gvtools.cameras import Cameras
+from gvtools.cameras import Cameras, rigid_poses
 from gvtools.errors import CheckpointError, DegenerateError, ShapeError
 from gvtools.evaluation.pose_probe import (
     Located,
@@ -329,9 +329,7 @@ def test_held_out_photographs_and_shifted_projections(shared):
     for one in context:
         memory.observe(one.rgb, one.depth, one.camera, round=0)
     for step, turn in (((0.0, 0, 0.2), (0, 0, 0)), ((0.0, 0, 0), (0, 5, 0))):
-        move = np.eye(4)
-        move[:3, :3] = Rotation.from_euler("xyz", turn, degrees=True).as_matrix()
-        move[:3, 3] = step
+        move = rigid_poses(Rotation.from_euler("xyz", turn, degrees=True).as_matrix(), step)
         found = []
         for one in targets[::5]:
             pose = move @ one.camera.cam_from_world

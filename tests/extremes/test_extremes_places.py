@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from gvtools.cameras import Cameras, check_usable
+from gvtools.cameras import Cameras, check_usable, rigid_poses
 from gvtools.errors import OptionError, ShapeError
 from gvtools.evaluation.depth_reprojection import depth_reprojection
 from gvtools.evaluation.feature_consistency import feature_consistency
@@ -316,8 +316,7 @@ TEXTURE = np.random.default_rng(0).integers(0, 256, (*TEXTURED, 3), dtype=np.uin
 
 
 def wall(*, depth: float | None = 2.0, shift: float = 0.0) -> PosedPicture:
-    pose = np.eye(4)
-    pose[0, 3] = -shift
+    pose = rigid_poses(np.eye(3), (-shift, 0, 0))
     camera = Cameras.pinhole(TEXTURED[1], TEXTURED[0], focal=30, cam_from_world=pose)
     lengths = None if depth is None else np.full(TEXTURED, depth, np.float32)
     return PosedPicture(f"at {shift:g}", camera, TEXTURE, lengths, None)

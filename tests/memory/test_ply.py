@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from memory_scenes import camera, points, random_memory, saved_bytes
 
-from gvtools.cameras import Cameras
+from gvtools.cameras import Cameras, rigid_poses
 from gvtools.errors import MemoryFileError
 from gvtools.memory import files
 from gvtools.memory.ply import export_memory_ply
@@ -167,10 +167,8 @@ def test_a_wall_is_seen_where_it_stands(tmp_path, offset):
     write_ply(path, wall(offset))
     memory = SpatialMemory.from_ply(path)
     assert memory.voxel == pytest.approx(0.01, rel=1e-3)
-    K = np.array([[[100.0, 0, 24], [0, 100, 24], [0, 0, 1]]])
-    pose = np.eye(4)
-    pose[0, 3] = -offset
-    seen = memory.project(Cameras(K, pose[None], np.array([48]), np.array([48]), ("a",)))
+    pose = rigid_poses(np.eye(3), (-offset, 0, 0))
+    seen = memory.project(Cameras.pinhole(48, 48, focal=100.0, cam_from_world=pose))
     assert seen.coverage == 1.0
     np.testing.assert_allclose(seen.depth, 2.0, atol=1e-5)
     np.testing.assert_allclose(seen.rgb[0, 20, 20] * 255, [200, 100, 50], atol=1e-3)

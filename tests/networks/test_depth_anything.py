@@ -15,6 +15,8 @@ from gvtools.networks.depth_anything.encoder import patch_rays
 from gvtools.networks.depth_anything.geometry_head import camera_centres
 from gvtools.networks.depth_anything.network import DepthAnything3
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 SIZE = (84, 112)
 GRID = (24, 32)
 
@@ -154,7 +156,6 @@ def test_rays_that_hold_no_camera():
         camera_centres(ray, -torch.ones(ray.shape[:-1]))
 
 
-pytestmark = pytest.mark.usefixtures("one_thread")
 TOLD = HintConfig(cameras=True, camera_unit="depth")
 
 

@@ -90,14 +90,8 @@ def test_solids_on_their_own_and_from_within_their_hull() -> None:
 
 
 def _towards(eye: np.ndarray, aim: np.ndarray) -> Cameras:
-    K = np.array([[16.0, 0, 20], [0, 16, 20], [0, 0, 1]])
-    return Cameras(
-        K[None],
-        invert_rigid(look_at(eye[None], aim, up=[0, 0, 1])),
-        np.array([40]),
-        np.array([40]),
-        ("a",),
-    )
+    (pose,) = invert_rigid(look_at(eye[None], aim, up=[0, 0, 1]))
+    return Cameras.pinhole(40, 40, focal=16.0, cam_from_world=pose)
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2, 5])

@@ -8,6 +8,7 @@ from memory_scenes import camera, points
 from scan_files import FAR, surface
 from scipy.spatial.transform import Rotation
 
+from gvtools.cameras import rigid_poses
 from gvtools.errors import DegenerateError, OptionError
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.scans import registration
@@ -130,8 +131,7 @@ def test_a_scan_that_fits_as_it_is_stays_where_it_is():
 @pytest.mark.parametrize(("moved", "fits"), [(0.0, True), (0.3, False), (1e6, False)])
 def test_a_given_placement_is_judged_and_kept(moved, fits):
     one, two = surface(20_000, seed=1)[0], surface(20_000, seed=2)[0]
-    matrix = np.eye(4)
-    matrix[:3, 3] = moved
+    matrix = rigid_poses(np.eye(3), moved)
     found = register(
         Surface(one), seen(two), least=0.5, metric=True, given=Placement(matrix, "given")
     )

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from walls import blotches, camera_at, photograph, write_project
 
-from gvtools.cameras import Cameras, invert_rigid
+from gvtools.cameras import Cameras, invert_rigid, rigid_poses
 from gvtools.scenes.pose_forms import pose_findings
 from gvtools.scenes.project import open_project
 from gvtools.scenes.registration import register_depth
@@ -123,7 +123,7 @@ def turned(degrees, translation):
 def plane_depth(K, cam_from_plane_frame, normal, offset, size):
     """z-depth of the plane normal . X = offset, given in the depth camera's frame."""
     height, width = size
-    rays = Cameras(K[None], np.eye(4)[None], np.array([width]), np.array([height]), ()).rays()
+    rays = Cameras.alike(K, np.eye(4), size=(width, height)).rays()
     rotation, shift = cam_from_plane_frame[:3, :3], cam_from_plane_frame[:3, 3]
     n = rotation @ normal
     return (offset + n @ shift) / (rays @ n)
@@ -147,7 +147,7 @@ def test_a_plane_stays_a_closed_plane(degrees, normal, zoom):
     np.testing.assert_allclose(result[filled], expected[filled], rtol=0.06)
     # Every colour pixel whose surface point was measured, well inside, has to be filled.
     height, width = size
-    rays = Cameras(K[None], np.eye(4)[None], np.array([width]), np.array([height]), ()).rays()
+    rays = Cameras.alike(K, np.eye(4), size=(width, height)).rays()
     points = (rays * expected[..., None]).reshape(-1, 3)
     back = invert_rigid(move)
     local = (points @ back[:3, :3].T + back[:3, 3]) @ DEPTH_K.T
@@ -175,8 +175,7 @@ def test_a_plane_stays_a_closed_plane(degrees, normal, zoom):
 def test_silhouette_neither_grows_nor_leaks():
     depth = np.full(SIZE, 4.0, np.float32)
     depth[30:70, 40:90] = 1.5
-    shift = np.eye(4)
-    shift[0, 3] = -0.06
+    shift = rigid_poses(np.eye(3), (-0.06, 0, 0))
     result = register_depth(
         depth, DEPTH_K, DEPTH_K, color_from_depth=shift, width=SIZE[1], height=SIZE[0]
     )
@@ -192,8 +191,7 @@ def test_silhouette_neither_grows_nor_leaks():
 
 
 def test_nothing_behind_the_camera():
-    behind = np.eye(4)
-    behind[2, 3] = -10
+    behind = rigid_poses(np.eye(3), (0, 0, -10))
     depth = np.full(SIZE, 2.0)
     result = register_depth(
         depth, DEPTH_K, DEPTH_K, color_from_depth=behind, width=SIZE[1], height=SIZE[0]

@@ -413,7 +413,7 @@ def cameras(names=()):
     K[3, 0, 0] = 400
     pose = np.repeat(np.eye(4)[None], VIEWS, axis=0)
     pose[:, 0, 3] = np.arange(VIEWS) * 0.1
-    return Cameras(K, pose, np.full(VIEWS, 640), np.full(VIEWS, 480), tuple(names))
+    return Cameras.alike(K, pose, size=(640, 480), names=tuple(names))
 
 
 def tracks(scene):

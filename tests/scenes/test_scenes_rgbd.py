@@ -11,6 +11,7 @@ from rgbd_folders import redwood, scannet, tum
 from scenes_workspace import HEIGHT, WIDTH, pose_matrix, ramp, save, sevenscenes
 from scipy.spatial.transform import Rotation
 
+from gvtools.cameras import rigid_poses
 from gvtools.errors import GvError, OptionError, ProjectError, ShapeError
 from gvtools.scenes.images import read_depth
 from gvtools.scenes.project import open_project
@@ -198,8 +199,7 @@ def test_depth_maximum_unit_and_eight_bit_depth(tmp_path):
 def test_registration_through_options_and_sidecar(tmp_path):
     root = sevenscenes(tmp_path)
     K = [[90, 0, 47.5], [0, 90, 35.5], [0, 0, 1]]
-    shift = np.eye(4)
-    shift[0, 3] = 0.2  # 90 * 0.2 / 2 m = 9 pixels to the right
+    shift = rigid_poses(np.eye(3), (0.2, 0, 0))  # 90 * 0.2 / 2 m = 9 pixels to the right
     given = SEVENSCENES.read(root, options=RgbdOptions(depth_K=K, color_from_depth=shift))
     depth = given.views[0].load().depth
     assert not depth[:, :9].any()
@@ -540,8 +540,7 @@ def test_scannet_registers_depth_into_the_larger_picture_and_drops_lost_frames(t
 
 def test_scannet_moved_depth_camera_is_pointed_out(tmp_path):
     root = scannet(tmp_path)
-    moved = np.eye(4)
-    moved[0, 3] = 0.1
+    moved = rigid_poses(np.eye(3), (0.1, 0, 0))
     np.savetxt(root / "intrinsic/extrinsic_color.txt", moved)
     scene = SCANNET.read(root)
     assert "camera-from-rig" in messages(scene)

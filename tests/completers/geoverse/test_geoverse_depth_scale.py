@@ -341,11 +341,8 @@ def test_rays_through_pixel_centres_are_those_of_the_cameras():
     pose, K = cameras()
     found = plucker_map(pose, K, ENCODED, pixel_offset=CENTRED)
     for b, view in np.ndindex(2, 3):
-        numpy = Cameras(
-            K[b, view].numpy()[None], invert_rigid(pose[b, view].numpy())[None],
-            np.array([ENCODED[1]]), np.array([ENCODED[0]]),
-            ("a",),
-        )  # fmt: skip
+        world = invert_rigid(pose[b, view].numpy())
+        numpy = Cameras.alike(K[b, view].numpy(), world, size=ENCODED[::-1])
         np.testing.assert_allclose(
             np.moveaxis(found[b, view].numpy(), 0, -1), numpy.plucker(), rtol=1e-9, atol=1e-9
         )

@@ -229,8 +229,7 @@ NAMES = ("a", "b", "c")
 
 
 def camera() -> Cameras:
-    K = np.array([[[40.0, 0, 24], [0, 40, 18], [0, 0, 1]]])
-    return Cameras(K, np.eye(4)[None], np.array([48]), np.array([36]), ("target",))
+    return Cameras.pinhole(48, 36, focal=40.0, name="target")
 
 
 def whole() -> Gaussians:

@@ -12,6 +12,7 @@ from command_line import run_command
 from export_runs import export_run
 from PIL import Image
 
+from gvtools.cameras import rigid_poses
 from gvtools.errors import OptionError, ProjectError
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.memory.store.views import SourceView
@@ -123,8 +124,7 @@ def test_track_elements_follow_the_renamed_views(scene, tmp_path):
 def test_cameras_far_from_the_origin_are_told_apart(scene, tmp_path):
     """Five million units out, the camera next door is within a relative tolerance of the pose."""
     memory = SpatialMemory(VOXEL, origin=ORIGIN)
-    shift = np.eye(4)
-    shift[:3, 3] = -np.array(ORIGIN)
+    shift = rigid_poses(np.eye(3), -np.array(ORIGIN))
     camera = scene.views[0].camera
     far = replace(camera, cam_from_world=camera.cam_from_world @ shift, names=("a.png",))
     beside = far.cam_from_world.copy()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import threading
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +15,7 @@ from tiny_scan import ExactDepth, render, world_from_cam, write_colmap_scan, wri
 from gvtools.depth import choice
 from gvtools.depth.source import DepthMap
 from gvtools.errors import DegenerateError
+from gvtools.prefetch import prefetch
 from gvtools.scenes.scene import Frame, Scene, View
 from pipelines.cli import main
 
@@ -161,3 +163,33 @@ def test_views_off_the_sparse_points_scale_are_reported_and_named(tmp_path, monk
     # A run that is taken up again says it as well.
     assert main([*words, "--quiet", "--resume"]) == 0
     assert "view_1.png, view_4.png;" in capsys.readouterr().err
+
+
+def test_items_come_in_order_with_the_next_one_begun():
+    begun: list[int] = []
+    second = threading.Event()
+
+    def load(item: int) -> int:
+        begun.append(item)
+        if item == 1:
+            second.set()
+        return 10 * item
+
+    items = prefetch(load, range(4))
+    assert next(items) == 0
+    # Nobody has asked for it yet.
+    assert second.wait(5) and 3 not in begun
+    assert list(items) == [10, 20, 30]
+    assert list(prefetch(load, [])) == []
+
+
+def test_an_error_comes_where_its_item_would_have():
+    def load(item: int) -> int:
+        if item == 1:
+            raise ValueError("broken")
+        return item
+
+    items = prefetch(load, range(3))
+    assert next(items) == 0
+    with pytest.raises(ValueError, match="broken"):
+        next(items)

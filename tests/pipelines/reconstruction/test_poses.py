@@ -11,6 +11,7 @@ from command_line import run_command
 from run_files import Killed, kill_after_round_0, reconstructed, results
 from tiny_scan import world_from_cam, write_scan
 
+from gvtools.cameras import rigid_poses
 from gvtools.errors import MemoryFileError
 from gvtools.poses.motions import move_pose
 from gvtools.procedural.noisy_room import jitter_poses
@@ -109,8 +110,7 @@ def test_the_project_of_a_run_is_seen_at_its_refined_poses(scan, whole, tmp_path
     extra = replace(scene.views[3], name="z.png")
     scene = replace(scene, views=(*scene.views, extra))
     given = scene.cameras.cam_from_world
-    shift = np.eye(4)
-    shift[:3, 3] = (0.01, 0.02, -0.03)
+    shift = rigid_poses(np.eye(3), (0.01, 0.02, -0.03))
     RunPoses(shift @ given[:8], given[8:10], depth=depth).save(copy / POSES)
     moved, said = at_run_poses(scene, copy)
     np.testing.assert_allclose(moved.cameras.cam_from_world[:8], shift @ given[:8], atol=1e-12)

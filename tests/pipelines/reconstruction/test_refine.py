@@ -18,6 +18,7 @@ from tiny_scan import write_colmap_scan, write_scan
 from gvtools.appearance import fit_options
 from gvtools.appearance.fit import Fit
 from gvtools.appearance.fit_options import FitOptions
+from gvtools.cameras import rigid_poses
 from gvtools.errors import DegenerateError
 from gvtools.files import write_json
 from gvtools.runs.poses import RunPoses
@@ -245,9 +246,7 @@ def started(walls, file, *settings):
 def test_splats_lie_where_the_project_is(walls, rows, tmp_path):
     """From their own frame, and from one that is turned, shifted and 2.5 times as large."""
     back = tmp_path / "placement.txt"
-    move = np.eye(4)
-    move[:3, :3] = 2.5 * Rotation.from_rotvec([0.3, -1.2, 2.0]).as_matrix()
-    move[:3, 3] = 7, -3, 11
+    move = rigid_poses(2.5 * Rotation.from_rotvec([0.3, -1.2, 2.0]).as_matrix(), (7, -3, 11))
     np.savetxt(back, np.linalg.inv(move))
     same = started(walls, saved(rows, tmp_path / "same.ply"))
     file = saved(rows, tmp_path / "moved.ply", move)

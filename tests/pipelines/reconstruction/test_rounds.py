@@ -17,7 +17,7 @@ from scan_files import FAR, write_las
 from tiny_scan import FOCAL, HEIGHT, WIDTH, render, world_from_cam, write_colmap_scan, write_scan
 from trajectory_writers import write_tum
 
-from gvtools.cameras import Cameras
+from gvtools.cameras import Cameras, rigid_poses
 from gvtools.cameras import concatenate as all_of
 from gvtools.completers.base import Completer, Completion, ScaleAlignment, ScaleStatus
 from gvtools.errors import OptionError, ShapeError
@@ -42,10 +42,8 @@ from pipelines.reconstruction.settings import RunSettings
 
 def camera(name: str, size: tuple[int, int], x: float = 0.0) -> Cameras:
     height, width = size
-    pose = np.eye(4)
-    pose[0, 3] = -x
-    K = np.array([[40.0, 0, width / 2], [0, 40.0, height / 2], [0, 0, 1]])
-    return Cameras(K[None], pose[None], np.array([width]), np.array([height]), names=(name,))
+    pose = rigid_poses(np.eye(3), (-x, 0, 0))
+    return Cameras.pinhole(width, height, focal=40.0, cam_from_world=pose, name=name)
 
 
 class Recorder(Completer):
