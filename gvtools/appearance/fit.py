@@ -399,9 +399,11 @@ class Fit:
             return
         found = np.zeros((len(self.views), 3))
         for row, view in enumerate(self.views):
-            shown = self._picture(row, self.cameras.given[row])
-            where = shown.solid if view.mask is None else shown.solid & view.mask
-            pairs = shown.rgb[where] * view.rgb[where] / np.float32(255)
+            small = reduce_view(view, _reduction(view, 0.0))
+            lens = Lens.of(self.cameras.given[row], small.K, size=small.size, near=self.near)
+            shown = Picture.of(self.splatter(self.population.values, lens))
+            where = shown.solid & (small.weight > 0)
+            pairs = shown.rgb[where] * small.target[:, where].T
             squares = np.square(shown.rgb[where]).sum(axis=0)
             if squares.all() and pairs.any(axis=0).all():
                 found[row] = np.log(pairs.sum(axis=0) / squares)
