@@ -225,7 +225,6 @@ def partners(pictures, views, **how):
     [
         (["{}.png"], VIEWS),
         (["generated_{}.png"], VIEWS),
-        (["{}_rgb.png"], VIEWS),
         (["step3/pred-{}.render.PNG"], VIEWS),
         (["{}.png"], ("left/1.jpg", "left/2.jpg", "right/1.jpg", "right/2.jpg")),
         (["out/{}.png"], ("left/1.jpg", "left/2.jpg", "right/1.jpg", "right/2.jpg")),

@@ -373,7 +373,6 @@ def test_the_same_generator_gives_the_same_path() -> None:
     ("rule", "count", "expected"),
     [
         ("first", 3, {(0, 1, 2)}),
-        ("ends", 1, {(0,)}),
         ("ends", 2, {(0, 7)}),
         ("ends", 4, {(0, 2, 5, 7)}),
         ("every", 4, {(0, 2, 4, 6), (1, 3, 5, 7)}),

@@ -140,12 +140,10 @@ NAMES = tuple(f"img{i}.png" for i in range(10))
         ("first:2", [0, 1]),
         ("last:3", [7, 8, 9]),
         ("range:2-4", [2, 3, 4]),
-        ("range:9-9", [9]),
         ("not:every:2", [1, 3, 5, 7, 9]),
         ("not:not:first:1", [0]),
         ("not:img3.png, img1.png", [0, 2, 4, 5, 6, 7, 8, 9]),
         ("img7.png,img2.png", [2, 7]),
-        (" img4.png ", [4]),
     ],
 )
 def test_forms(spec, indices):
@@ -176,12 +174,10 @@ def test_names_in_a_file_and_names_with_commas_and_colons(tmp_path):
     ("spec", "told"),
     [
         ("img33.png", "did you mean 'img3.png'"),
-        ("al", "did you mean 'all'"),
         ("evry:3", "did you mean 'every'"),
         ("every:x", "'x' after 'every'"),
         ("every:0", "steps of 1 or more"),
         ("every:50+20", "none of 10 views"),
-        ("range:4-2", "0 <= A <= B <= 9"),
         ("range:4-10", "0 <= A <= B <= 9"),
         ("first:11", "there are 10 views"),
         ("first:0", "none of 10"),
