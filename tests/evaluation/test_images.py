@@ -1,4 +1,4 @@
-"""LPIPS on a backbone with made-up weights: the plumbing is the published one, no value is."""
+"""Figures of pictures against libraries: PSNR, SSIM, LPIPS; pictures that were read otherwise."""
 
 from __future__ import annotations
 

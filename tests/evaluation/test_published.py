@@ -1,4 +1,4 @@
-"""Splits of scenes by the rules of benchmarks, and by the protocol's."""
+"""Published rows beside measured ones, and splits of scenes by the rules of benchmarks."""
 
 from __future__ import annotations
 

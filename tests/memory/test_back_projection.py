@@ -1,4 +1,4 @@
-"""Panoramas and fisheye pictures: directions as of COLMAP's lenses, holes, which way is up."""
+"""Pixels lifted to points; panoramas and fisheyes: directions as of COLMAP's lenses, up."""
 
 from __future__ import annotations
 

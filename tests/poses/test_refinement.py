@@ -1,4 +1,4 @@
-"""Poses by odometry between views: back to the truth, and better for pictures than given ones."""
+"""Poses by odometry between views and by bundle adjustment: back to the truth, never worse."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Poses of another form than the file's are told from the photographs of scenes without tracks."""
+"""Poses of another form than the file's, and depth registered into another camera."""
 
 from __future__ import annotations
 

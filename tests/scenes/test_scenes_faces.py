@@ -1,4 +1,4 @@
-"""Panoramas and wide fisheyes as perspective views; the pictures are functions of direction."""
+"""Panoramas and wide fisheyes as perspective views; pictures resized and undistorted."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures, masks and depth maps that are not called quite as lists have them."""
+"""Pictures, masks and depth maps as they are read, also under nearly the name that lists have."""
 # mypy: no-check-untyped-defs
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The look "splats": the page to share, behind the web viewer's scene."""
+"""The web viewer: its page, and the look "splats" behind the scene."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Fits that begin with splats or points from a file."""
+"""``gvtools refine``, and fits that begin with splats or points from a file."""
 
 from __future__ import annotations
 

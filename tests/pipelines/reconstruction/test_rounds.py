@@ -1,4 +1,4 @@
-"""A round's targets: completed together where wanted, projected no oftener than needed."""
+"""Targets: what they may be, completed in rounds, projected no oftener than needed; scans."""
 
 from __future__ import annotations
 
