@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cache, partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -130,6 +131,16 @@ def climbed(
                 break
             best, place = max(scores), tried[int(np.argmax(scores))]
     return best, place
+
+
+def sampled(picture: NDArray[Any], xy: Float64, *of: NDArray[np.int64]) -> Float64:
+    """(N,) numbers of (..., H, W) pictures, ``of`` which, at places (N, 2); NaN outside."""
+    with np.errstate(invalid="ignore"):
+        inside = ((xy >= 0) & (xy < picture.shape[:-3:-1])).all(1)
+    x, y = np.floor(xy[inside]).astype(np.int64).T
+    found = np.full(len(xy), np.nan)
+    found[inside] = picture[(*(each[inside] for each in of), y, x)]
+    return found
 
 
 def frame_there(scene: Scene, number: int) -> Frame | None:

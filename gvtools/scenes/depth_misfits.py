@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.scenes.depth_contradictions import climbed, frame_there, unit_findings
-from gvtools.scenes.pixel_contradictions import detailed, shown
+from gvtools.scenes.depth_contradictions import climbed, frame_there, sampled, unit_findings
+from gvtools.scenes.pixel_contradictions import GIVE, detail, shown
 from gvtools.scenes.scene import Finding, Frame, Scene
 
 Float64 = NDArray[np.float64]
@@ -34,12 +34,15 @@ GROWN = [np.array([0, 0, 0, wider]) for wider in np.arange(-4, 5) / 320]
 # places. On three recordings it is at most 1.04 times better, also with maps that are coarse, noisy
 # or spread; with a camera 25 mm beside 1.23 and 1.87.
 FAR, BETTER, CLEAR = 0.006, 1.12, 1.6
-# Views of which places are sought in those so many after them; depth is tried so many times as
-# large, and farther by so many times the middle depth. It is wrong where another is so far from it
-# and correlates so much, and so much better, in so many pairs. On three recordings none does.
-PROBES, GAPS, LOOK, PLACES = 6, (1, 2, 4, 8), 0.8, 60
+# Views of which places, where depth is smooth, are sought in those so many after them that stand
+# within a share of the depth and look almost the same way: a tracker's poses drift.
+PROBES, GAPS, STAND, LOOK, PLACES, FEWEST_PLACES, SMOOTH = 8, (1, 2, 4, 8), 0.15, 0.9, 400, 60, 1.05
+# Depth is tried so many times as large, and farther by so many times the middle depth. It is wrong
+# where another is so far from it, and correlates so much better in so many pairs; the photographs
+# are where so many pairs correlate by less. On three recordings they do by 0.7 to 0.99 in the
+# middle of the pairs, and no other depth does better; mirrored, turned or of others by 0.5 at most.
 TIMES, AHEAD = np.geomspace(0.6, 1 / 0.6, 61), np.linspace(-0.5, 0.5, 61)
-OTHER, CORRELATED, GAIN, PAIRS = 0.06, 0.4, 0.012, 0.6
+OTHER, GAIN, PAIRS, FEWEST_PAIRS, ALIKE = 0.06, 0.012, 0.6, 3, 0.52
 
 
 def depth_findings(scene: Scene) -> list[Finding]:
@@ -47,7 +50,7 @@ def depth_findings(scene: Scene) -> list[Finding]:
     numbers = [number for number, view in enumerate(scene.views) if view.has_depth]
     if len(numbers) < 2:
         return []
-    return unit_findings(scene) or _displaced(scene, numbers) or _offset(scene, numbers)
+    return unit_findings(scene) or _displaced(scene, numbers) or _unlike(scene, numbers)
 
 
 def _displaced(scene: Scene, numbers: Sequence[int]) -> list[Finding]:
@@ -55,13 +58,11 @@ def _displaced(scene: Scene, numbers: Sequence[int]) -> list[Finding]:
     ends = np.linspace(0, len(numbers) - 1, min(VIEWS, len(numbers))).astype(int)
     frames = [frame_there(scene, numbers[at]) for at in ends]
     found = [_edges(frame) for frame in frames if frame is not None and frame.depth is not None]
-    found = [(at, edges) for at, edges in found if len(at) >= FEWEST]
-    found = [(at, edges) for at, edges in found if edges.shape == found[0][1].shape]
+    found = [(at, k) for at, k in found if len(at) >= FEWEST and k.shape == found[0][1].shape]
     if len(found) < FEWEST_VIEWS:
         return []
-    places, view = np.concatenate([at for at, _ in found]), np.repeat(
-        range(len(found)), [len(at) for at, _ in found]
-    )  # fmt: skip
+    places = np.concatenate([at for at, _ in found])
+    view = np.repeat(range(len(found)), [len(at) for at, _ in found])
     pictures = np.array([edges for _, edges in found])
     size = np.array(pictures.shape[:1:-1])
     off, axis, ahead = places[:, :2] - size / 2, places[:, 2].astype(int), places[:, 3:]
@@ -69,10 +70,7 @@ def _displaced(scene: Scene, numbers: Sequence[int]) -> list[Finding]:
     def strengths(move: Float64) -> Float64:
         """(N,) of the pictures' edges where those of depth then are; NaN outside."""
         moved = off * (1 + move[2]) + (move[:2] + move[3] * ahead) * size.max()
-        xy = np.floor(size / 2 + moved).astype(int)
-        x, y = np.clip(xy, 0, size - 1).T
-        inside = (xy == np.column_stack([x, y])).all(1)
-        return np.asarray(np.where(inside, pictures[view, axis, y, x], np.nan))
+        return sampled(pictures, size / 2 + moved, view, axis)
 
     def score(move: Float64) -> float:
         there = strengths(move)
@@ -124,55 +122,77 @@ def _edges(frame: Frame) -> tuple[Float64, NDArray[np.float32]]:
     return found[chosen], np.array(edges)
 
 
-def _offset(scene: Scene, numbers: Sequence[int]) -> list[Finding]:
-    """A warning when views look alike where depth would place them if it were larger or farther."""
+def _unlike(scene: Scene, numbers: Sequence[int]) -> list[Finding]:
+    """A warning when views are not alike where depth places them, or more so by other depth."""
     load = lru_cache(1 + len(GAPS))(partial(frame_there, scene))
-    pairs = list[tuple[NDArray[Any], ...]]()
+    pairs = list[tuple[Any, ...]]()
     for at in sorted({*np.linspace(0, len(numbers) - 1, PROBES).astype(int).tolist()}):
         frame, camera = load(numbers[at]), scene.views[numbers[at]].camera
         if frame is None or frame.depth is None:
             continue
-        y, x = detailed(frame.rgb, frame.depth)
-        rays, z, own = camera.rays()[y, x], frame.depth[y, x].astype(float), shown(frame.rgb)[y, x]
+        y, x = _detailed(frame.rgb, frame.depth)
+        pose, z = camera.world_from_cam[0], frame.depth[y, x].astype(float)
+        rays = camera.rays()[y, x] @ pose[:3, :3].T
         for other in (numbers[at + gap] for gap in GAPS if at + gap < len(numbers)):
             there, beside = load(other), scene.views[other].camera
-            change = beside.cam_from_world[0] @ camera.world_from_cam[0]
-            if there is not None and change[2, 2] > LOOK and change[:3, 3].any():
+            moved = np.linalg.norm(beside.centers[0] - pose[:3, 3])
+            turned = beside.cam_from_world[0, 2, :3] @ pose[:3, 2]
+            near = 0 < moved < STAND * np.median([*z, 0]) and turned > LOOK
+            if there is not None and near:
                 picture = np.clip(shown(there.rgb), -127, 127).astype(np.int8)
-                pairs.append((rays, z, own, beside.K[0] @ change[:3], picture))
-    middle = float(np.median(np.concatenate([[1.0], *(z for _, z, *_ in pairs)])))
+                pairs.append((pose[:3, 3], rays, z, shown(frame.rgb)[y, x], beside, picture))
+    middle = float(np.median(np.concatenate([[1.0], *(pair[2] for pair in pairs)])))
 
     def alike(times: float, ahead: float) -> Float64:
-        """(P,) correlation of what pairs show at the same places, depth so changed; NaN for few."""
-        found = np.full(len(pairs), np.nan)
-        for row, (rays, z, own, projection, picture) in enumerate(pairs):
-            points = rays * (times * z + ahead * middle)[:, None]
-            at = points @ projection[:, :3].T + projection[:, 3]
-            x, y = np.floor(at[:, :2] / np.maximum(at[:, 2:], 1e-9)).T
-            seen = (at[:, 2] > 0) & (x >= 0) & (y >= 0)
-            seen &= (x < picture.shape[1]) & (y < picture.shape[0])
-            other = picture[y[seen].astype(int), x[seen].astype(int)]
-            if seen.sum() >= PLACES and min(own[seen].std(), other.std()) > 0:
-                found[row] = np.corrcoef(own[seen], other)[0, 1]
+        """(P,) correlation of what pairs show at the same places, depth so changed; 0 for few."""
+        found = np.zeros(len(pairs))
+        for row, (center, rays, z, own, beside, picture) in enumerate(pairs):
+            places = center + rays * (times * z + ahead * middle)[:, None]
+            (xy,), (depth,) = beside.project(places)
+            there = sampled(picture, np.where(depth[:, None] > 0, xy, -1))
+            seen = np.isfinite(there)
+            if seen.sum() >= FEWEST_PLACES and min(own[seen].std(), there[seen].std()) > 0:
+                found[row] = np.corrcoef(own[seen], there[seen])[0, 1]
         return found
 
-    now = alike(1, 0)
-    told = np.isfinite(now)
-    if not told.any():
+    pairs = [pair for pair, known in zip(pairs, alike(1, 0) != 0, strict=True) if known]
+    if len(pairs) < FEWEST_PAIRS:
         return []
-    larger = np.array([alike(times, 0) for times in TIMES])[:, told]
-    farther = np.array([alike(1, ahead) for ahead in AHEAD])[:, told]
-    k, j = (int(np.nan_to_num(found).mean(1).argmax()) for found in (larger, farther))
-    means = np.nan_to_num([larger[k], farther[j]]).mean(1)
-    best, before = (larger[k], farther[j])[int(means.argmax())], float(np.mean(now[told]))
-    near = abs(float(TIMES[k]) - 1) < OTHER or abs(float(AHEAD[j])) < OTHER
-    if near or max(means) < max(before + GAIN, CORRELATED) or np.mean(best > now[told]) < PAIRS:
+    now = alike(1, 0)
+    tried = [[alike(times, 0) for times in TIMES], [alike(1, ahead) for ahead in AHEAD]]
+    rows = [int(np.argmax(np.mean(found, axis=1))) for found in tried]
+    fits = [found[row] for found, row in zip(tried, rows, strict=True)]
+    means, before = [float(fit.mean()) for fit in fits], float(now.mean())
+    times, ahead = float(TIMES[rows[0]]), float(AHEAD[rows[1]])
+    gained = float((fits[means[1] > means[0]] > now).mean())
+    other = min(abs(times - 1), abs(ahead)) > OTHER and gained > PAIRS
+    if other and max(means) > max(before + GAIN, ALIKE):
+        line = (
+            f"recorded depth contradicts the poses: pictures of neighbouring views agree where it "
+            f"places them (correlation {before:.2f}), but more if it were {times:.3g} times as "
+            f"large ({means[0]:.2f}) or {ahead * middle:+.3g} farther ({means[1]:.2f}): mend the "
+            "unit or the constant of one of them (--depth-unit of RGB-D folders, "
+            "depth_unit_scale_factor or integer_depth_scale of transforms.json)"
+        )
+        return [Finding("warning", line)]
+    if np.median(now) > ALIKE:
         return []
     line = (
-        f"recorded depth contradicts the poses: pictures of neighbouring views agree where it "
-        f"places them (correlation {before:.2f}), but more if it were {TIMES[k]:.3g} times as "
-        f"large ({means[0]:.2f}) or {AHEAD[j] * middle:+.3g} farther ({means[1]:.2f}): "
-        "mend the unit or the constant of one of them (--depth-unit of RGB-D folders, "
-        "depth_unit_scale_factor or integer_depth_scale of transforms.json)"
+        f"photographs do not show the same places by depth: neighbours correlate by "
+        f"{np.median(now):.2f} where depth and poses place them, expected more than {ALIKE:g}: "
+        f"renumbered, mirrored, cropped or turned pictures give wrong results: {GIVE}"
     )
     return [Finding("warning", line)]
+
+
+def _detailed(
+    rgb: NDArray[np.uint8], depth: NDArray[np.float32]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows and columns of pixels with detail around which depth is smooth, evenly spread."""
+    around = np.ones((5, 5), np.uint8)
+    low, high = cv2.erode(depth, around), cv2.dilate(depth, around)
+    strength = np.abs(detail(rgb)) * ((low > 0) & (high < SMOOTH * low))
+    used = strength[strength > 0]
+    rows, columns = np.nonzero(strength >= (np.quantile(used, 0.75) if used.size else np.inf))
+    chosen = np.linspace(0, len(rows) - 1, min(PLACES, len(rows))).astype(int)
+    return rows[chosen], columns[chosen]

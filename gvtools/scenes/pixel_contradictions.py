@@ -2,8 +2,7 @@
 
 Reprojection errors do not tell, as no pixel enters them. A track's detections show one place, so
 that what photographs have there is alike: luminance at the detections of a view, freed of what
-varies slowly, is correlated with the mean of the other views' at the same tracks. Where a scene has
-no sparse points, recorded depth of a few views tells what they and those after them show.
+varies slowly, is correlated with the mean of the other views' at the same tracks.
 
 Pictures that are all a little off (cropped, shifted, undistorted twice) still show alike places; so
 places that are moved together are tried, too. The points' colours tell channels that are swapped.
@@ -12,14 +11,13 @@ places that are moved together are tried, too. The points' colours tell channels
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import cache, partial
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.scenes.depth_contradictions import climbed, frame_there, unit_findings
+from gvtools.scenes.depth_contradictions import climbed, frame_there, sampled
 from gvtools.scenes.matching import named
 from gvtools.scenes.scene import Finding, Scene, SparsePoints
 
@@ -48,12 +46,6 @@ CHANGES: Mapping[str, tuple[int, Callable[[Grey], Grey]]] = {
     "each fits the picture before it": (-1, np.asarray),
 }
 GIVE = "give the pictures that the poses were computed from"
-# Views whose depth is taken, those so many places after each that it is compared with, pixels of
-# each; how far depth around one may differ, and two views' depth of one place.
-DEPTH_PROBES, DEPTH_GAPS, DEPTH_PIXELS, SMOOTH, SAME_PLACE = 5, (0, 1, 2, 4), 400, 1.05, 0.02
-# Only views that stand within this share of the depth and look almost the same way (cosine) tell: a
-# tracker's poses drift, so that right ones farther apart correlate by 0.1 to 0.6. So many tell.
-STAND, LOOK, ROUGH = 0.15, 0.9, 3
 # Views that a run looks at, and that a reason is sought for.
 PROBES, TRIED = 8, 16
 # How all detections may be moved: right and down in longer sides, from the middle in shares of the
@@ -71,14 +63,17 @@ PIXELS, FEWEST, ENOUGH = 2.0, 4, 80
 # with the points'.
 COLORED, SWAPPED = 4.0, -0.3
 
+NO_POINTS = SparsePoints(
+    np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0, np.float32),
+    np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros((0, 2)),
+)  # fmt: skip
+
 
 class PixelCheck:
     """The luminance at detections, gathered view by view."""
 
     def __init__(self, scene: Scene) -> None:
-        # Depth is rougher than detections: it judges all photographs together.
-        self.rough = scene.points is None
-        self.scene, self.points = scene, scene.points or _points_of_depth(scene)
+        self.scene, self.points = scene, scene.points or NO_POINTS
         self.rows = self.points.rows_of_views(len(scene))
         self.values = np.full(len(self.points.point_index), np.nan)
         self.kept = dict.fromkeys(self.most_in_common(range(len(scene))), np.zeros((0, 0), np.int8))
@@ -113,13 +108,7 @@ class PixelCheck:
         self, number: int, picture: NDArray[Any], xy: NDArray[np.float64] | None = None
     ) -> NDArray[np.float64]:
         """(N,) numbers of a picture at the detections of a view, or at other places of them."""
-        height, width = picture.shape
-        xy = self.points.xy[self.rows[number]] if xy is None else xy
-        x, y = np.floor(xy).astype(np.int64).T
-        inside = (x > 0) & (y > 0) & (x < width - 1) & (y < height - 1)
-        found = np.full(len(x), np.nan)
-        found[inside] = picture[y[inside], x[inside]]
-        return found
+        return sampled(picture, self.points.xy[self.rows[number]] if xy is None else xy)
 
     def _places(self, number: int, move: NDArray[np.float64]) -> NDArray[np.float64]:
         """(N, 2) where the detections of a view are when they are moved, see MOVES."""
@@ -134,7 +123,7 @@ class PixelCheck:
     def _moved(self) -> str:
         """How all detections have to be moved for the photographs to agree better, "" for none."""
         known = [number for number, kept in self.kept.items() if kept.size]
-        if self.rough or len(known) < FEWEST:
+        if len(known) < FEWEST:
             return ""
         # For each track another direction, the same in all views.
         turn, still = 2.4 * self.points.point_index, np.zeros(len(MOVES))
@@ -193,11 +182,6 @@ class PixelCheck:
         """A warning where photographs and detections disagree."""
         judged = self.agreements()
         wrong = [n for n, s in judged.items() if s < self.agree]
-        if self.rough and (len(judged) < ROUGH or np.median([*judged.values()]) >= self.agree):
-            return []
-        # Depth of a wrong unit says of no place where it is.
-        if self.rough and wrong and unit_findings(self.scene):
-            return []
         # Right ones that were compared with wrong ones are cleared.
         judged |= self.agreements(without=wrong)
         wrong = sorted((n for n in wrong if judged[n] < self.agree), key=lambda n: judged[n])
@@ -215,10 +199,9 @@ class PixelCheck:
                 findings.append(Finding("warning", f"photographs are {moved}: {GIVE}"))
             return findings
         names = named([f"{self.scene.views[n].name} ({judged[n]:.2f})" for n in wrong])
-        place = "the same places by depth" if self.rough else "detections"
         message = (
             f"{len(wrong)} of {len(judged)} photographs do not show what their cameras saw "
-            f"({len(wrong) / len(judged):.0%}; correlation at {place} below {self.agree:.2g}): "
+            f"({len(wrong) / len(judged):.0%}; correlation at detections below {self.agree:.2g}): "
             f"{names}{self._reason(wrong) or (moved and f'; they are {moved}')}; renumbered, "
             f"mirrored, cropped or turned pictures give wrong results: {GIVE}"
         )
@@ -242,53 +225,6 @@ class PixelCheck:
             if fit and np.median(fit) > self.agree:
                 return f"; {reason}"
         return ""
-
-
-def _points_of_depth(scene: Scene) -> SparsePoints:
-    """Places with detail that depth of a few views gives, and where some after them show these."""
-    numbers = [number for number, view in enumerate(scene.views) if view.has_depth]
-    load = cache(partial(frame_there, scene))
-    places, count = [np.zeros((0, 3))], 0
-    tracks = [(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)))]
-    last = len(numbers) - 1
-    for at in sorted({*np.linspace(0, last, min(DEPTH_PROBES, last + 1)).astype(int).tolist()}):
-        frame, camera = load(numbers[at]), scene.views[numbers[at]].camera
-        if frame is None or frame.depth is None:
-            continue
-        y, x = detailed(frame.rgb, frame.depth)
-        pose = camera.world_from_cam[0]
-        local = (frame.depth[..., None] * camera.rays())[y, x]
-        places.append(local @ pose[:3, :3].T + pose[:3, 3])
-        for other in (numbers[at + gap] for gap in DEPTH_GAPS if at + gap < len(numbers)):
-            frame, there = load(other), scene.views[other].camera.world_from_cam[0]
-            if frame is None or frame.depth is None:
-                continue
-            moved = np.linalg.norm(there[:3, 3] - pose[:3, 3])
-            if moved > STAND * np.median([*local[:, 2], 0]) or there[:3, 2] @ pose[:3, 2] < LOOK:
-                continue
-            (xy,), (z,) = scene.views[other].camera.project(places[-1])
-            inside = (z > 0) & (xy >= 0).all(1) & (xy < frame.depth.shape[::-1]).all(1)
-            x, y = np.where(inside[:, None], xy, 0).astype(int).T
-            rows = np.flatnonzero(inside & (np.abs(frame.depth[y, x] - z) < SAME_PLACE * z))
-            tracks.append((count + rows, np.full(len(rows), other), xy[rows]))
-        count += len(places[-1])
-    point, view, xy = (np.concatenate(part) for part in zip(*tracks, strict=True))
-    colors, errors = np.zeros((count, 3), np.uint8), np.zeros(count, np.float32)
-    point, view = point.astype(np.int32), view.astype(np.int32)
-    return SparsePoints(np.concatenate(places), colors, errors, point, view, xy)
-
-
-def detailed(
-    rgb: NDArray[np.uint8], depth: NDArray[np.float32]
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows and columns of pixels with detail around which depth is smooth, evenly spread."""
-    around = np.ones((5, 5), np.uint8)
-    low, high = cv2.erode(depth, around), cv2.dilate(depth, around)
-    strength = np.abs(detail(rgb)) * ((low > 0) & (high < SMOOTH * low))
-    used = strength[strength > 0]
-    rows, columns = np.nonzero(strength >= (np.quantile(used, 0.75) if used.size else np.inf))
-    chosen = np.linspace(0, len(rows) - 1, min(DEPTH_PIXELS, len(rows))).astype(int)
-    return rows[chosen], columns[chosen]
 
 
 def shown(rgb: NDArray[np.uint8]) -> Grey:
