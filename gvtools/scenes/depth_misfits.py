@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.scenes.depth_contradictions import climbed, frame_there, sampled, unit_findings
-from gvtools.scenes.pixel_contradictions import GIVE, detail, shown
+from gvtools.scenes.pixel_contradictions import CONTRAST, GIVE, detail, shown
 from gvtools.scenes.scene import Finding, Frame, Scene
 
 Float64 = NDArray[np.float64]
@@ -151,7 +151,7 @@ def _unlike(scene: Scene, numbers: Sequence[int]) -> list[Finding]:
             (xy,), (depth,) = beside.project(places)
             there = sampled(picture, np.where(depth[:, None] > 0, xy, -1))
             seen = np.isfinite(there)
-            if seen.sum() >= FEWEST_PLACES and min(own[seen].std(), there[seen].std()) > 0:
+            if seen.sum() >= FEWEST_PLACES and own[seen].std() > CONTRAST < there[seen].std():
                 found[row] = np.corrcoef(own[seen], there[seen])[0, 1]
         return found
 
