@@ -35,10 +35,7 @@ DIRECTIONS = {"up": (0, -1), "left": (-1, 0), "down": (0, 1), "right": (1, 0)}
 
 
 def number_table(path: Path, columns: int, *, skip: int = 0, required: bool = False) -> Float64:
-    """(N, columns) float64 of a text file with one row a line.
-
-    An absent file or one without rows has none, unless one is ``required``.
-    """
+    """(N, columns) float64 of a text file with one row a line."""
     if not required and not path.exists():
         return np.zeros((0, columns))
     with reading(path, f"expected {columns} numbers in each row; download it again"):

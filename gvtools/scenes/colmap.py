@@ -245,10 +245,7 @@ def _observations(
 def _of_view(
     lens: Undistortion, K: NDArray[np.float64], xy: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """(N, 2) pixels of a model's pinhole camera as those of the view, whose picture may be scaled.
-
-    Both look along the same axes from the same place, so that the ray stays the same.
-    """
+    """(N, 2) pixels of a model's pinhole camera as those of the view, which may be scaled."""
     if np.array_equal(lens.K, K):
         return xy
     change = K @ np.linalg.inv(lens.K)

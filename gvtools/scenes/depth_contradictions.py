@@ -172,9 +172,8 @@ def _agreeing(
         z = points[..., 2]
         with np.errstate(divide="ignore", invalid="ignore"):
             xy = (points @ cameras[1].K[0].T)[..., :2] / z[..., None]
-            inside = (z > 0) & (xy >= 0).all(-1) & (xy < other.shape[::-1]).all(-1)
-        x, y = np.moveaxis(np.where(inside[..., None], xy, 0).astype(int), -1, 0)
-        expected = factors[:, None] * other[y, x]
+        there = sampled(other, np.where(z[..., None] > 0, xy, -1).reshape(-1, 2)).reshape(z.shape)
+        inside, expected = np.isfinite(there), factors[:, None] * np.nan_to_num(there)
         # What is hidden tells nothing.
         inside &= expected * (1 + same) > z
         shared[row] = inside.sum(1) / max(len(rows), 1)

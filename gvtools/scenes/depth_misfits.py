@@ -21,11 +21,9 @@ from gvtools.scenes.scene import Finding, Frame, Scene
 
 Float64 = NDArray[np.float64]
 
-# Views whose edges are compared, how many at least, the pictures' longer side then [pixels], and
-# edges of each; depth ends where it jumps by this share.
-VIEWS, FEWEST_VIEWS, SIDE, EDGES, FEWEST, JUMP = 8, 4, 320, 400, 150, 0.08
-# Strength of pictures' edges is over that around them, and no more than this counts.
-STRONGEST = 4.0
+# Views whose edges are compared, how many at least, the pictures' longer side then [pixels], edges
+# of each; depth ends where it jumps by this share; edges count up to so many times those around.
+VIEWS, FEWEST_VIEWS, SIDE, EDGES, FEWEST, JUMP, STRONGEST = 8, 4, 320, 400, 150, 0.08, 4.0
 # Maps are tried moved right and down [longer sides] and larger [shares], from the best on by these
 # steps. Those whose near surfaces are too wide or narrow, as stereo has them, are in place.
 SHIFTS, SIZES, STEPS = np.arange(-8, 9) / 160, np.arange(-3, 4) / 20, (0.004, 0.002)

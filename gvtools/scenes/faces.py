@@ -219,10 +219,7 @@ class Face(Undistortion):
     def _source_xy(
         self, samples: int, *, rows: tuple[int, int], everywhere: bool = False
     ) -> NDArray[np.float32]:
-        """Places in the picture of samples of some rows, pixels; NaN where nothing is seen.
-
-        With ``everywhere``, places outside the picture and past ``limit`` are kept.
-        """
+        """Places in the picture of samples of some rows, pixels; NaN where nothing is seen."""
         rays = self._rays(samples, rows)
         local = rays.reshape(-1, 3) @ self.rotation
         xy = project(self.source, local)
@@ -343,10 +340,7 @@ def _last(theta: Float64, holds: NDArray[np.bool_]) -> float:
 
 
 def project(camera: pycolmap.Camera, rays: Float64) -> Float64:
-    """(N, 3) directions of a camera as (N, 2) pixels; NaN where the model shows nothing.
-
-    Equidistant fisheye models are projected past 90 degrees, too.
-    """
+    """(N, 3) directions of a camera as (N, 2) pixels; NaN where the model shows nothing."""
     if camera.model_name not in EQUIDISTANT:
         return np.asarray(camera.img_from_cam(rays)).reshape(-1, 2)
     theta = _angle(rays)

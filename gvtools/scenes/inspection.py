@@ -19,7 +19,7 @@ from gvtools.scenes.depth_misfits import depth_findings
 from gvtools.scenes.matching import named
 from gvtools.scenes.pixel_contradictions import PixelCheck
 from gvtools.scenes.pose_forms import pose_findings
-from gvtools.scenes.scene import Finding, Frame, Scene, SparsePoints
+from gvtools.scenes.scene import Finding, Frame, Scene
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -151,10 +151,7 @@ def _of_kinds(findings: Sequence[Finding]) -> list[Finding]:
 
 
 def reprojection_errors(scene: Scene) -> np.ndarray:
-    """(M,) float64, pixels: for each track element, projection minus detection, in length.
-
-    NaN where the point lies behind the camera.
-    """
+    """(M,) pixels between projection and detection of each track element; NaN behind a camera."""
     points = scene.points
     if points is None or not len(points.point_index):
         return np.zeros(0)
@@ -221,13 +218,13 @@ def _views_without_depth(scene: Scene) -> list[Finding]:
     if len(scene) < 2:
         message = "the only view has no depth, and depth cannot be computed from one photograph"
         return [Finding("warning", message)]
-    if without == len(scene):
-        which, whose = f"none of the {len(scene)} views has recorded depth", "it"
-    else:
-        which = f"recorded depth in {len(scene) - without} of the {len(scene)} views"
-        whose = "that of the others"
-    message = f"{which}; a run computes {whose} from the photographs (plane-sweep stereo)"
-    return [Finding("info", message)]
+    line = f"none of the {without} views has recorded depth; a run computes it"
+    if without < len(scene):
+        line = (
+            f"recorded depth in {len(scene) - without} of the {len(scene)} views; a run computes "
+        )
+        line += "that of the others"
+    return [Finding("info", f"{line} from the photographs (plane-sweep stereo)")]
 
 
 def camera_findings(scene: Scene, errors: np.ndarray) -> list[Finding]:
@@ -281,15 +278,10 @@ def _depth(scene: Scene, opened: list[_Opened]) -> DepthSummary | None:
 
 # --- poses that contradict each other -------------------------------------------------------------
 #
-# Structure from motion that meets an object which repeats (a label on two sides, equal facades) can
-# give pictures of one side the poses of the other. Reprojection errors stay small then, since every
-# point fits. What gives such poses away is a pair of cameras at nearly the same place, with nearly
-# the same orientation, that see different surroundings.
-#
-# The parallax between such cameras is small, so that the homography of their rotation,
-# ``K_b R K_a⁻¹``, carries one picture onto the other up to a few pixels of a small picture. Windows
-# are compared by zero-normalised cross-correlation, which no change of brightness or contrast
-# alters, at the best of a few shifts, which take up what parallax is left.
+# Structure from motion can give pictures of one side of an object that repeats the poses of the
+# other; every point fits. Nearly equal cameras that see different surroundings tell: the homography
+# ``K_b R K_a⁻¹`` carries one small picture onto the other up to a few pixels. Windows are compared
+# by zero-normalised cross-correlation at the best of a few shifts.
 
 # Cameras count as nearly equal below this distance, in scene depths, and this angle.
 NEAR = 0.06
@@ -308,7 +300,6 @@ COMPARABLE, DISAGREEING = 0.3, 0.15
 # Sparse points contradict when each view has at least this many that lie in the other's picture,
 # and less than this share of them is of both. On three real scenes it is at least 0.5.
 POINTS, SHARED = 30, 0.05
-LISTED = 3  # pairs that the finding names
 # Places of the shifted window in the padded picture, unshifted first.
 _SHIFTS = sorted(
     product(range(2 * SHIFT + 1), repeat=2), key=lambda at: hypot(at[0] - SHIFT, at[1] - SHIFT)
@@ -327,54 +318,28 @@ class Contradiction:
     """Two views whose poses cannot both be right."""
 
     names: tuple[str, str]  # of the two
-    # share of the comparable area in which the pictures differ; None where the pictures could
-    # not be compared
-    disagreement: float | None
-    shared_points: int | None  # sparse points of both views; None without enough points
-    points: int | None  # of those that could be shared, the smaller number of the two views
+    worse: float  # the share of the picture that differs; 1 where no points are shared
+    evidence: str
 
     def __str__(self) -> str:
-        if self.disagreement is not None and self.disagreement > DISAGREEING:
-            evidence = f"{self.disagreement:.0%} of the picture differs"
-        else:
-            evidence = f"{self.shared_points} of {self.points} sparse points shared"
-        return f"{self.names[0]} and {self.names[1]} ({evidence})"
+        return f"{self.names[0]} and {self.names[1]} ({self.evidence})"
 
 
-@dataclass(frozen=True, eq=False)
-class _Tracks:
-    """Sparse points by the views that detected them."""
-
-    points: SparsePoints  # all
-    # for each view the points of its track elements, repeats included
-    of_view: list[NDArray[np.int32]]
-
-    @staticmethod
-    def of(points: SparsePoints, views: int) -> _Tracks:
-        return _Tracks(points, [points.point_index[rows] for rows in points.rows_of_views(views)])
-
-    def depths(self, cameras: Cameras) -> dict[int, float]:
-        """Median z-depth of the points of each view that has any, scene units."""
-        axes = cameras.cam_from_world[:, 2]
-        return {
-            view: float(np.median(self.points.positions[rows] @ axis[:3] + axis[3]))
-            for view, (rows, axis) in enumerate(zip(self.of_view, axes, strict=True))
-            if len(rows)
-        }
-
-    def shared(self, cameras: Cameras, views: tuple[int, int]) -> tuple[int, int] | None:
-        """How many points both views have, and of how many; None where too few can tell."""
-        own = [np.unique(self.of_view[view]) for view in views]
-        inside = []
-        for rows, other in zip(own, reversed(views), strict=True):
-            xy, z = cameras[other].project(self.points.positions[rows])
-            size = [cameras.width[other], cameras.height[other]]
-            with np.errstate(invalid="ignore"):
-                seen = (z[0] > 0) & (xy[0] >= 0).all(-1) & (xy[0] < size).all(-1)
-            inside.append(int(seen.sum()))
-        if min(inside) < POINTS:
-            return None
-        return len(np.intersect1d(own[0], own[1])), min(inside)
+def _shared(
+    scene: Scene, own: Sequence[NDArray[np.int32]], views: tuple[int, int]
+) -> tuple[int, int] | None:
+    """How many of the ``own`` points two views share, of how many; None where too few can tell."""
+    assert scene.points is not None
+    inside = []
+    for view, other in zip(views, reversed(views), strict=True):
+        camera, positions = scene.views[other].camera, scene.points.positions[own[view]]
+        (xy,), (z,) = camera.project(positions)
+        with np.errstate(invalid="ignore"):
+            seen = (z > 0) & (xy >= 0).all(-1) & (xy < [*camera.width, *camera.height]).all(-1)
+        inside.append(int(seen.sum()))
+    if min(inside) < POINTS:
+        return None
+    return len(np.intersect1d(own[views[0]], own[views[1]])), min(inside)
 
 
 def turn_degrees(a: Float64, b: Float64) -> Float64:
@@ -402,17 +367,13 @@ def thumbnail(frame: Frame) -> GreyThumbnail:
 def contradiction_findings(
     scene: Scene, thumbnails: Mapping[int, GreyThumbnail], depths: Mapping[int, float]
 ) -> list[Finding]:
-    """One warning when nearly equal cameras see different things, else nothing.
-
-    By the view's number, ``thumbnails`` are of those that could be read, ``depths`` median z-depth.
-    """
+    """One warning when nearly equal cameras see different things; ``depths`` are medians."""
     found = contradictions(scene, thumbnails, depths)
     if not found:
         return []
-    more = f" and {len(found) - LISTED} more" if len(found) > LISTED else ""
     message = (
         f"{len(found)} pairs of views have nearly equal cameras but show different things: "
-        f"{', '.join(str(pair) for pair in found[:LISTED])}{more}; expected at most "
+        f"{named(found)}; expected at most "
         f"{DISAGREEING:.0%} of the picture to differ and at least {SHARED:.0%} of the points to be "
         "shared: their poses contradict each other (an object that looks alike from two sides, "
         "swapped pictures), or something large moved, or light flickers in bands; look at these "
@@ -427,37 +388,42 @@ def contradictions(
     """The pairs of views whose poses contradict each other, worst first; arguments as above."""
     if len(scene) < 2:
         return []
-    cameras = scene.cameras
-    tracks = None if scene.points is None else _Tracks.of(scene.points, len(scene))
+    cameras, points = scene.cameras, scene.points
+    rows = [] if points is None else points.rows_of_views(len(scene))
+    own = [np.unique(points.point_index[each]) for each in rows] if points is not None else []
     found = []
-    for a, b in _near_pairs(cameras, _reach(scene, depths, tracks)):
-        points = None if tracks is None else tracks.shared(cameras, (a, b))
-        unshared = points is not None and points[0] < SHARED * points[1]
-        differs = None
+    for a, b in _near_pairs(cameras, _reach(scene, depths, own)):
+        shared = None if points is None else _shared(scene, own, (a, b))
+        unshared = shared is not None and shared[0] < SHARED * shared[1]
+        differs = 0.0
         if a in thumbnails and b in thumbnails:
             pair = thumbnails[a], thumbnails[b]
             enough = 0.0 if unshared else DISAGREEING
-            differs = disagreement(*pair, homography(pair, cameras, (a, b)), enough=enough)
-        if unshared or (differs is not None and differs > DISAGREEING):
-            names = scene.views[a].name, scene.views[b].name
-            shared, of = points or (None, None)
-            found.append(Contradiction(names, differs, shared, of))
-    return sorted(found, key=lambda pair: -(pair.disagreement or 1.0))
+            H = homography(pair, cameras, (a, b))
+            differs = disagreement(*pair, H, enough=enough) or 0.0
+        names = scene.views[a].name, scene.views[b].name
+        if differs > DISAGREEING:
+            found.append(Contradiction(names, differs, f"{differs:.0%} of the picture differs"))
+        elif unshared and shared is not None:
+            line = f"{shared[0]} of {shared[1]} sparse points shared"
+            found.append(Contradiction(names, 1.0, line))
+    return sorted(found, key=lambda pair: -pair.worse)
 
 
 def disagreement(
     a: GreyThumbnail, b: GreyThumbnail, H: Float64, *, enough: float = 0.0
 ) -> float | None:
-    """Share of the area with contrast in which two pictures differ, carried over by a homography.
+    """Share of what has contrast in both pictures that differs; None where that is too little.
 
-    None where less than ``COMPARABLE`` of the picture lies in both and has contrast in both. The
-    search among shifts ends once the share is at most ``enough``: each shift can lower it alone,
-    so that ending early never turns a pair into a contradiction or back. Most pairs agree at once,
-    unshifted.
+    The search among shifts, which lower it alone, ends once it is at most ``enough``.
     """
     x = a.grey
-    y, valid = _carried(b, H, a.grey.shape)
-    mask = (valid & a.valid).astype(np.float32)
+    size, flags = a.grey.shape[::-1], cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    y, there = (
+        np.asarray(cv2.warpPerspective(each.astype(np.float32), H, size, flags=flags), np.float32)
+        for each in (b.grey, b.valid)
+    )
+    mask = ((there > 0.99) & a.valid).astype(np.float32)
     # A lamp that flickers lights other rows in each picture, or columns of turned ones.
     for axis in (0, 1):
         light = [(mask * picture).sum(axis, keepdims=True) for picture in (x, y)]
@@ -507,34 +473,18 @@ def homography(
     return np.asarray(np.linalg.inv(half) @ Ks[1] @ rotation @ np.linalg.inv(Ks[0]) @ half)
 
 
-def _carried(
-    b: GreyThumbnail, H: Float64, shape: tuple[int, ...]
-) -> tuple[Float32, NDArray[np.bool_]]:
-    """The second picture seen from the first's orientation, and where it is known."""
-    size = shape[1], shape[0]
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    grey = cv2.warpPerspective(b.grey, H, size, flags=flags)
-    valid = cv2.warpPerspective(b.valid.astype(np.float32), H, size, flags=flags)
-    return np.asarray(grey, np.float32), valid > 0.99
-
-
-def _reach(scene: Scene, depths: Mapping[int, float], tracks: _Tracks | None) -> Float64:
-    """(V,) how far another camera may stand from each, scene units.
-
-    A share of the view's depth, from its sparse points or its depth map. A scene that has neither
-    is taken to be as deep as its cameras are spread, and half the mean step from view to view is
-    the most.
-    """
-    cameras = scene.cameras
-    centers = cameras.centers
-    known = dict(depths)
-    if tracks is not None:
-        known |= tracks.depths(cameras)
+def _reach(scene: Scene, depths: Mapping[int, float], own: Sequence[NDArray[np.int32]]) -> Float64:
+    """(V,) how far another camera may stand from each, by depth or what stands for it."""
+    cameras, known = scene.cameras, dict(depths)
+    for view, (rows, axis) in enumerate(zip(own, cameras.cam_from_world[:, 2], strict=False)):
+        if len(rows) and scene.points is not None:
+            known[view] = float(np.median(scene.points.positions[rows] @ axis[:3] + axis[3]))
     if known:
         middle = float(np.median(list(known.values())))
         return NEAR * np.array([known.get(view, middle) for view in range(len(scene))])
-    step = float(np.linalg.norm(np.diff(centers, axis=0), axis=1).mean())
-    return np.full(len(scene), min(NEAR * float(np.ptp(centers, axis=0).max()), step / 2))
+    # As deep as the cameras are spread; half the mean step from view to view is the most.
+    step = float(np.linalg.norm(np.diff(cameras.centers, axis=0), axis=1).mean())
+    return np.full(len(scene), min(NEAR * float(np.ptp(cameras.centers, axis=0).max()), step / 2))
 
 
 def _near_pairs(cameras: Cameras, reach: Float64) -> list[tuple[int, int]]:
@@ -551,10 +501,10 @@ def _near_pairs(cameras: Cameras, reach: Float64) -> list[tuple[int, int]]:
     count = min(NEIGHBORS + 1, len(cameras))
     _, nearest = KDTree(places).query(places, count)
     pairs = {(min(a, int(b)), max(a, int(b))) for a, row in enumerate(nearest) for b in row}
-    near = []
-    for a, b in sorted(pairs):
-        distance = float(np.linalg.norm(centers[a] - centers[b]))
-        degrees = float(turn_degrees(rotations[a], rotations[b]))
-        if a != b and distance < min(reach[a], reach[b]) and degrees < NEAR_DEGREES:
-            near.append((a, b))
-    return near
+    return [
+        (a, b)
+        for a, b in sorted(pairs)
+        if a != b
+        and np.linalg.norm(centers[a] - centers[b]) < min(reach[a], reach[b])
+        and turn_degrees(rotations[a], rotations[b]) < NEAR_DEGREES
+    ]

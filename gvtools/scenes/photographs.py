@@ -431,10 +431,7 @@ def conversion_findings(headers: Sequence[ImageHeader]) -> list[Finding]:
 
 
 def map_findings(photographs: Sequence[Photograph]) -> list[Finding]:
-    """An error for each unreadable map or mask or other aspect, and a line a size that differs.
-
-    None is decoded. Maps of a depth camera of its own, which may be of any size, are not looked at.
-    """
+    """An error for each unreadable map or mask or other aspect, and a line a size that differs."""
     findings: list[Finding] = []
     resized: Counter[str] = Counter()
     maps = dict[tuple[str, Path], tuple[int, int]]()

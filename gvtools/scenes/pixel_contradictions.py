@@ -156,11 +156,7 @@ class PixelCheck:
         without: Sequence[int] = (),
         least: int = TRACKS,
     ) -> dict[int, float]:
-        """Correlation with the others, of each view that has enough tracks in common with them.
-
-        Views ``without`` are compared, and none is compared with them. ``values`` (M,) stand for
-        those that were seen.
-        """
+        """Correlation of each view with the others; none is compared with those ``without``."""
         values = self.values if values is None else values
         index, count = self.points.point_index, len(self.points.positions)
         known = np.isfinite(values)

@@ -196,10 +196,7 @@ def pose_contradiction(
 def _pairs(
     scene: Scene, chosen: Sequence[int], scale: Float64, *, odd: NDArray[np.bool_], most_pairs: int
 ) -> list[_Pair]:
-    """A few pairs of views, evenly spread, that show the same from places apart.
-
-    Where there are odd ones among them, one of each pair is.
-    """
+    """A few pairs of views, evenly spread, that show the same from places apart."""
     matcher, features = SiftMatcher(max_features=1500), dict[int, Features | None]()
     pairs = []
     unlike = odd[chosen]

@@ -81,10 +81,7 @@ def resized(scene: Scene, width: int, height: int) -> Scene:
 
 
 def seen_by(scene: Scene, names: Iterable[str]) -> Scene:
-    """The scene with the sparse points alone that two of the named views detected.
-
-    Their positions stay as they were solved, with the help of all views.
-    """
+    """The scene with the sparse points alone that two of the named views detected."""
     points = scene.points
     if points is None:
         return scene

@@ -241,10 +241,7 @@ class _Views:
 
 
 def _write_shard(views: _Views, tar: Path, *, limit: float) -> ShardRecord | None:
-    """Write one shard, and its index after it; None where no view is left.
-
-    The view that reaches ``limit``, in bytes, is the last.
-    """
+    """Write one shard, and its index after it; None where no view is left."""
     first = views.position
     item = views.next()
     if item is None:

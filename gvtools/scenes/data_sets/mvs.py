@@ -43,10 +43,7 @@ class MvsCamera:
     def frame(
         self, image: Path, *, sizes: tuple[tuple[int, int], ...], unit: float = 1.0
     ) -> PosedFrame:
-        """A frame of this camera, in units of ``unit`` scene units.
-
-        ``sizes`` are further ones that the intrinsics may be of.
-        """
+        """A frame of this camera, in units of ``unit`` scene units."""
         size = size_of_intrinsics(self.K, first_size([image]) or (2, 2), *sizes)
         pose = self.cam_from_world.copy()
         pose[:3, 3] *= unit
