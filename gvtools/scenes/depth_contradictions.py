@@ -89,6 +89,12 @@ def unit_findings(scene: Scene) -> list[Finding]:
         )
         return [Finding("warning", line)]
     known = np.sort(shares[np.isfinite(shares)])
+    if not len(known) and len(names) > len(telling):
+        line = (
+            f"recorded depth contradicts the poses: no place of {len(names)} pairs of neighbouring "
+            f"views (first {names[0]}) is seen by both: state the unit of depth (--depth-unit)"
+        )
+        return [Finding("warning", line)]
     wrong = (known[:1] < ONE_PAIR).any() or (known[1:2] < TWO_PAIRS).any()
     if not (by_rays or wrong or late):
         return []

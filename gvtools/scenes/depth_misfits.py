@@ -28,6 +28,7 @@ VIEWS, FEWEST_VIEWS, SIDE, EDGES, FEWEST, JUMP, STRONGEST = 8, 4, 320, 400, 150,
 # steps. Those whose near surfaces are too wide or narrow, as stereo has them, are in place.
 SHIFTS, SIZES, STEPS = np.arange(-8, 9) / 160, np.arange(-3, 4) / 20, (0.004, 0.002)
 GROWN = [np.array([0, 0, 0, wider]) for wider in np.arange(-4, 5) / 320]
+FLIPS = {"mirrored": (-1, 1), "upside down": (1, -1), "turned by half": (-1, -1)}
 # They are displaced that are so far away, are so much better there and stand out so much among all
 # places. On three recordings it is at most 1.04 times better, also with maps that are coarse, noisy
 # or spread; with a camera 25 mm beside 1.23 and 1.87.
@@ -65,18 +66,22 @@ def _displaced(scene: Scene, numbers: Sequence[int]) -> list[Finding]:
     size = np.array(pictures.shape[:1:-1])
     off, axis, ahead = places[:, :2] - size / 2, places[:, 2].astype(int), places[:, 3:]
 
-    def strengths(move: Float64) -> Float64:
+    def strengths(move: Float64, flip: tuple[int, int] = (1, 1)) -> Float64:
         """(N,) of the pictures' edges where those of depth then are; NaN outside."""
-        moved = off * (1 + move[2]) + (move[:2] + move[3] * ahead) * size.max()
+        moved = flip * off * (1 + move[2]) + (move[:2] + move[3] * ahead) * size.max()
         return sampled(pictures, size / 2 + moved, view, axis)
 
-    def score(move: Float64) -> float:
-        there = strengths(move)
+    def score(move: Float64, flip: tuple[int, int] = (1, 1)) -> float:
+        there = strengths(move, flip)
         return float(np.nanmean(there)) if np.isfinite(there).mean() > 0.5 else 0.0
 
     moves = [np.array([x, y, larger, 0]) for larger, x, y in product(SIZES, SHIFTS, SHIFTS)]
     scores = [score(move) for move in moves]
     best, move = climbed(score, moves[int(np.argmax(scores))], STEPS)
+    flipped, way = max((score(np.zeros(4), flip), way) for way, flip in FLIPS.items())
+    if flipped > max(BETTER * best, CLEAR * np.median(scores)):
+        line = f"recorded depth is {way} against its pictures: their edges are where it ends then"
+        return [Finding("warning", f"{line}; give both as one camera has them")]
     # Maps whose near surfaces are a little too wide or narrow, as stereo has them, are in place.
     now, still = max((score(still), tuple(still)) for still in GROWN)
     gain = strengths(move) - strengths(np.array(still))

@@ -69,13 +69,27 @@ def seen_by(depth: np.ndarray, *, focal: float = FOCAL, beside: float = 0.0) -> 
     ],
 )
 def test_depth_that_is_not_of_its_pictures(change, said):
+    found = told(change)
+    assert [said in line for line in found] == [True] * bool(said), found
+
+
+@pytest.mark.parametrize(
+    ("flip", "said"),
+    [(np.fliplr, "mirrored"), (np.flipud, "upside down"), (lambda x: x[::-1, ::-1], "by half")],
+)
+def test_depth_that_is_turned_over_where_nothing_moves(flip, said):
+    (line,) = told(flip, step=0)
+    assert f"depth is {said}" in line.replace("turned ", "")
+
+
+def told(change, *, step=0.06):
+    """What is said of six views, so far apart."""
     views = []
     for number in range(6):
         pose = np.eye(4)
-        pose[0, 3] = -0.06 * number
+        pose[0, 3] = -step * number
         camera = Cameras(CAMERA.K, pose[None], CAMERA.width, CAMERA.height, (f"{number}",))
-        rgb, depth = boards(0.06 * number)
+        rgb, depth = boards(step * number)
         load = partial(Frame, rgb, np.ascontiguousarray(change(depth), np.float32))
         views.append(View(f"{number}", camera, load, has_depth=True))
-    found = [item.message for item in depth_findings(Scene(Path("."), "rgbd", tuple(views)))]
-    assert [said in line for line in found] == [True] * bool(said), found
+    return [item.message for item in depth_findings(Scene(Path("."), "rgbd", tuple(views)))]
