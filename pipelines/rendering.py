@@ -35,6 +35,7 @@ from gvtools.memory.splat.api import SplatOptions
 from gvtools.optional import require
 from gvtools.runs.run import at_run_poses, load_appearance, load_memory, said_of_path
 from gvtools.runs.target_files import to_bytes, write_png
+from gvtools.scenes.depth_contradictions import frame_there
 from gvtools.scenes.scene import Frame, Scene
 from gvtools.scenes.transforms import read_camera_path
 from gvtools.trajectories import PATHS, named_path
@@ -44,10 +45,8 @@ from pipelines.reconstruction.settings import RunSettings
 from pipelines.spherical_metadata import mark_mp4, write_panorama
 from viz.viewer.render import picture_of
 
-# Pictures beside a view's own fit what is shown where so much of the squared error is left.
-NEARER = 0.7
-# What a memory knows is more like its own scene's pictures than this [dB].
-OTHER_SCENE = 11
+# Other pictures fit where so much of the squared error is left; no scene's own has this PSNR.
+NEARER, OTHER_SCENE = 0.7, 11
 
 
 def render_view(
@@ -131,35 +130,25 @@ def measure(
     )
 
 
-def other_pictures(
-    scene: Scene | None, shown: Mapping[str, Guidance], *, psnr: float | None
-) -> str:
+def other_pictures(scene: Scene | None, shown: Mapping[str, Guidance], psnr: float | None) -> str:
     """What a project's pictures seem to be that are not those of views that are shown, or ""."""
-    if scene is None or not shown:
-        return ""
-    if psnr is not None and psnr < OTHER_SCENE:
-        return f"of another scene ({psnr:.1f} dB where the memory is known)"
+    if scene is None or psnr is None or psnr < OTHER_SCENE:
+        return "" if psnr is None else f"of another scene ({psnr:.1f} dB)"
     pictures, truths, ratios = [], [], []
     for name, guidance in shown.items():
         rgb, valid, at = to_bytes(guidance.rgb[0]), guidance.valid[0], scene.names.index(name)
-        if not (valid.any() and 0 < at < len(scene) - 1):
-            continue
-        own, *beside = (scene.views[at + step].load() for step in (0, 1, -1))
-        pictures.append(rgb)
-        truths.append(Frame(own.rgb, mask=valid))
-        left = [
-            np.square(np.subtract(frame.rgb, rgb, dtype=np.float32)[valid]).mean()
-            if frame.rgb.shape == rgb.shape else np.inf
-            for frame in (own, *beside)
-        ]  # fmt: skip
-        ratios.append(np.array(left[1:]) / max(left[0], 1))
+        frames = [frame_there(scene, (at + step) % len(scene)) for step in (0, 1, -1)]
+        around = [frame for frame in frames if frame and frame.rgb.shape == rgb.shape]
+        if len(around) == 3 and valid.any():
+            off = [np.subtract(frame.rgb, rgb, dtype=np.float32)[valid] for frame in around]
+            own, *others = np.mean(np.square(off), axis=(1, 2))
+            ratios.append(np.array(others) / max(own, 1))
+            pictures.append(rgb)
+            truths.append(Frame(around[0].rgb, mask=valid))
     least = np.median(ratios, axis=0) if ratios else np.ones(2)
     if min(least) < NEARER:
         way = "after" if least[0] < least[1] else "before"
-        return (
-            f"renumbered: what is shown is nearer to the picture {way} each view's own "
-            f"({-10 * np.log10(min(least)):.1f} dB)"
-        )
+        return f"renumbered: what is shown is nearer to the picture {way} each view's own"
     return better_reading(pictures, truths)
 
 

@@ -275,10 +275,7 @@ class ColmapModel:
 
 
 def load_model(folder: Path, *, faces: bool = False) -> ColmapModel:
-    """The model in ``folder``, binary or text, classic or with rigs and frames.
-
-    With ``faces``, cameras that see too much for one pinhole camera become several views.
-    """
+    """The model in ``folder``, binary or text; with ``faces``, wide cameras become several."""
     suffix, findings = checked_suffix(folder), list[Finding]()
     if others := _siblings(folder):
         listed = ", ".join(f"{name} ({count} images)" for name, count in others)

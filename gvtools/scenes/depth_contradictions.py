@@ -40,9 +40,8 @@ CLIMBS = 8
 Pair = tuple[Depth, Depth, tuple[Cameras, Cameras]]
 
 
-def unit_findings(scene: Scene) -> list[Finding]:
-    """A warning when depth of neighbours does not agree with the poses."""
-    numbers = [number for number, view in enumerate(scene.views) if view.has_depth]
+def unit_findings(scene: Scene, numbers: Sequence[int]) -> list[Finding]:
+    """A warning when depth of neighbours does not agree with the poses; views by ``numbers``."""
     first = sorted({*np.linspace(0, len(numbers) - 1, PROBES).astype(int).tolist()})
     frame_of = cache(partial(frame_there, scene))
     pairs = [(at, at + gap) for at in first for gap in GAPS if at + gap < len(numbers)]
@@ -90,15 +89,12 @@ def unit_findings(scene: Scene) -> list[Finding]:
         return [Finding("warning", line)]
     known = np.sort(shares[np.isfinite(shares)])
     if not len(known) and len(names) > len(telling):
-        line = (
-            f"recorded depth contradicts the poses: no place of {len(names)} pairs of neighbouring "
-            f"views (first {names[0]}) is seen by both: state the unit of depth (--depth-unit)"
-        )
+        line = f"no place of {len(names)} pairs of views (first {names[0]}) is seen by both"
+        line = f"recorded depth contradicts the poses: {line}: state its unit (--depth-unit)"
         return [Finding("warning", line)]
     wrong = (known[:1] < ONE_PAIR).any() or (known[1:2] < TWO_PAIRS).any()
     if not (by_rays or wrong or late):
         return []
-    worst = int(np.nanargmin(shares))
     reason = "; it fits as distances along the rays" if by_rays else ""
     if late and not by_rays:
         beside = "before" if late > 0 else "after"
@@ -106,11 +102,11 @@ def unit_findings(scene: Scene) -> list[Finding]:
             f"; each map fits the frame {beside} its own ({close[late]:.0%} then agrees within "
             f"{CLOSE:.0%}, {close[0]:.0%} now)"
         )
+    which = names[int(np.nanargmin(shares))]
     line = (
-        f"recorded depth contradicts the poses: {shares[worst]:.0%} of the places that "
-        f"{names[worst]} show agrees within {NEARLY:.0%}{reason}; expected z-depth in one unit, of "
-        "the frame and the camera that it is named after: look for maps that are mirrored, of "
-        "other frames or of another byte order"
+        f"recorded depth contradicts the poses: {np.nanmin(shares):.0%} of the places that {which} "
+        f"show agrees within {NEARLY:.0%}{reason}; expected z-depth in one unit, of frame and "
+        "camera that it is named after: are maps mirrored, of other frames or another byte order?"
     )
     return [Finding("warning", line)]
 

@@ -49,7 +49,7 @@ def depth_findings(scene: Scene) -> list[Finding]:
     numbers = [number for number, view in enumerate(scene.views) if view.has_depth]
     if len(numbers) < 2:
         return []
-    return unit_findings(scene) or _displaced(scene, numbers) or _unlike(scene, numbers)
+    return unit_findings(scene, numbers) or _displaced(scene, numbers) or _unlike(scene, numbers)
 
 
 def _displaced(scene: Scene, numbers: Sequence[int]) -> list[Finding]:
@@ -67,7 +67,6 @@ def _displaced(scene: Scene, numbers: Sequence[int]) -> list[Finding]:
     off, axis, ahead = places[:, :2] - size / 2, places[:, 2].astype(int), places[:, 3:]
 
     def strengths(move: Float64, flip: tuple[int, int] = (1, 1)) -> Float64:
-        """(N,) of the pictures' edges where those of depth then are; NaN outside."""
         moved = flip * off * (1 + move[2]) + (move[:2] + move[3] * ahead) * size.max()
         return sampled(pictures, size / 2 + moved, view, axis)
 
@@ -158,18 +157,16 @@ def _unlike(scene: Scene, numbers: Sequence[int]) -> list[Finding]:
                 found[row] = np.corrcoef(own[seen], there[seen])[0, 1]
         return found
 
-    pairs = [pair for pair, known in zip(pairs, alike(1, 0) != 0, strict=True) if known]
-    if len(pairs) < FEWEST_PAIRS:
+    pairs = [pair for pair, known in zip(pairs, alike(1, 0), strict=True) if known]
+    if len(now := alike(1, 0)) < FEWEST_PAIRS:
         return []
-    now = alike(1, 0)
     tried = [[alike(times, 0) for times in TIMES], [alike(1, ahead) for ahead in AHEAD]]
     rows = [int(np.argmax(np.mean(found, axis=1))) for found in tried]
     fits = [found[row] for found, row in zip(tried, rows, strict=True)]
     means, before = [float(fit.mean()) for fit in fits], float(now.mean())
     times, ahead = float(TIMES[rows[0]]), float(AHEAD[rows[1]])
-    gained = float((fits[means[1] > means[0]] > now).mean())
-    other = min(abs(times - 1), abs(ahead)) > OTHER and gained > PAIRS
-    if other and max(means) > max(before + GAIN, ALIKE):
+    other = min(abs(times - 1), abs(ahead)) > OTHER and max(means) > max(before + GAIN, ALIKE)
+    if other and (fits[means[1] > means[0]] > now).mean() > PAIRS:
         line = (
             f"recorded depth contradicts the poses: pictures of neighbouring views agree where it "
             f"places them (correlation {before:.2f}), but more if it were {times:.3g} times as "
@@ -182,8 +179,7 @@ def _unlike(scene: Scene, numbers: Sequence[int]) -> list[Finding]:
         return []
     line = (
         f"photographs do not show the same places by depth: neighbours correlate by "
-        f"{np.median(now):.2f} where depth and poses place them, expected more than {ALIKE:g}: "
-        f"renumbered, mirrored, cropped or turned pictures give wrong results: {GIVE}"
+        f"{np.median(now):.2f}, expected more than {ALIKE:g} (renumbered, mirrored?): {GIVE}"
     )
     return [Finding("warning", line)]
 
@@ -192,10 +188,8 @@ def _detailed(
     rgb: NDArray[np.uint8], depth: NDArray[np.float32]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Rows and columns of pixels with detail around which depth is smooth, evenly spread."""
-    around = np.ones((5, 5), np.uint8)
-    low, high = cv2.erode(depth, around), cv2.dilate(depth, around)
+    low, high = (edge(depth, np.ones((5, 5), np.uint8)) for edge in (cv2.erode, cv2.dilate))
     strength = np.abs(detail(rgb)) * ((low > 0) & (high < SMOOTH * low))
-    used = strength[strength > 0]
-    rows, columns = np.nonzero(strength >= (np.quantile(used, 0.75) if used.size else np.inf))
-    chosen = np.linspace(0, len(rows) - 1, min(PLACES, len(rows))).astype(int)
-    return rows[chosen], columns[chosen]
+    found = np.argwhere(strength > np.quantile(strength[low > 0], 0.75) if low.any() else low)
+    y, x = found[np.linspace(0, len(found) - 1, min(PLACES, len(found))).astype(int)].T
+    return y, x

@@ -257,10 +257,7 @@ def perspective_views(
 
 
 def panorama_faces(camera: pycolmap.Camera, *, degrees: float = 90.0) -> tuple[Face, ...]:
-    """The six faces of an equirectangular camera, as fine in their middle as it is at its equator.
-
-    More ``degrees`` of view than 90 let neighbours overlap.
-    """
+    """The six faces of an equirectangular camera, as fine in the middle as its equator."""
     across = math.tan(math.radians(degrees / 2))
     half = max(1, round(camera.width / (2 * math.pi) * across))
     target = _pinhole(half / across, (2 * half, 2 * half), (half, half))

@@ -63,11 +63,7 @@ def phone_scene(
     upright: bool = True,
     findings: Iterable[Finding] = (),
 ) -> Scene:
-    """The scene of an app's export, metric, in the poses' own world.
-
-    Poses are world_from_cam for OpenCV's axes; ``upright`` says that y of the world points up.
-    Readers of depth are partial functions; those with confidence have it as a keyword.
-    """
+    """The scene of an app's export, metric, of world_from_cam poses in OpenCV's axes."""
     readers = [item.read_depth for item in frames if item.depth and item.depth.is_file()]
     bare = sum(getattr(reader, "keywords", {}).get("confidence") is None for reader in readers)
     if bare:

@@ -334,9 +334,9 @@ class _NeuralRgbd(_Redwood):
 
     def posed(self, recording: Recording, *, strict: bool) -> Recording:
         read = super().posed(recording, strict=strict)
-        poses = (None if frame.pose is None else opencv_pose(frame.pose) for frame in read.frames)
-        turned = [replace(f, pose=pose) for f, pose in zip(read.frames, poses, strict=True)]
-        return replace(read, frames=turned)
+        turned = (f.pose if f.pose is None else opencv_pose(f.pose) for f in read.frames)
+        pairs = zip(read.frames, turned, strict=True)
+        return replace(read, frames=[replace(frame, pose=pose) for frame, pose in pairs])
 
 
 class _Replica(_Redwood):

@@ -134,10 +134,7 @@ def _lines(path: Path) -> list[str]:
 
 
 def check_disjoint(context: Sequence[str], targets: Sequence[str]) -> None:
-    """Refuse targets that are context as well, since their figures would be of seen pictures.
-
-    Views of one picture count as one: its faces may overlap.
-    """
+    """Refuse targets that are context as well, views of one picture included."""
     seen = {picture_of(name) for name in context}
     both = [name for name in targets if picture_of(name) in seen]
     if both:

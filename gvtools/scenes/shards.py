@@ -178,11 +178,7 @@ def read_index(folder: Path) -> ShardsIndex:
 
 @lru_cache(KEPT_INDICES)
 def read_shard_index(path: Path, checksum: str) -> ShardRecord:
-    """The index beside a shard; the last ones read are cached.
-
-    Its checksum, as ``index.json`` lists it, is part of the cache's key, so that a shard that was
-    converted anew is read again.
-    """
+    """The index beside a shard, cached with its checksum, as ``index.json`` lists it."""
     record = read_record(path, ShardRecord)
     if sha256_of(path) != checksum:
         raise ProjectError(

@@ -222,10 +222,7 @@ def _listed(path: Path) -> tuple[list[_Listed], list[Finding]]:
 def transforms_frames(
     path: Path, home: Path, *, lists: tuple[str, ...] = ("frames",)
 ) -> list[PosedFrame]:
-    """Frames of a data set's ``transforms.json`` whose pictures lie in ``home``, world_from_cam.
-
-    ``lists`` name the lists of frames that are read.
-    """
+    """Frames of a ``transforms.json``, by its ``lists``, whose pictures lie in ``home``."""
     data = load_frames(path)
     frames = []
     for key in lists:
@@ -263,10 +260,7 @@ def read_camera_path(
 
 
 def read_transforms_cameras(path: Path) -> Cameras:
-    """The cameras of a ``transforms.json`` alone: no picture has to be there.
-
-    Views and their order are those of ``read_transforms``.
-    """
+    """The cameras of a ``transforms.json`` as ``read_transforms`` has them, without pictures."""
     cameras: dict[LensParameters, tuple[Undistortion, ...]] = {}
     found = []
     for shared, entry, file, name, where in _listed(Path(path))[0]:
@@ -380,10 +374,7 @@ def _pose(keys: FrameKeys, what: str) -> Float64:
 
 
 class FrameKeys(BaseModel):
-    """What is read of a frame. None stands for an absent key; a key whose value is null is wrong.
-
-    Keys as nerfstudio and instant-ngp have them.
-    """
+    """What is read of a frame, as nerfstudio has it; None is an absent key, null a wrong value."""
 
     model_config = ConfigDict(extra="allow")
     transform_matrix: Any = None

@@ -90,10 +90,7 @@ class Undistortion:
         return np.asarray(cv2.remap(rgb, *_positions(self), cv2.INTER_LINEAR), np.uint8)
 
     def nearest(self, array: NDArray[Any]) -> NDArray[Any]:
-        """(h, w) recorded values as (H, W) of the pinhole camera, by nearest pixel.
-
-        Pixels that look past the recorded picture become 0.
-        """
+        """(h, w) recorded values as (H, W) of the pinhole camera, by nearest pixel; 0 outside."""
         if self.untouched:
             return array
         values = array.reshape(-1)[np.maximum(self._source_pixel, 0)]
@@ -107,10 +104,7 @@ class Undistortion:
         return self._source_pixel >= 0
 
     def points(self, xy: ArrayLike) -> NDArray[np.float64]:
-        """(N, 2) recorded pixel positions as (N, 2) of the pinhole camera, float64.
-
-        Positions outside the picture are kept; NaN where the distortion has no inverse.
-        """
+        """(N, 2) recorded positions as (N, 2) of the pinhole camera; NaN without an inverse."""
         xy = np.asarray(xy, np.float64).reshape(-1, 2)
         if self.untouched or not len(xy):
             return xy

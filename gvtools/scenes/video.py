@@ -41,10 +41,7 @@ def video_header(path: Path) -> VideoHeader:
 
 
 def frame_seconds(path: Path, *, edits: bool = True) -> NDArray[np.float64]:
-    """(N,) seconds of all frames from the video's beginning, in their order; nothing is decoded.
-
-    With ``edits``, frames that the file's edit list hides are left out.
-    """
+    """(N,) seconds of all frames in order; with ``edits``, without those of the edit list."""
     with _reading(path), _opened(path, edits=edits) as container:
         stream = container.streams.video[0]
         ticks = sorted(

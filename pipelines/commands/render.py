@@ -106,7 +106,7 @@ class RenderCommand(LensArguments, LpipsArguments, SceneArguments):
             if rig is not None:
                 views[-1]["coverage"] = float(guidance.valid[0][rig.inside].mean())
         figures = rendering.summary(views, compared=self.against_images, no_lpips=no_lpips)
-        if other := rendering.other_pictures(scene, shown, psnr=figures["psnr_valid"]):
+        if other := rendering.other_pictures(scene, shown, figures["psnr_valid"]):
             console.warn(f"the pictures of {self.cameras} seem to be {other}")
         if poses:
             figures["poses"] = poses

@@ -205,10 +205,7 @@ def _parse_address(address: Path | str, root: Path | None) -> tuple[DataSetSpec,
 
 
 def open_address(address: Path | str, root: Path | None) -> Scene:
-    """The scene that ``spec:NAME:SCENE`` names in the folder of the data set's download.
-
-    ":SCENE" may be left out where the folder holds only one.
-    """
+    """The scene that ``spec:NAME[:SCENE]`` names in the folder of the data set's download."""
     spec, scene, folder = _parse_address(address, root)
     return open_data_set(spec.name, scene or "", folder)
 

@@ -105,10 +105,7 @@ class TurnedPinhole:
     slope: float
 
     def straight(self, values: NDArray[Any], *, nearest: bool) -> NDArray[Any]:
-        """A stored picture or map (h, w, ...) with its rows shifted, so that it has no skew.
-
-        Pixels from outside of the stored picture are 0. ``nearest`` resamples without blending.
-        """
+        """A stored picture or map (h, w, ...) with its rows shifted against skew; 0 outside."""
         import cv2
 
         if not self.slope:
@@ -121,10 +118,7 @@ class TurnedPinhole:
 
 
 def turned_pinhole(cam_from_uv: Float64, size: tuple[int, int]) -> TurnedPinhole:
-    """Split (3, 3), from (u, v, 1) to a ray, into a rotation and a pinhole; see the module.
-
-    Rays have x right, y up, z backward; u and v are from -1 to 1 across the picture.
-    """
+    """Split (3, 3), from (u, v, 1) to a ray, into a rotation and a pinhole; see the module."""
     width, height = size
     uv_from_pixel = np.array([[2 / width, 0, -1], [0, -2 / height, 1], [0, 0, 1]])
     ray = np.diag([1.0, -1, -1]) @ np.asarray(cam_from_uv, np.float64) @ uv_from_pixel

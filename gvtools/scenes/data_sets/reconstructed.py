@@ -270,10 +270,7 @@ def _with_raw_depth(
 
 
 def read_raw_depth(path: Path, *, size: tuple[int, int], lens: Undistortion | None = None) -> Depth:
-    """(H, W) float32 z-depth, metres, of 4-byte floats without head; 0 for infinity.
-
-    Maps are of the original picture's ``size``; ``lens`` leads to another one at hand.
-    """
+    """(H, W) float32 z-depth, metres, of 4-byte floats without head; 0 for infinity."""
     width, height = size
     with reading(path, f"expected floats of the original camera's size in {ORIGINAL}; copy again"):
         values = np.fromfile(regular(path), "<f4")

@@ -57,10 +57,7 @@ def numbered_frames(
     lens_of: LensOf = renderer_lens,
     numbers: Iterable[int] = (),
 ) -> list[PosedFrame]:
-    """Frames with a number each, which stands in the ``names`` of pictures.
-
-    ``numbers`` are given where not all pictures of the folder are of the scene.
-    """
+    """Frames with a number each, given or else that in the ``names`` of pictures."""
     numbers = sorted(set(numbers) or numbers_in(images, names).union(cameras))
     size = first_size(images / names.format(i) for i in numbers) or (1, 1)
     return [
@@ -232,10 +229,7 @@ SAME_SURFACE = 0.05  # relative disparity between neighbours of one surface
 
 
 def spring_depth(path: Path, *, focal: float, sky: Path | None) -> Depth:
-    """(H, W) float32 z-depth, metres, 0 = none, of a disparity map of (2 H, 2 W).
-
-    ``focal`` is in pixels of the frame; ``sky`` is the map of the sky, of (2 H, 2 W) or (H, W).
-    """
+    """(H, W) float32 z-depth, metres, 0 = none, of a disparity map of (2 H, 2 W)."""
     disparity = hdf5_array(path, "disparity").astype(np.float64)
     if disparity.ndim != 2 or disparity.shape[0] % 2 or disparity.shape[1] % 2:
         raise ProjectError(f"{path}: disparity {disparity.shape}; expected twice the frame's size")
