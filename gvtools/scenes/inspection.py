@@ -295,8 +295,12 @@ CONTRAST, AGREE = 4.0, 0.5
 # Rows of one are as bright as those of the other, up to these factors.
 GAINS = (0.6, 1.7)
 # Pictures can be compared when this share of them has contrast, and contradict each other when more
-# than the second share of that disagrees. On six real scenes it is at most 0.03.
-COMPARABLE, DISAGREEING = 0.3, 0.15
+# than the second share of that disagrees. On six real scenes it is at most 0.03, in 120 views
+# around an object 0.15.
+COMPARABLE, DISAGREEING = 0.3, 0.2
+# Nor can they where parallax moves more than this share of the sparse points farther than the
+# shifts: in a forward walk past near things, or with a long lens.
+BEYOND = 0.03
 # Sparse points contradict when each view has at least this many that lie in the other's picture,
 # and less than this share of them is of both. On three real scenes it is at least 0.5.
 POINTS, SHARED = 30, 0.05
@@ -340,6 +344,16 @@ def _shared(
     if min(inside) < POINTS:
         return None
     return len(np.intersect1d(own[views[0]], own[views[1]])), min(inside)
+
+
+def _beyond(cameras: Cameras, points: Float64, views: tuple[int, int]) -> float:
+    """Share of points, world (N, 3), that parallax moves beyond the shifts."""
+    rotation = cameras.cam_from_world[views[1], :3, :3]
+    side = SIDE / max(cameras.width[views[1]], cameras.height[views[1]])
+    local = np.array([(points - cameras.centers[view]) @ rotation.T for view in views])
+    seen = local[:, (local[:, :, 2] > 0).all(axis=0)]
+    first, second = seen[..., :2] / seen[..., 2:] * cameras.K[views[1], 0, 0] * side
+    return float((np.abs(first - second).max(axis=1) > SHIFT).mean()) if len(first) else 0.0
 
 
 def turn_degrees(a: Float64, b: Float64) -> Float64:
@@ -396,7 +410,8 @@ def contradictions(
         shared = None if points is None else _shared(scene, own, (a, b))
         unshared = shared is not None and shared[0] < SHARED * shared[1]
         differs = 0.0
-        if a in thumbnails and b in thumbnails:
+        near = points is None or _beyond(cameras, points.positions[own[a]], (a, b)) <= BEYOND
+        if near and a in thumbnails and b in thumbnails:
             pair = thumbnails[a], thumbnails[b]
             enough = 0.0 if unshared else DISAGREEING
             H = homography(pair, cameras, (a, b))

@@ -133,3 +133,12 @@ def test_near_views_that_share_no_sparse_point_are_told() -> None:
     assert contradiction_messages(replace(scene, points=points_of(scene, shared=True))) == []
     (message,) = contradiction_messages(replace(scene, points=points_of(scene, shared=False)))
     assert "0 of 40 sparse points shared" in message
+
+
+def test_near_views_that_parallax_makes_different_are_not_told() -> None:
+    scene = without_depth(walk(views=4, spread=0.2, wrong=(1, 3)))
+    points = points_of(scene, shared=True)
+    (message,) = contradiction_messages(replace(scene, points=points))
+    assert "of the picture differs" in message
+    points.positions[::10] *= 0.015  # one of ten stands close before the cameras
+    assert contradiction_messages(replace(scene, points=points)) == []
