@@ -142,7 +142,8 @@ class Fit:
         )
         self.near = 0.02 * self.cameras.depth
         self.surface = surface
-        self.steps = 0
+        # Of all calls of ``run`` together.
+        self.steps, self.seconds = 0, 0.0
         self._stop = threading.Event()
         self._last_psnr = -np.inf
         # Pictures of the validation photographs, by their numbers, before these joined the fit.
@@ -212,19 +213,20 @@ class Fit:
         In a fit for a time, what is left until validation photographs join is skipped when they
         stop gaining. ``stop`` ends it after the step at work. ``report`` is called now and then,
         and at the end, with the share that is done; a trial ends at the progress ``until``, with
-        its validation photographs left out.
+        its validation photographs left out, and may be run on.
         """
-        limit, began = self.options.limit, clock()
+        limit, began = self.options.limit, clock() - self.seconds
         most = np.inf if self.begin else self.converged_after
         if limit is None:
             most = min(self.options.steps or 0, most)
         skipped, checks = 0.0, list(GAIN_CHECKS)
         while not self.stopped:
+            self.seconds = clock() - began
             over = self.steps / most if most else 1.0
             if not self.begin:
                 over = float(np.interp(over, OF_STEPS, OF_TIME))
             if limit is not None:
-                over = max(over, (clock() - began) / max(limit, 1e-9)) + skipped
+                over = max(over, self.seconds / max(limit, 1e-9)) + skipped
             if over >= until:
                 break
             if limit is not None and self._validation and checks and over >= checks[0]:
@@ -510,7 +512,7 @@ LEAST_SHARE = 0.5
 
 
 def with_chosen_backdrop(fit: Fit) -> tuple[Fit, str]:
-    """A fit that has not begun, or the same over black if left-out photographs say so; and why."""
+    """A fit that has not begun, or the better of two trials of it, to be run on; and why."""
     few, limit = len(fit.views) <= FEW_PHOTOGRAPHS, fit.options.limit
     long = (fit.options.steps or 0) >= TRIAL_STEPS if limit is None else limit >= TRIAL_SECONDS
     if fit.begin or fit.recorded or not (few and long and validation_rows(len(fit.views))):
@@ -520,8 +522,9 @@ def with_chosen_backdrop(fit: Fit) -> tuple[Fit, str]:
     for trial in trials:
         trial.run(until=TRIAL_ENDS)
     random, black = (trial.left_out_psnr() for trial in trials)
-    chosen = fit.again(0, fit.options, backdrop=False) if black > random + CLEARLY_BETTER else fit
-    behind = "random colours" if chosen is fit else "black"
+    over_black = black > random + CLEARLY_BETTER
+    chosen, behind = trials[over_black], "black" if over_black else "random colours"
+    chosen.options = fit.options
     return chosen, (
         f"{behind} behind the Gaussians (trials with left-out photographs: random {random:.2f} dB, "
         f"black {black:.2f} dB)"
@@ -543,7 +546,7 @@ def run_fits(
 
     Returns the fits to average, the first one first: one that lowered that PSNR is left out.
     """
-    options, began = first.options, clock()
+    options, began = first.options, clock() - first.seconds
     timed = options.limit is not None
     # In seconds, or in steps where these are given.
     budget = options.limit if options.limit is not None else float(options.steps or 0)

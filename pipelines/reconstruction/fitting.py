@@ -392,7 +392,7 @@ def fit_appearance(plan: Plan, console: Console, *, earlier: Fitted | None = Non
     limit = fit.options.limit
     if limit is not None:
         left = max(limit - (time.perf_counter() - began), limit / 2)
-        fit.options = fit.options.replaced(seconds=left)
+        fit.options = fit.options.replaced(seconds=left + fit.seconds)
     if fit.splatter is GsplatSplat:
         console.line("fitting: on the CUDA device, by gsplat")
     # Splats that are given may be better than what there is time for.

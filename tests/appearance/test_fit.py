@@ -395,12 +395,12 @@ def test_left_out_photographs_choose_the_backdrop(gain, backdrop, monkeypatch, f
     monkeypatch.setattr(Fit, "left_out_psnr", psnr)
     first = fit_of(count=10, steps=8)
     chosen, why = with_chosen_backdrop(first)
-    assert chosen.backdrop is backdrop and (chosen is first) is backdrop
+    assert chosen is trials[not backdrop] and chosen.backdrop is backdrop
     assert "random 20.00 dB" in why and f"black {20 + gain:.2f} dB" in why
     # Trials leave photographs out to their end, and fit to no others than the fit itself.
     assert [0 < trial.steps < 6 and not trial.predicted for trial in trials] == [True, True]
-    assert chosen.steps == 0
     alone = run_fits(chosen)[0]
+    assert alone is chosen and alone.steps == 8
     again = run_fits(with_chosen_backdrop(fit_of(count=10, steps=8))[0])[0]
     assert alone.gaussians.values.tobytes() == again.gaussians.values.tobytes()
 
