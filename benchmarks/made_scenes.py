@@ -281,6 +281,32 @@ def room_inside(rng: np.random.Generator, views: int) -> tuple[ProceduralScene, 
     return scene, eyes, aims
 
 
+def plant(rng: np.random.Generator, views: int) -> tuple[ProceduralScene, Float64, Float64]:
+    """Stems and thin leaves in a pot, in front of much else; few views see it from one side."""
+    build = _builder(rng)
+    _outdoors(build, 1.2)
+    build.solid(TUBE, [0, 0, 0.15], [0.16, 0.16, 0.15], material=build.material(0.3))
+    for _ in range(9):
+        foot, tall = rng.uniform(-0.12, 0.12, 2), rng.uniform(0.2, 0.5)
+        build.solid(TUBE, [*foot, 0.3 + tall], [0.006, 0.006, tall], material=build.material(0.2))
+    leaves = [build.material(rng.uniform(0.1, 0.3)) for _ in range(6)]
+    for number in range(90):
+        angle, away, height = rng.uniform(0, 6.28), rng.uniform(0.02, 0.38), rng.uniform(0.4, 1.25)
+        upright = [rng.uniform(0.03, 0.09), rng.uniform(0.004, 0.02), rng.uniform(0.02, 0.06)]
+        flat = [rng.uniform(0.03, 0.09), rng.uniform(0.02, 0.05), 0.003]
+        place = [away * np.cos(angle), away * np.sin(angle), height]
+        build.solid(BOX, place, flat if number % 5 < 2 else upright, material=leaves[number % 6],
+                    yaw=rng.uniform(0, 3))  # fmt: skip
+    for _ in range(10):
+        angle, away = rng.uniform(0, 6.28), rng.uniform(3, 15)
+        half, material = rng.uniform(0.3, 1.5, 3), build.material(rng.uniform(0.8, 3))
+        build.solid(BOX, [away * np.cos(angle), away * np.sin(angle), half[2]], half,
+                    material=material, yaw=rng.uniform(0, 3))  # fmt: skip
+    sweep = 2 * np.pi if views > 12 else 1.6
+    eyes, aims = _around(rng, views, 1.7, height=(0.7, 1.4), sweep=sweep, aim=0.7)
+    return _done("plant", build, DAY), eyes, aims
+
+
 PLACES = {
     "object indoors": Place(object_indoors, 1, 24),
     "object outdoors": Place(object_outdoors, 2, 32),
@@ -294,6 +320,10 @@ PLACES = {
     "corridor, 240 pixels": Place(corridor, 14, 24, size=(240, 180)),
     "from above": Place(from_above, 9, 18),
     "from above, noisy": Place(from_above, 10, 30, pose_noise=0.0015),
+    "plant": Place(plant, 15, 24, size=(640, 480)),
+    "plant, few": Place(plant, 16, 9, size=(640, 480)),
+    "facade, 960 pixels": Place(facade, 17, 12, size=(960, 640)),
+    "object indoors, 1280 pixels": Place(object_indoors, 18, 40, size=(1280, 960)),
     "room inside": Place(room_inside, 11, 24),
     "room inside, 200": Place(room_inside, 12, 200, size=(240, 180), points=30),
 }

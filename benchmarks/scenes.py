@@ -81,6 +81,12 @@ CASES = {
     "from above": Case("b", "from above", "not:every:6", "every:6"),
     "street, 1600 pixels": Case("b", "street, 1600 pixels", "not:every:6", "every:6"),
     "corridor, 240 pixels": Case("b", "corridor, 240 pixels", "not:every:6", "every:6"),
+    "plant": Case("b", "plant", "not:every:6", "every:6"),
+    "plant, few": Case("b", "plant, few", "not:every:4", "every:4"),
+    "facade, 960 pixels": Case("b", "facade, 960 pixels", "not:every:6", "every:6"),
+    "object indoors, 1280 pixels": Case(
+        "b", "object indoors, 1280 pixels", "not:every:8", "every:8"
+    ),
     "room inside": Case("b", "room inside", "not:every:6", "every:6"),
     "demo room": Case("b", "room", "first:8", "not:first:8"),
 }
