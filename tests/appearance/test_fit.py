@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+import splat_scene
 from splat_scene import (
     HEIGHT,
     WIDTH,
@@ -65,6 +70,36 @@ def test_a_view_that_was_held_out_is_predicted_6_db_better(fitted):
     assert after > before + 6
     assert fitted.steps == STEPS
     assert fitted.validation_psnr() is None
+
+
+# Prints the kernels that a fit compiles beyond those that a run compiles before its clock begins.
+LATE_KERNELS = """
+import sys
+import numpy as np
+from numba.core.dispatcher import Dispatcher
+from splat_scene import photographs, rough_gaussians, walk
+from gvtools.appearance.compile_kernels import kernel_sets
+from gvtools.appearance.fit import Fit
+from gvtools.appearance.fit_options import FitOptions
+
+def types():
+    modules = [m for name, m in sys.modules.items() if name.startswith("gvtools.")]
+    found = [k for m in modules for k in vars(m).values() if isinstance(k, Dispatcher)]
+    return {(kernel.py_func.__name__, s) for kernel in found for s in kernel.signatures}
+
+for kernels in kernel_sets():
+    kernels.compile()
+before, points = types(), np.array([[0, 0, 2]], np.float32)
+Fit(rough_gaussians(), photographs(walk(3)), options=FitOptions(steps=30), surface=points).run()
+print(sorted(types() - before))
+"""
+
+
+def test_no_kernel_is_compiled_on_the_clock_of_a_fit():
+    words = [sys.executable, "-c", LATE_KERNELS]
+    place = {**os.environ, "PYTHONPATH": str(Path(splat_scene.__file__).parent)}
+    found = subprocess.run(words, env=place, capture_output=True, text=True, check=True)
+    assert found.stdout == "[]\n"
 
 
 def test_the_start_is_left_as_it_was_and_its_frame_kept(views):
