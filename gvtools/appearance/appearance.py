@@ -83,6 +83,10 @@ class Blend:
     # that.
     tolerance: float = 0.2
 
+    def __str__(self) -> str:
+        detail = f" with {self.share:.0%} of the memory's detail" if self.share else ""
+        return f"Gaussians{detail}"
+
 
 def blend_colors(
     shown: Float32, memory: Float32, where: NDArray[np.bool_], *, blend: Blend
@@ -105,15 +109,22 @@ def blend_colors(
 def best_blend(
     samples: Iterable[tuple[Float32, Float32, NDArray[np.bool_], Float32]],
     *,
-    least_tolerance: float = 0.0,
-) -> Blend:
-    """The blend with the highest mean PSNR on photographs; the default without any sample.
+    most_share: float = 1.0,
+    tolerances: tuple[float, float] = (0.0, np.inf),
+) -> Blend | None:
+    """The blend with the highest mean PSNR on photographs; None without any sample.
 
     Samples are colours (H, W, 3) of the Gaussians and of the memory, both made without the
-    photograph, pixels (H, W) that both know, and the photograph; from 0 to 1.
+    photograph, pixels (H, W) that both know, and the photograph; from 0 to 1. Shares up to
+    ``most_share`` are compared, and ``tolerances`` from the first to the last.
     """
-    tolerances = [tolerance for tolerance in TOLERANCES if tolerance >= least_tolerance]
-    choices = list(product(SHARES, tolerances))
+    least, most = tolerances
+    choices = list(
+        product(
+            [share for share in SHARES if share <= most_share],
+            [tolerance for tolerance in TOLERANCES if least <= tolerance <= most],
+        )
+    )
     scores = np.zeros(len(choices))
     for shown, memory, where, truth in samples:
         if not where.any():
@@ -123,7 +134,7 @@ def best_blend(
         for number, (share, tolerance) in enumerate(choices):
             weight = share * np.exp(-apart / tolerance**2)
             scores[number] -= np.log10(np.square(off + weight[:, None] * detail).mean() + 1e-10)
-    return Blend(*choices[int(scores.argmax())]) if scores.any() else Blend()
+    return Blend(*choices[int(scores.argmax())]) if scores.any() else None
 
 
 def _difference(shown: Float32, memory: Float32, where: NDArray[np.bool_]) -> Float32:
@@ -217,18 +228,21 @@ class Appearance:
         gain = self.exposures.at(pose) if self.exposures else None
         return [Picture.of(self.splatter(values, lens), gain=gain) for values in self._shown(lens)]
 
-    def depth(self, camera: Cameras) -> NDArray[np.float32]:
+    def depth(self, camera: Cameras, *, opaque: float = 0.0) -> NDArray[np.float32]:
         """(H, W) z-depth that one camera sees, scene units; 0 where no fit has a surface.
 
-        With several fits it is the median of those that have one; with an even number the nearer of
-        the middle two, since their mean may be where neither has a surface.
+        It is also 0 where they stop at most the share ``opaque`` of the light on average. With
+        several fits it is the median of those that have one; with an even number the nearer of the
+        middle two, since their mean may be where neither has a surface.
         """
         lens = self._pose_and_lens(camera)[1]
-        depths = np.array([median_depth(values, lens) for values in self._shown(lens)])
+        shown = [Splat(values, lens) for values in self._shown(lens)]
+        depths = np.array([median_depth(splat) for splat in shown])
         ordered = np.sort(np.where(depths > 0, depths, np.float32(np.inf)), axis=0)
         middle = np.maximum((depths > 0).sum(axis=0) - 1, 0) // 2
         found = np.take_along_axis(ordered, middle[None], axis=0)[0]
-        return np.where(np.isfinite(found), found, np.float32(0))
+        alpha = np.mean([splat.image[4] for splat in shown], axis=0)
+        return np.where(np.isfinite(found) & (alpha > opaque), found, np.float32(0))
 
     def _pose_and_lens(self, camera: Cameras) -> tuple[NDArray[np.float64], Lens]:
         """The pose in the Gaussians' frame, and the lens there."""

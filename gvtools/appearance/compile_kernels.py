@@ -16,7 +16,7 @@ def compile_splatting() -> None:
     lens = Lens.of(np.eye(4), np.diag([16.0, 16.0, 1.0]), size=(16, 16), near=0.1)
     picture = Splat(some.values, lens)
     picture.backward(np.ones_like(picture.image))
-    median_depth(some.values, lens)
+    median_depth(picture)
 
 
 def compile_steps() -> None:

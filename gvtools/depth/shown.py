@@ -116,10 +116,10 @@ class FittedDepth:
 
     def depth(self, scene: Scene, view: View, frame: Frame) -> DepthMap:
         """The depth that the Gaussians show from the view's camera."""
-        shown = self.appearance.picture(view.camera)
-        known = np.where(shown.alpha > OPAQUE, self.appearance.depth(view.camera), np.float32(0))
+        known = self.appearance.depth(view.camera, opaque=OPAQUE)
         guessed = None
         if self.swept is None:
+            shown = self.appearance.picture(view.camera)
             off = np.abs(shown.rgb - frame.rgb / np.float32(255)).mean(axis=2)
             confidence = np.exp(-np.square(off / np.float32(TOLERANCE)))
         else:
@@ -145,21 +145,29 @@ class FittedDepth:
             for camera, depth in maps
             if depth is not None
         ]
-        compared = agreement(_inverse(known), view.camera, others, tolerance=AGREE_ACROSS)
-        count, inverse = compared.views.numpy(), compared.inverse_depth.numpy()
         own = swept.depth(view) if swept.covers(view) else None
-        contradicted = np.zeros(known.shape, np.bool_)
+        # Compared at the size of the maps: finer depth takes the corrections of the pixel it is in.
+        size = known.shape[::-1]
+        sides = [max(depth.shape) for depth in (own, *(d for _, d in maps)) if depth is not None]
+        scale = min(max(sides, default=max(size)) / max(size), 1.0)
+        small = resize_nearest(known, *(max(round(side * scale), 1) for side in size))
+        known_there = small > 0
+        camera = view.camera.resized(*small.shape[::-1])
+        compared = agreement(_inverse(small), camera, others, tolerance=AGREE_ACROSS)
+        count, inverse = compared.views.numpy(), compared.inverse_depth.numpy()
+        contradicted = np.zeros(small.shape, np.bool_)
         if own is not None:
-            own = resize_nearest(own, *known.shape[::-1])
-            both = (known > 0) & (own > 0)
-            agreed = both & (np.abs(own / np.where(known > 0, known, np.float32(1)) - 1) < AGREE)
+            own = resize_nearest(own, *small.shape[::-1])
+            both = known_there & (own > 0)
+            agreed = both & (np.abs(own / np.where(known_there, small, np.float32(1)) - 1) < AGREE)
             total = (1 + count) * inverse + agreed / np.where(agreed, own, np.float32(1))
             count = count + agreed
             inverse = total / (1 + count)
             contradicted = both & (count == 0)
         confidence = np.where(contradicted, CONTRADICTED, CONFIRMED[count])
-        depth = np.where(known > 0, 1 / np.where(known > 0, inverse, 1), 0)
-        return depth.astype(np.float32), confidence
+        factor = np.where(known_there, 1 / np.where(known_there, inverse * small, 1), 1)
+        depth = known * resize_nearest(factor, *size)
+        return depth.astype(np.float32), resize_nearest(confidence, *size)
 
 
 def _inverse(depth: NDArray[np.float32]) -> torch.Tensor:

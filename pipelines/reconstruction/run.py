@@ -258,9 +258,8 @@ def complete_run(
                     fitted = fitted.with_best_blend(plan, memory)
                     fitted.save(folder / APPEARANCE)
                     targets.appearance = fitted.appearance
-                    report["colours"] = str(fitted.validation or fitted.appearance.blend)
-                    if fitted.validation is None:
-                        console.line(f"colours: {report['colours']}")
+                    report["colours"] = str(fitted.appearance.blend)
+                    console.line(f"colours: {report['colours']}")
                 write_json(folder / REPORT, report)
             console.line(_round_line(report))
     export_memory_ply(memory, directory.path / POINTS)

@@ -145,7 +145,7 @@ def test_each_pixel_has_the_gaussian_at_which_half_of_the_light_is_stopped():
     centers = np.stack([*rng.uniform(-1, 1, (2, 60)), rng.uniform(1, 3, 60)], axis=1)
     cloud = Gaussians.at(centers, np.full((60, 3), 90), sizes=rng.uniform(0.05, 0.15, 60))
     cloud.values[:, LOGIT] = rng.uniform(-1, 3, 60)
-    found = median_depth(cloud.values, LENS)
+    found = median_depth(Splat(cloud.values, LENS))
     assert 0.3 < (found > 0).mean() < 0.99
     depths = np.unique(found[found > 0])
     assert len(depths) > 10
@@ -160,13 +160,13 @@ def test_each_pixel_has_the_gaussian_at_which_half_of_the_light_is_stopped():
 
 def test_fog_before_a_surface_does_not_count():
     values = sheets((1.0, 0.3), (3.0, 0.9)).values
-    np.testing.assert_allclose(median_depth(values, LENS), 3.0, rtol=1e-5)
+    np.testing.assert_allclose(median_depth(Splat(values, LENS)), 3.0, rtol=1e-5)
     _, _, _, weighted, alpha = Splat(values, LENS).image
     assert (weighted / alpha).max() < 2.4
 
 
 def test_what_is_too_faint_has_no_depth():
-    assert not median_depth(sheets((1.0, 0.2), (3.0, 0.3)).values, LENS).any()
+    assert not median_depth(Splat(sheets((1.0, 0.2), (3.0, 0.3)).values, LENS)).any()
 
 
 @pytest.mark.parametrize(

@@ -4,15 +4,19 @@ import json
 import signal
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
+from numba import get_num_threads
 from PIL import Image
 from run_files import Killed, kill_after_round_0, reconstructed, report_of, results, untimed
 from tiny_scan import write_colmap_scan, write_scan
 
 from benchmarks.made_scenes import PLACES, write_place
 from gvtools.appearance.appearance import Appearance, Blend, Picture, recolor
+from gvtools.appearance.camera_corrections import Exposures
 from gvtools.appearance.fit import Fit
 from gvtools.appearance.gaussians import Gaussians
 from gvtools.appearance.population import from_points
@@ -31,6 +35,8 @@ from pipelines.console import Console
 from pipelines.reconstruction import fitting
 from pipelines.reconstruction import run as runs
 from pipelines.reconstruction.fitting import (
+    MOST_SHARE,
+    MOST_TOLERANCE,
     Fitted,
     Sweep,
     first_gaussians,
@@ -269,10 +275,9 @@ def test_refined_poses_move_context_and_targets(scan):
     assert kept.scene is plan.scene and kept.source is plan.source
 
 
-def test_photographs_with_fitted_depth_enter_the_memory_smaller(bare, scan, monkeypatch):
-    monkeypatch.setattr(fitting, "SWEPT_SIDE", 64)
+def test_photographs_with_fitted_depth_enter_the_memory_smaller(bare, scan):
     plan = planned(bare)
-    changed = Fitted(ONE).apply(plan)
+    changed = Fitted(ONE, side=64).apply(plan)
     assert changed.evidence is not None and plan.config.voxel is not None
     camera = changed.evidence["view_0.png"].camera
     assert (int(camera.width[0]), int(camera.height[0])) == (64, 48)
@@ -324,6 +329,46 @@ def test_the_blend_is_chosen_by_the_left_out_photographs(scan):
     assert fitted.with_best_blend(plan, memory).appearance.blend == Blend(1.0, 4.0)
     fitted = Fitted(replace(ONE, blend=Blend(0.3, 0.3)))
     assert fitted.with_best_blend(plan, memory) is fitted
+
+
+def test_photographs_take_at_most_half_of_the_memory_s_detail_and_none_unevenly_exposed(bare):
+    plan = planned(bare)
+    memory, name = _empty_memory(plan, Path()), plan.context[1]
+    for each in plan.context:
+        view = plan.scene[each]
+        frame = view.load()
+        distance = np.full(frame.rgb.shape[:2], 2, np.float32)
+        memory.observe(frame.rgb, distance, view.camera, round=0)
+    shown = project(memory, plan.scene[name].camera, options=plan.config.splat, without=name)
+    truth = plan.scene[name].load().rgb / np.float32(255)
+    smooth = truth + 0.3 * (truth - np.clip(shown.rgb[0], 0, 1))
+    predicted = {name: Picture(smooth.astype(np.float32), np.ones(truth.shape[:2], np.float32))}
+    even = replace(ONE, blend=Blend(share=0.0))
+    blend = Fitted(even, predicted=predicted).with_best_blend(plan, memory).appearance.blend
+    assert 0 < blend.share <= MOST_SHARE and blend.tolerance <= MOST_TOLERANCE
+    poses = np.repeat(np.eye(4)[None], 2, axis=0)
+    uneven = replace(even, exposures=Exposures(poses, np.array([[0.1] * 3, [-0.1] * 3]), 1.0))
+    kept = Fitted(uneven, predicted=predicted).with_best_blend(plan, memory)
+    assert kept.appearance.blend.share == 0
+
+
+@pytest.mark.parametrize(("seconds", "side"), [(0.05, 64), (1000, 96), (None, 96)])
+def test_the_memory_takes_photographs_as_large_as_the_fit_has_time_for(
+    bare, monkeypatch, seconds, side
+):
+    monkeypatch.setattr(fitting, "SWEPT_SIDE", 64)
+    length = "refine.steps=9" if seconds is None else f"refine.seconds={seconds}"
+    plan = planned(bare, length)
+    fit: Any = SimpleNamespace(begin=0.0)
+    monkeypatch.setattr(fitting, "validation_rows", lambda views: (1,))
+    found, expected = fitting._memory_side(plan, fit, None)
+    pixels = 8 * 96 * 72 * (side / 96) ** 2
+    each = fitting.MEGAPIXEL_SECONDS / get_num_threads()
+    assert found == side and expected == pytest.approx(1e-6 * pixels * each)
+    monkeypatch.setattr(fitting, "validation_rows", lambda views: ())
+    assert fitting._memory_side(plan, fit, None) == (64, 0.0)
+    earlier = Fitted(ONE, side=80)
+    assert fitting._memory_side(plan, fit, earlier) == (80, 0.0)
 
 
 def test_a_photograph_does_not_validate_a_memory_that_has_seen_it(scan):
