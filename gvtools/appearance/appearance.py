@@ -262,8 +262,10 @@ class Appearance:
 def recolor(guidance: Guidance, picture: Picture, *, blend: Blend) -> Guidance:
     """A guidance of one view with the Gaussians' colours where photographs saw what it shows.
 
-    Depth, and what is valid, generated and how confident, stays the memory's.
+    Generated content adds no detail. Depth, and what is valid, generated and how confident, stays
+    the memory's.
     """
     where = guidance.valid[0] & ~guidance.scanned[0] & picture.solid
     rgb = blend_colors(picture.rgb, guidance.rgb[0], where, blend=blend)
+    rgb = np.where((where & guidance.generated[0])[..., None], picture.rgb, rgb)
     return replace(guidance, rgb=rgb[None])

@@ -385,6 +385,7 @@ class Fitted:
             options = plan.config.splat
             guidance = project(memory, view.camera, options=options, without=name)
             where = guidance.valid[0] & ~guidance.scanned[0] & picture.solid
+            where &= ~guidance.generated[0]
             if frame.mask is not None:
                 where &= frame.mask
             yield picture.rgb, guidance.rgb[0], where, frame.rgb / np.float32(255)
