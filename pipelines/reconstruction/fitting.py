@@ -383,12 +383,11 @@ class Fitted:
             view = plan.scene[name]
             frame = view.load()
             options = plan.config.splat
-            guidance = project(memory, view.camera, options=options, without=name)
-            where = guidance.valid[0] & ~guidance.scanned[0] & picture.solid
-            where &= ~guidance.generated[0]
+            shown = project(memory, view.camera, options=options, without=name)
+            where = shown.valid[0] & ~shown.scanned[0] & ~shown.generated[0] & picture.solid
             if frame.mask is not None:
                 where &= frame.mask
-            yield picture.rgb, guidance.rgb[0], where, frame.rgb / np.float32(255)
+            yield picture.rgb, shown.rgb[0], where, frame.rgb / np.float32(255)
 
 
 def fit_appearance(plan: Plan, console: Console, *, earlier: Fitted | None = None) -> Fitted | None:
