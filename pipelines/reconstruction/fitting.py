@@ -464,10 +464,7 @@ def fit_appearance(plan: Plan, console: Console, *, earlier: Fitted | None = Non
 
 
 def _memory_side(plan: Plan, fit: Fit, earlier: Fitted | None) -> tuple[int, float]:
-    """Longer side of the photographs that enter the memory after a fit [px], and what it takes [s].
-
-    They are larger than the sweep's where that is no loss: see MEMORY_SHARE.
-    """
+    """Longer side of photographs in the memory [px], and what it takes beyond SWEPT_SIDE [s]."""
     cameras, limit = plan.scene.subset(plan.context).cameras, plan.config.refine.limit
     if earlier is not None:
         return earlier.side, 0.0
@@ -478,10 +475,11 @@ def _memory_side(plan: Plan, fit: Fit, earlier: Fitted | None) -> tuple[int, flo
     each, most = MEGAPIXEL_SECONDS / get_num_threads(), MOST_MEGAPIXELS
     if limit is not None:
         most = min(most, MEMORY_SHARE * limit / each)
-    sides = np.maximum(cameras.width, cameras.height)
+    longest = max(cameras.width.max(), cameras.height.max())
     pixels = 1e-6 * float((cameras.width * cameras.height).sum())
-    scale = float(np.clip(np.sqrt(most / pixels), min(SWEPT_SIDE / sides.max(), 1.0), 1.0))
-    return max(round(scale * sides.max()), 1), each * pixels * scale**2
+    least = min(SWEPT_SIDE / longest, 1.0)
+    scale = min(max((most / pixels) ** 0.5, least), 1.0)
+    return max(round(scale * longest), 1), each * pixels * (scale**2 - least**2)
 
 
 def _worth_adding(fits: Sequence[Fit], earlier: Fitted) -> Sequence[Fit]:

@@ -362,7 +362,7 @@ def test_the_memory_takes_photographs_as_large_as_the_fit_has_time_for(
     fit: Any = SimpleNamespace(begin=0.0)
     monkeypatch.setattr(fitting, "validation_rows", lambda views: (1,))
     found, expected = fitting._memory_side(plan, fit, None)
-    pixels = 8 * 96 * 72 * (side / 96) ** 2
+    pixels = 8 * 96 * 72 * (side**2 - 64**2) / 96**2
     each = fitting.MEGAPIXEL_SECONDS / get_num_threads()
     assert found == side and expected == pytest.approx(1e-6 * pixels * each)
     monkeypatch.setattr(fitting, "validation_rows", lambda views: ())
