@@ -8,6 +8,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
+from gvtools.depth.stereo.plane_sweep import KERNELS as SWEEP_KERNELS
 from gvtools.errors import OptionError, ProjectError
 from gvtools.evaluation.images import FIGURES, view_figures
 from gvtools.evaluation.statistics import mean_known
@@ -190,7 +191,8 @@ def reconstruct(
     """
     directory = RunDirectory(out)
     directory.refuse_foreign()
-    compile_kernels(config, console)
+    swept = () if any(view.has_depth for view in scene) else (SWEEP_KERNELS,)
+    compile_kernels(config, console, more=swept)
     begun = directory.round_path(0) if resume and directory.reports() else None
     plan = make_plan(scene, config, say=console.line, round_0=begun)
     describe(plan, console)

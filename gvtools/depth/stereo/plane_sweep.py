@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -43,6 +44,7 @@ from gvtools.depth.stereo.matching import (
 )
 from gvtools.depth.stereo.matching_cpu import CpuMatcher
 from gvtools.errors import DegenerateError, OptionError
+from gvtools.kernels import KernelSet
 from gvtools.poses.dense_adjustment import PoseEquations, adjust_cameras, pose_equations
 from gvtools.scenes.scene import Frame, Scene, View
 
@@ -488,3 +490,25 @@ def only_turned(coarse: CoarseDepth, options: StereoOptions, matcher: Matcher) -
     if not matched.any():
         return False
     return float((turned - cost > BETTER)[matched].float().mean()) < BETTER_SHARE
+
+
+def compile_sweep() -> None:
+    """Sweep one of three small photographs, which calls each kernel."""
+    coarse = np.random.default_rng(0).integers(0, 256, (12, 16, 3), dtype=np.uint8)
+    texture = coarse.repeat(8, axis=0).repeat(8, axis=1)
+    views = []
+    for number in range(3):
+        pose = np.eye(4)[None]
+        pose[0, 0, 3] = -0.1 * number
+        camera = Cameras.pinhole(96, 96, focal=96.0, cam_from_world=pose, name=f"{number}")
+        frame = Frame(np.ascontiguousarray(texture[:, 12 * number : 12 * number + 96]))
+        views.append(View(f"{number}", camera, lambda frame=frame: frame))
+    scene = Scene(Path(), "photographs", tuple(views))
+    options = StereoOptions(max_side=64)
+    with suppress(DegenerateError):
+        PlaneSweepStereo(scene, options=options, views=scene.names).depth(
+            scene, views[1], views[1].load()
+        )
+
+
+KERNELS = KernelSet("plane sweep", compile_sweep, filtering.enlarge)
