@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -501,8 +502,8 @@ def compile_sweep() -> None:
         pose = np.eye(4)[None]
         pose[0, 0, 3] = -0.1 * number
         camera = Cameras.pinhole(96, 96, focal=96.0, cam_from_world=pose, name=f"{number}")
-        frame = Frame(np.ascontiguousarray(texture[:, 12 * number : 12 * number + 96]))
-        views.append(View(f"{number}", camera, lambda frame=frame: frame))
+        rgb = np.ascontiguousarray(texture[:, 12 * number : 12 * number + 96])
+        views.append(View(f"{number}", camera, partial(Frame, rgb)))
     scene = Scene(Path(), "photographs", tuple(views))
     options = StereoOptions(max_side=64)
     with suppress(DegenerateError):
