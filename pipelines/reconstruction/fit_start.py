@@ -1,9 +1,9 @@
-"""Gaussians from a file that a fit begins with: splats or points, placed in the project."""
+"""Gaussians that a fit begins with: at points and pixels with depth, or from a file, placed."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from gvtools.appearance.appearance import Appearance
 from gvtools.appearance.gaussians import Gaussians
-from gvtools.appearance.population import from_points
+from gvtools.appearance.population import from_depth, from_points, pixels_with_depth
 from gvtools.appearance.splat.project_kernels import VALUES
 from gvtools.errors import DegenerateError
+from gvtools.poses.refinement import FitView
 from gvtools.scans.registration import (
     ESTIMATE,
     FEWEST,
@@ -36,6 +37,12 @@ if TYPE_CHECKING:
     from pipelines.console import Console
     from pipelines.reconstruction.plan import Plan
 
+# Fewer than FEW_POINTS sparse points are made up to ENOUGH_POINTS by pixels with depth, by a
+# network or a plane sweep. With points that three to seven photographs detected, held-out pictures
+# gain 1.3 to 2.8 dB by this; with 25,000 instead of 10,000 up to 0.8 dB less.
+FEW_POINTS, ENOUGH_POINTS = 5_000, 10_000
+# A fit needs at least so many sparse points and pixels with depth together.
+FEWEST_POINTS = 100
 # The progress at which a fit begins with fitted Gaussians. The fox in 30 s: 30.55 dB so, 30.33 at
 # 0.35, 30.21 at 0.6, 29.76 at 0.85 and 29.39 without them.
 GIVEN = 0.15
@@ -218,3 +225,39 @@ def _strongest(values: NDArray[np.float32], most: int) -> NDArray[np.float32]:
     sizes = np.sort(values[:, LOG_SCALE:QUATERNION], axis=1)[:, 1:].sum(axis=1)
     light = sizes - np.log1p(np.exp(-values[:, LOGIT]))
     return values[np.sort(np.argsort(-light, kind="stable")[:most])]
+
+
+def first_gaussians(plan: Plan, views: Sequence[FitView], frame: LocalFrame) -> Gaussians:
+    """Gaussians at recorded depth, else at sparse points and, if these are few, estimated depth."""
+    seed, most = plan.config.seed, plan.config.refine.most_gaussians
+    if any(view.depth is not None for view in views):
+        return from_depth(views, frame=frame, seed=seed, most=most)
+    points = plan.scene.points
+    positions, colors = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+    if points is not None:
+        positions, colors = frame.from_world(points.positions), points.colors
+    if len(positions) < FEW_POINTS:
+        estimated = [replace(v, depth=v.estimate) for v in views if v.estimate is not None]
+        missing = ENOUGH_POINTS - len(positions)
+        more = pixels_with_depth(estimated, seed=seed, count=missing)
+        positions = np.concatenate([positions, more[0]])
+        colors = np.concatenate([colors, more[1]])
+    if len(positions) < FEWEST_POINTS:
+        raise DegenerateError(
+            f"{plan.scene.root}: {len(positions)} sparse points and pixels with depth in "
+            f"{len(views)} views; expected at least {FEWEST_POINTS}; add photographs that overlap"
+        )
+    return from_points(positions, colors, frame=frame, most=most)
+
+
+def known_surface(start: Gaussians, views: Sequence[FitView]) -> NDArray[np.float32] | None:
+    """(N, 3) points on surfaces, which nothing may float before; None where depth is recorded.
+
+    Recorded depth keeps Gaussians on surfaces by itself, and where only some views have it, it
+    tells nothing of what the others see.
+    """
+    if any(view.depth is not None for view in views):
+        return None
+    estimated = [replace(v, depth=v.estimate) for v in views if v.estimate is not None]
+    more = pixels_with_depth(estimated, seed=0, count=ENOUGH_POINTS)[0]
+    return np.concatenate([start.values[:, :LOG_SCALE], more.astype(np.float32)])

@@ -33,10 +33,7 @@ from gvtools.appearance.fit import (
     with_chosen_backdrop,
 )
 from gvtools.appearance.fit_options import FitOptions, converged_steps
-from gvtools.appearance.gaussians import Gaussians
-from gvtools.appearance.population import from_depth, from_points, pixels_with_depth
 from gvtools.appearance.splat.gsplat_splatter import GsplatSplat, splatter_on
-from gvtools.appearance.splat.project_kernels import LOG_SCALE
 from gvtools.depth.choice import is_estimated
 from gvtools.depth.shown import FittedDepth
 from gvtools.depth.source import DepthMap, MixedDepth, RecordedDepth, is_recorded
@@ -52,7 +49,8 @@ from gvtools.scenes.scene import Frame, View
 from gvtools.splat_files import holds_splats
 from gvtools.untrusted import load_arrays
 from gvtools.view_selection import evenly_spread
-from pipelines.reconstruction.fit_start import GIVEN, given_start
+from pipelines.reconstruction import fit_start
+from pipelines.reconstruction.fit_start import GIVEN, first_gaussians, given_start, known_surface
 from pipelines.reconstruction.voxel import grid_frame
 
 if TYPE_CHECKING:
@@ -60,10 +58,6 @@ if TYPE_CHECKING:
     from pipelines.console import Console
     from pipelines.reconstruction.plan import Plan
 
-# Fewer than FEW_POINTS sparse points are made up to ENOUGH_POINTS by pixels with depth, by a
-# network or a plane sweep. With points that three to seven photographs detected, held-out pictures
-# gain 1.3 to 2.8 dB by this; with 25,000 instead of 10,000 up to 0.8 dB less.
-FEW_POINTS, ENOUGH_POINTS = 5_000, 10_000
 # Longer side at which photographs are swept [px].
 SWEPT_SIDE = 320
 # After a fit photographs enter the memory at least so large. Where validation photographs can tell
@@ -76,8 +70,6 @@ MEMORY_SHARE, MOST_MEGAPIXELS, MEGAPIXEL_SECONDS = 0.15, 20.0, 2.0
 SWEEP_SECONDS, SWEEP_SHARE, SMALL_SIDE = 0.8, 0.15, 160
 # So many views are swept however little time there is, where a fit has few points to begin with.
 FEWEST_SWEPT = 12
-# A fit needs at least so many sparse points and pixels with depth together.
-FEWEST_POINTS = 100
 # The memory's colours must be better by so much, divided by the number of photographs that judge:
 # pictures of one that is at the border of the others differ by 2 dB from fit to fit [dB].
 MARGIN = 3.0
@@ -135,42 +127,6 @@ def _estimate(
     return None if depth is None else resize_nearest(depth, *frame.rgb.shape[1::-1])
 
 
-def first_gaussians(plan: Plan, views: Sequence[FitView], frame: LocalFrame) -> Gaussians:
-    """Gaussians at recorded depth, else at sparse points and, if these are few, estimated depth."""
-    seed, most = plan.config.seed, plan.config.refine.most_gaussians
-    if any(view.depth is not None for view in views):
-        return from_depth(views, frame=frame, seed=seed, most=most)
-    points = plan.scene.points
-    positions, colors = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
-    if points is not None:
-        positions, colors = frame.from_world(points.positions), points.colors
-    if len(positions) < FEW_POINTS:
-        estimated = [replace(v, depth=v.estimate) for v in views if v.estimate is not None]
-        missing = ENOUGH_POINTS - len(positions)
-        more = pixels_with_depth(estimated, seed=seed, count=missing)
-        positions = np.concatenate([positions, more[0]])
-        colors = np.concatenate([colors, more[1]])
-    if len(positions) < FEWEST_POINTS:
-        raise DegenerateError(
-            f"{plan.scene.root}: {len(positions)} sparse points and pixels with depth in "
-            f"{len(views)} views; expected at least {FEWEST_POINTS}; add photographs that overlap"
-        )
-    return from_points(positions, colors, frame=frame, most=most)
-
-
-def known_surface(start: Gaussians, views: Sequence[FitView]) -> NDArray[np.float32] | None:
-    """(N, 3) points on surfaces, which nothing may float before; None where depth is recorded.
-
-    Recorded depth keeps Gaussians on surfaces by itself, and where only some views have it, it
-    tells nothing of what the others see.
-    """
-    if any(view.depth is not None for view in views):
-        return None
-    estimated = [replace(v, depth=v.estimate) for v in views if v.estimate is not None]
-    more = pixels_with_depth(estimated, seed=0, count=ENOUGH_POINTS)[0]
-    return np.concatenate([start.values[:, :LOG_SCALE], more.astype(np.float32)])
-
-
 class Sweep:
     """Plane-sweep depth of a run's photographs, at a size that its fit has time for.
 
@@ -196,7 +152,7 @@ class Sweep:
         estimated = any(is_estimated(plan.source, plan.scene[name]) for name in plan.context)
         if recorded or estimated or len(plan.context) < 2:
             return None
-        few = plan.scene.points is None or len(plan.scene.points.positions) < FEW_POINTS
+        few = plan.scene.points is None or len(plan.scene.points.positions) < fit_start.FEW_POINTS
         limit, views = plan.config.refine.limit, len(plan.context)
         for side in (SWEPT_SIDE, SMALL_SIDE):
             each = SWEEP_SECONDS * (side / SWEPT_SIDE) ** 2 / get_num_threads()

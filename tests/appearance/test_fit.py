@@ -78,24 +78,30 @@ import sys
 import numpy as np
 from numba.core.dispatcher import Dispatcher
 from splat_scene import photographs, rough_gaussians, walk
+from stereo_scenes import plane_scene
 from gvtools.appearance.compile_kernels import kernel_sets
 from gvtools.appearance.fit import Fit
 from gvtools.appearance.fit_options import FitOptions
+from gvtools.depth.options import StereoOptions
+from gvtools.depth.stereo.plane_sweep import KERNELS, PlaneSweepStereo
 
 def types():
     modules = [m for name, m in sys.modules.items() if name.startswith("gvtools.")]
     found = [k for m in modules for k in vars(m).values() if isinstance(k, Dispatcher)]
     return {(kernel.py_func.__name__, s) for kernel in found for s in kernel.signatures}
 
-for kernels in kernel_sets():
+for kernels in (*kernel_sets(), KERNELS):
     kernels.compile()
 before, points = types(), np.array([[0, 0, 2]], np.float32)
 Fit(rough_gaussians(), photographs(walk(3)), options=FitOptions(steps=30), surface=points).run()
+scene = plane_scene().scene
+sweep = PlaneSweepStereo(scene, options=StereoOptions(max_side=64), views=scene.names)
+sweep.depth(scene, scene.views[2], scene.views[2].load())
 print(sorted(types() - before))
 """
 
 
-def test_no_kernel_is_compiled_on_the_clock_of_a_fit():
+def test_no_kernel_is_compiled_on_the_clock_of_a_fit_or_of_its_sweep():
     words = [sys.executable, "-c", LATE_KERNELS]
     place = {**os.environ, "PYTHONPATH": str(Path(splat_scene.__file__).parent)}
     found = subprocess.run(words, env=place, capture_output=True, text=True, check=True)

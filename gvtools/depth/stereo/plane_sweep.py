@@ -505,11 +505,8 @@ def compile_sweep() -> None:
         rgb = np.ascontiguousarray(texture[:, 12 * number : 12 * number + 96])
         views.append(View(f"{number}", camera, partial(Frame, rgb)))
     scene = Scene(Path(), "photographs", tuple(views))
-    options = StereoOptions(max_side=64)
-    with suppress(DegenerateError):
-        PlaneSweepStereo(scene, options=options, views=scene.names).depth(
-            scene, views[1], views[1].load()
-        )
+    sweep = PlaneSweepStereo(scene, options=StereoOptions(max_side=64), views=scene.names)
+    sweep.depth(scene, views[1], views[1].load())
 
 
 KERNELS = KernelSet("plane sweep", compile_sweep, filtering.enlarge)

@@ -32,14 +32,14 @@ from gvtools.runs.poses import RunPoses
 from gvtools.scenes.project import open_project
 from gvtools.settings import with_texts
 from pipelines.console import Console
-from pipelines.reconstruction import fitting
+from pipelines.reconstruction import fit_start, fitting
 from pipelines.reconstruction import run as runs
+from pipelines.reconstruction.fit_start import first_gaussians
 from pipelines.reconstruction.fitting import (
     MOST_SHARE,
     MOST_TOLERANCE,
     Fitted,
     Sweep,
-    first_gaussians,
     fit_appearance,
     fit_views,
     validate_fit,
@@ -146,7 +146,7 @@ def test_a_run_that_nothing_can_be_fitted_to_goes_on_without_and_resumes(
     def nowhere(*args, **kwargs):
         raise DegenerateError("no surface is known")
 
-    monkeypatch.setattr(fitting, "from_depth", nowhere)
+    monkeypatch.setattr(fit_start, "from_depth", nowhere)
     out = run(scan, tmp_path / "run")
     assert "no Gaussians are fitted: no surface is known" in capsys.readouterr().err
     assert not (out / FITTED).exists()
@@ -217,13 +217,13 @@ def test_pixels_with_swept_depth_make_up_for_few_sparse_points(tmp_path, monkeyp
         begun.append(positions)
         return from_points(positions, colors, **kwargs)
 
-    monkeypatch.setattr(fitting, "from_points", watched)
+    monkeypatch.setattr(fit_start, "from_points", watched)
     scan = write_colmap_scan(tmp_path / "scan", views=10, points=15)
     plan = planned(scan, "refine.most_gaussians=20000")
     frame = fitting.grid_frame(plan.scene, plan.context)
     views = fit_views(plan, frame, QUIET, sweep=Sweep.of(plan))
     first_gaussians(plan, views, frame)
-    monkeypatch.setattr(fitting, "FEW_POINTS", 150)
+    monkeypatch.setattr(fit_start, "FEW_POINTS", 150)
     first_gaussians(plan, views, frame)
     few, enough = begun
     assert len(enough) == 150
@@ -241,13 +241,13 @@ def test_a_sweep_is_as_large_as_there_is_time(bare, monkeypatch, seconds, side):
     monkeypatch.setattr(fitting, "SWEPT_SIDE", 96)
     monkeypatch.setattr(fitting, "SMALL_SIDE", 64)
     monkeypatch.setattr(fitting, "get_num_threads", lambda: 2)
-    monkeypatch.setattr(fitting, "FEW_POINTS", 15)
+    monkeypatch.setattr(fit_start, "FEW_POINTS", 15)
     plan = planned(bare, f"refine.seconds={seconds}")
     sweep = Sweep.of(plan)
     if side is None:
         assert sweep is None
         # A start needs points.
-        monkeypatch.setattr(fitting, "FEW_POINTS", 10**6)
+        monkeypatch.setattr(fit_start, "FEW_POINTS", 10**6)
         sweep, side = Sweep.of(plan), 64
     assert sweep is not None
     view = sweep.scene["view_1.png"]

@@ -33,8 +33,8 @@ from pipelines.export.formats import ExportOptions
 from pipelines.export.splats import write_file
 from pipelines.reconstruction import fitting
 from pipelines.reconstruction import run as module
-from pipelines.reconstruction.fit_start import given_start
-from pipelines.reconstruction.fitting import Fitted, first_gaussians, fit_appearance, fit_views
+from pipelines.reconstruction.fit_start import first_gaussians, given_start
+from pipelines.reconstruction.fitting import Fitted, fit_appearance, fit_views
 from pipelines.reconstruction.prepare import make_plan
 from pipelines.reconstruction.run import refine
 from pipelines.reconstruction.settings import RunSettings
