@@ -56,7 +56,7 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     from gvtools.appearance.compile_kernels import kernel_sets
     from gvtools.completers.inpaint import InpaintCompleter
     from gvtools.depth import source
-    from gvtools.memory import compile_kernels as memory
+    from gvtools.memory import spatial_memory as memory
     from gvtools.procedural import room_sample
 
     sets = [*kernel_sets(), memory.KERNELS, room_sample.KERNELS, *InpaintCompleter.kernels]

@@ -15,29 +15,19 @@ from gvtools.memory.back_projection import FREE_CELL
 from gvtools.memory.store.views import FreeGrid
 
 
+@compiled(inline="always")
+def _moved(M, row, x, y, z):
+    """A coordinate of (x, y, z) after the rigid motion ``M`` (4, 4)."""
+    return M[row, 0] * x + M[row, 1] * y + M[row, 2] * z + M[row, 3]
+
+
 @compiled()
 def seen_through(x, y, z, K, cam_from_world, free_depth, tolerance):
     """Whether the camera saw past (x, y, z): its cell's nearest depth lies clearly behind."""
-    depth = (
-        cam_from_world[2, 0] * x
-        + cam_from_world[2, 1] * y
-        + cam_from_world[2, 2] * z
-        + cam_from_world[2, 3]
-    )
+    depth = _moved(cam_from_world, 2, x, y, z)
     if depth <= 0:
         return False
-    cx = (
-        cam_from_world[0, 0] * x
-        + cam_from_world[0, 1] * y
-        + cam_from_world[0, 2] * z
-        + cam_from_world[0, 3]
-    )
-    cy = (
-        cam_from_world[1, 0] * x
-        + cam_from_world[1, 1] * y
-        + cam_from_world[1, 2] * z
-        + cam_from_world[1, 3]
-    )
+    cx, cy = _moved(cam_from_world, 0, x, y, z), _moved(cam_from_world, 1, x, y, z)
     column = np.floor(((K[0, 0] * cx + K[0, 1] * cy) / depth + K[0, 2]) / FREE_CELL)
     row = np.floor((K[1, 1] * cy / depth + K[1, 2]) / FREE_CELL)
     if not (0 <= column < free_depth.shape[1] and 0 <= row < free_depth.shape[0]):
@@ -45,8 +35,6 @@ def seen_through(x, y, z, K, cam_from_world, free_depth, tolerance):
     return depth < free_depth[np.int64(row), np.int64(column)] * (1 - tolerance)
 
 
-# How far a point may be moved out of free space, and in what steps, as shares of its depth.
-FARTHEST, STEP = 2.0, 1.02
 # Views that are looked at in one call: a call costs as much as some thousand points.
 VIEWS_PER_CALL = 32
 
@@ -74,34 +62,6 @@ def in_free_space(
     for first in range(0, len(views), VIEWS_PER_CALL):
         grids = stack_grids(views[first : first + VIEWS_PER_CALL])
         in_threads(_mark, len(positions), positions, *grids, tolerance, out)
-    return out
-
-
-def behind_free_space(
-    origin: NDArray[np.float64],
-    rays: NDArray[np.float64],
-    depth: NDArray[np.float64],
-    *,
-    views: Sequence[FreeGrid],
-    tolerance: float,
-) -> NDArray[np.float64]:
-    """Move points along their rays until no view saw past them, see ``in_free_space``.
-
-    The rays (N, 3) go from ``origin`` (3,) to the points at depth 1. Returns the depth (N,), at
-    most FARTHEST times as large; 0 where all of that is free.
-    """
-    out = depth.copy()
-    left = np.arange(len(depth))
-    factor = 1.0
-    while len(left):
-        points = origin + rays[left] * (depth[left] * factor)[:, None]
-        hit = in_free_space(points.astype(np.float32), views, tolerance=tolerance)
-        out[left] = depth[left] * factor
-        left = left[hit]
-        factor *= STEP
-        if factor > FARTHEST:
-            out[left] = 0
-            break
     return out
 
 
@@ -194,9 +154,7 @@ def _outline(box, M, K):
         x = box[3 * (corner & 1)]
         y = box[1 + 3 * ((corner >> 1) & 1)]
         z = box[2 + 3 * ((corner >> 2) & 1)]
-        cx = M[0, 0] * x + M[0, 1] * y + M[0, 2] * z + M[0, 3]
-        cy = M[1, 0] * x + M[1, 1] * y + M[1, 2] * z + M[1, 3]
-        cz = M[2, 0] * x + M[2, 1] * y + M[2, 2] * z + M[2, 3]
+        cx, cy, cz = _moved(M, 0, x, y, z), _moved(M, 1, x, y, z), _moved(M, 2, x, y, z)
         low_z = min(low_z, cz)
         high_z = max(high_z, cz)
         if cz > 0:
@@ -256,11 +214,10 @@ def in_front(
         first = segment_start[r]
         for p in range(first, first + segment_length[r], SAMPLE):
             x, y, z = positions[p, 0], positions[p, 1], positions[p, 2]
-            pz = M[2, 0] * x + M[2, 1] * y + M[2, 2] * z + M[2, 3]
+            pz = _moved(M, 2, x, y, z)
             if pz <= 0:
                 continue
-            px = M[0, 0] * x + M[0, 1] * y + M[0, 2] * z + M[0, 3]
-            py = M[1, 0] * x + M[1, 1] * y + M[1, 2] * z + M[1, 3]
+            px, py = _moved(M, 0, x, y, z), _moved(M, 1, x, y, z)
             u = (K[0, 0] * px + K[0, 1] * py) / pz + K[0, 2]
             v = K[1, 1] * py / pz + K[1, 2]
             inside = u >= 0 and u < width and v >= 0 and v < height

@@ -5,7 +5,8 @@ from __future__ import annotations
 import io
 import json
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -75,10 +76,21 @@ def description(memory: Store) -> dict[str, Any]:
     }
 
 
+@contextmanager
+def _fitting(path: Path) -> Iterator[None]:
+    """Refuses parts of a memory that contradict each other, whatever that makes the code raise."""
+    try:
+        yield
+    except MemoryFileError:
+        raise
+    except (AttributeError, GvError, IndexError, KeyError, TypeError, ValueError) as error:
+        raise MemoryFileError(f"{path}: the memory's parts do not fit together ({error})") from None
+
+
 def load_memory(path: Path, kind: Callable[..., S], **more: Any) -> S:
     """Read a memory of a class, see ``create_empty``; every byte is checked."""
     header, arrays = _read(path)
-    try:
+    with _fitting(path):
         check_observations(arrays, len(header["names"]))
         empty = create_empty(header, kind, **more)
         append_views(empty.views, header["names"], arrays)
@@ -91,8 +103,6 @@ def load_memory(path: Path, kind: Callable[..., S], **more: Any) -> S:
                 round=round_,
             )  # fmt: skip
         empty.whole.rebuild_index()
-    except (GvError, IndexError, KeyError, TypeError, ValueError) as error:
-        raise MemoryFileError(f"{path}: the memory's parts do not fit together ({error})") from None
     return empty
 
 
@@ -277,20 +287,14 @@ def load_tiles(
     index = ArrayFile(folder / INDEX)
     meta = index.meta
     _check_version(folder, meta.get("version"))
-    try:
+    with _fitting(folder):
         memory = create_empty(
             meta, kind, budget=meta["budget"] if budget is None else budget, scratch=scratch
         )
         arrays = {name: index.array(name) for name in index.names}
         append_views(memory.views, meta["names"], arrays)
         _add_tiles(memory, folder, meta, arrays=arrays, scratch=scratch)
-        return memory
-    except MemoryFileError:
-        raise
-    except (AttributeError, GvError, IndexError, KeyError, TypeError, ValueError) as error:
-        raise MemoryFileError(
-            f"{folder}: the memory's parts do not fit together ({error})"
-        ) from None
+    return memory
 
 
 def _add_tiles(
@@ -336,7 +340,7 @@ def _add_tiles(
             voxels=voxels, agreed=tuple(agreed),
         )  # fmt: skip
         tiles.add(tile)
-    tiles.places.append(of_tile, local, start, level=arrays["segment_level"])
+    tiles.places.append_rows(of_tile, local, start, arrays["segment_level"])
     memory.segments.follow(length, view, box)
 
 

@@ -76,13 +76,6 @@ class FusionRules(NamedTuple):
     top: int
 
 
-class SegmentTable(NamedTuple):
-    """First observations and boxes of the segments that were there before."""
-
-    start: NDArray[np.int64]
-    box: NDArray[np.float32]
-
-
 class FusionOutput(NamedTuple):
     """New segments (``group``: rows of ``touched``), agreements with earlier rounds, and counts."""
 
@@ -139,13 +132,14 @@ def _most_similar(head, p, spacing, source, columns):
 
 
 @compiled()
-def fuse_blocks(batch, index, columns, count, source, rules, old, out):
+def fuse_blocks(batch, index, columns, count, source, rules, old_start, old_box, out):
     """Fuse one view's points, grouped by block; returns (observations, segments, agreements).
 
     New observations are appended block by block, so each (block, view) is one contiguous segment
     with a tight bounding box (``out.box``). Observations of earlier rounds are never changed: what
     agrees with one is logged as (row, confidence). ``columns`` hold ``count`` observations so far;
-    of the segments of before (``old``), ``out.report[FIRST_SEGMENT]`` is the first that changes.
+    of the segments of before, with first observations ``old_start`` and boxes ``old_box``,
+    ``out.report[FIRST_SEGMENT]`` is the first that changes.
     """
     starts, order, locals_ = batch.starts, batch.order, batch.locals
     positions, colors, confidence = batch.positions, batch.colors, batch.confidence
@@ -246,11 +240,11 @@ def fuse_blocks(batch, index, columns, count, source, rules, old, out):
                         for k in range(3):
                             r_position[best, k] = at[k]
                     # Neighbours mostly merge into the same segment.
-                    if old.start[merged_into] > best or (
-                        merged_into + 1 < len(old.start) and old.start[merged_into + 1] <= best
+                    if old_start[merged_into] > best or (
+                        merged_into + 1 < len(old_start) and old_start[merged_into + 1] <= best
                     ):
-                        merged_into = int(np.searchsorted(old.start, best, side="right")) - 1
-                    _include(old.box[merged_into], r_position[best], columns.spacing[best])
+                        merged_into = int(np.searchsorted(old_start, best, side="right")) - 1
+                    _include(old_box[merged_into], r_position[best], columns.spacing[best])
                     report[FIRST_SEGMENT] = min(report[FIRST_SEGMENT], merged_into)
                 else:
                     report[AGREED] += 1
@@ -431,11 +425,8 @@ def fuse(
     unusable = arrived - int(keep.sum())
     free = 0
     if generated and arrived:
-        hit = in_free_space(
-            points.positions,
-            store.observed_grids(range(len(store.views))),
-            tolerance=store.options.free_space_tolerance,
-        )
+        tolerance = store.options.free_space_tolerance
+        hit = in_free_space(points.positions, store.observed_grids(), tolerance=tolerance)
         free = int((hit & keep).sum())
         keep &= ~hit
     columns: list[NDArray[Any]] = [
@@ -495,7 +486,7 @@ def _fuse_tiles(store: Store, columns: list[NDArray[Any]], view: int) -> FuseRep
             for (at, _), rows in zip(touched, np.split(row, ends[:-1]), strict=True):
                 tiles[at].segments = np.concatenate([tiles[at].segments, rows])
             table.follow(length, np.full(len(order), view, np.int32), box)
-            tiles.places.append(tile, local, first, level=level)
+            tiles.places.append_rows(tile, local, first, level)
         tiles.divide_large([number for number, _ in touched])
         tiles.shrink()
     return total
@@ -539,7 +530,7 @@ def _fuse(store: Store, part: Observations, columns: list[NDArray[Any]], *, view
         view, round_, bool(views.generated[view]), views.centers[view], views.centers,
         views.scanned,
     )  # fmt: skip
-    old = SegmentTable(segments.start[: segments.count], segments.box[: segments.count])
+    old = segments.rows()
     rules = FusionRules(
         cosine_same=float(np.cos(np.radians(options.merge_angle_deg))),
         min_detail_ratio=options.min_detail_ratio,
@@ -549,8 +540,9 @@ def _fuse(store: Store, part: Observations, columns: list[NDArray[Any]], *, view
         top=index.top,
     )
     part.columns.count, added, agreed = fuse_blocks(
-        batch, index.arrays, part.columns.arrays, len(part), source, rules, old, out
-    )
+        batch, index.arrays, part.columns.arrays, len(part), source, rules, old["start"],
+        old["box"], out,
+    )  # fmt: skip
     index.voxels += int(out.report[NEW_VOXELS])
     segments.append(
         out.start[:added], out.length[:added], np.full(added, view, np.int32), box=out.box[:added],

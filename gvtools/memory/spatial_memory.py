@@ -11,10 +11,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from gvtools.cameras import Cameras, rigid_poses
 from gvtools.errors import DegenerateError, GvError, MemoryFileError, OptionError, ShapeError
+from gvtools.kernels import KernelSet
 from gvtools.memory import fusion
 from gvtools.memory.back_projection import BackProjectionOptions, back_project
-from gvtools.memory.culling import behind_free_space
+from gvtools.memory.culling import in_free_space
 from gvtools.memory.fusion import FuseReport
+from gvtools.memory.splat.api import SplatOptions
+from gvtools.memory.splat.cpu import resolve
 from gvtools.memory.store.local_frame import LocalFrame
 from gvtools.memory.store.observations import LAYOUT, rows_of
 from gvtools.memory.store.store import MemoryOptions, Store
@@ -29,12 +32,13 @@ if TYPE_CHECKING:
     import open3d as o3d
 
     from gvtools.guidance import Guidance
-    from gvtools.memory.splat.api import SplatOptions
 
 # Nearest neighbours are looked up for this many points when a cloud gives no spacing.
 NEIGHBOUR_SAMPLES = 20_000
 # How far float colours may leave 0 to 1.
 COLOR_SLACK = 0.01
+# How far a point may be moved out of free space, and in what steps, as shares of its depth.
+FARTHEST, STEP = 2.0, 1.02
 # RAM for an observation: columns, index, its share of segments and of the log of agreements.
 OBSERVATION_BYTES = 64
 
@@ -98,19 +102,26 @@ class SpatialMemory(Store):
     ) -> NDArray[np.float32]:
         """Depth (H, W), moved back ``where`` an observed ray saw its place to be free.
 
-        0 where all places along the ray are free.
+        It becomes at most FARTHEST times as large; 0 where all of that is free.
         """
         where = where & (depth > 0)
         rows, columns = np.nonzero(where)
         pixels = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))], axis=1)
         pose = self.frame.local_from_cam(camera.world_from_cam[0])
         rays = pixels @ np.linalg.inv(camera.K[0]).T @ pose[:3, :3].T
+        views, tolerance = self.observed_grids(), self.options.free_space_tolerance
+        near = depth[where].astype(np.float64)
+        moved, left, factor = near.copy(), np.arange(len(near)), 1.0
+        while len(left):
+            moved[left] = near[left] * factor
+            points = (pose[:3, 3] + rays[left] * moved[left, None]).astype(np.float32)
+            left = left[in_free_space(points, views, tolerance=tolerance)]
+            factor *= STEP
+            if factor > FARTHEST:
+                moved[left] = 0
+                break
         out = depth.copy()
-        out[where] = behind_free_space(
-            pose[:3, 3], rays, depth[where].astype(np.float64),
-            views=self.observed_grids(range(len(self.views))),
-            tolerance=self.options.free_space_tolerance,
-        )  # fmt: skip
+        out[where] = moved
         return out
 
     def fuse(
@@ -399,3 +410,22 @@ def _neighbour_distance(positions: NDArray[np.float64]) -> float:
     apart = np.sqrt(squared.numpy()[:, 1])
     apart = apart[apart > 0]
     return float(np.median(apart)) if apart.size else 0.0
+
+
+def compile_kernels(backend: str = "cpu") -> None:
+    """Compile, or load from numba's cache, what lifting, fusing and projecting need."""
+    memory = SpatialMemory(0.1)
+    rgb, depth = np.zeros((16, 16, 3), np.uint8), np.full((16, 16), 2, np.float32)
+    trust, mask = np.ones((16, 16), np.float32), np.ones((16, 16), np.bool_)
+    options = SplatOptions(nearest_views=1, backend=backend)
+    for number, x in enumerate((0.0, 0.5, 1.0)):
+        pose = rigid_poses(np.eye(3), (x, 0, 0))
+        camera = Cameras.pinhole(16, 16, focal=16.0, cam_from_world=pose, name=f"{number}")
+        memory.observe(
+            rgb, depth - np.float32(x), camera, round=number, confidence=trust, mask=mask,
+            generated=number == 2, pixel_binning=1.0,
+        )  # fmt: skip
+        memory.project(camera, options=options)
+
+
+KERNELS = KernelSet("memory", compile_kernels, resolve)

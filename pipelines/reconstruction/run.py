@@ -67,7 +67,7 @@ def compile_kernels(
     from gvtools import kernels as compiler
     from gvtools.completers.base import completer_type
     from gvtools.depth import source as depth_source
-    from gvtools.memory import compile_kernels as memory
+    from gvtools.memory import spatial_memory as memory
 
     completer = completer_type(config.completer)
     sets = [memory.KERNELS, depth_source.KERNELS, *completer.kernels, *more]

@@ -19,6 +19,7 @@ from gvtools.guidance import Guidance
 from gvtools.memory.back_projection import FREE_CELL, BackProjectionOptions, back_project
 from gvtools.memory.panoramas import LensOptions, Rig, picture_cameras
 from gvtools.memory.store.local_frame import LocalFrame
+from gvtools.memory.store.views import PointSet
 from gvtools.memory.store.voxel_index import VoxelLevels
 from gvtools.trajectories import level_up, look_at
 
@@ -32,6 +33,13 @@ def _numbered(shape) -> np.ndarray:
     """Colours that name the pixel: row, column, 0."""
     rows, cols = np.mgrid[: shape[0], : shape[1]]
     return np.stack([rows, cols, 0 * rows], -1).astype(np.uint8)
+
+
+def _kept(lifted: PointSet, shape: tuple[int, ...]) -> np.ndarray:
+    """Which of numbered pixels became points."""
+    kept = np.zeros(shape, bool)
+    kept[lifted.colors[:, 0], lifted.colors[:, 1]] = True
+    return kept
 
 
 def _plane_depth(source, normal, distance) -> np.ndarray:
@@ -74,9 +82,7 @@ def test_generated_depth_keeps_its_edges_with_little_confidence():
     made = back_project(rgb, depth, source, generated=True)
     assert measured.dropped["depth edge"] > 0
     assert (len(made), made.dropped["depth edge"]) == (depth.size, 0)
-    kept = np.zeros(depth.shape, bool)
-    kept[measured.colors[:, 0], measured.colors[:, 1]] = True
-    at_edge = ~kept[made.colors[:, 0], made.colors[:, 1]]
+    at_edge = ~_kept(measured, depth.shape)[made.colors[:, 0], made.colors[:, 1]]
     assert made.confidence[at_edge].max() < made.confidence[~at_edge].min() / 5
     np.testing.assert_array_equal(made.confidence[~at_edge], measured.confidence)
 
@@ -102,8 +108,7 @@ def test_a_step_loses_the_pixels_beside_it_and_no_others():
     depth = np.full((40, 60), 2, np.float32)
     depth[:, 30:] = 2.4
     lifted = back_project(_numbered(depth.shape), depth, source)
-    kept = np.zeros(depth.shape, bool)
-    kept[lifted.colors[:, 0], lifted.colors[:, 1]] = True
+    kept = _kept(lifted, depth.shape)
     np.testing.assert_array_equal(kept[:, [29, 30]], False)
     kept[:, [29, 30]] = True
     assert kept.all()
@@ -141,9 +146,7 @@ def test_masks_confidence_and_the_farthest_depth_choose_pixels():
     usable = np.isfinite(depth) & (depth > 0) & (depth <= 3.02)
     expected = usable & mask & (trust > 0)
     rows, cols = lifted.colors[:, 0].astype(int), lifted.colors[:, 1].astype(int)
-    found = np.zeros((30, 40), bool)
-    found[rows, cols] = True
-    np.testing.assert_array_equal(found[1:], expected[1:])
+    np.testing.assert_array_equal(_kept(lifted, (30, 40))[1:], expected[1:])
     assert lifted.dropped["masked"] == (usable & ~mask).sum()
     middle = (rows > 1) & (cols < 19)
     rays = source.rays()[rows, cols]

@@ -159,17 +159,6 @@ def chains_of(memory: SpatialMemory) -> dict[Cell, list[Observation]]:
 ONE_EDGE = MemoryOptions(voxels_per_footprint=0.0)
 
 
-def _cloud(rng: np.random.Generator, count: int, source):
-    """Points crowded into few voxels."""
-    return points(
-        rng.normal((0, 0, 2), 0.15, (count, 3)),
-        source=source,
-        colors=rng.integers(0, 256, (count, 3)),
-        confidence=rng.uniform(0.1, 3, count),
-        spacing=rng.uniform(0.02, 0.4, count),
-    )
-
-
 @settings(max_examples=20, deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),
@@ -187,7 +176,13 @@ def test_fusion_does_what_a_plain_dictionary_does(seed, views, capacity, degrees
     memory, reference = SpatialMemory(0.1, options=options), ReferenceMemory(0.1, options)
     for view in range(views):
         source = camera(center=rng.normal(0, 0.3, 3))
-        fresh = _cloud(rng, int(rng.integers(1, 80)), source)
+        count = int(rng.integers(1, 80))
+        # Crowded into few voxels.
+        fresh = points(
+            rng.normal((0, 0, 2), 0.15, (count, 3)), source=source,
+            colors=rng.integers(0, 256, (count, 3)), confidence=rng.uniform(0.1, 3, count),
+            spacing=rng.uniform(0.02, 0.4, count),
+        )  # fmt: skip
         generated = bool(rng.random() < 0.3)
         report = memory.fuse(fresh, round=view // 3, generated=generated)
         expected = reference.fuse(fresh, round=view // 3, generated=generated)

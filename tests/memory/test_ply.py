@@ -83,11 +83,6 @@ def test_thinning_keeps_the_most_confident_of_each_larger_voxel(most, tmp_path):
     np.testing.assert_allclose(np.sort(kept["confidence"]), np.sort(list(best.values())))
 
 
-def test_an_empty_memory_is_a_file_of_no_vertices(tmp_path):
-    assert export_memory_ply(SpatialMemory(1), tmp_path / "empty.ply") == (0, 0.0)
-    assert len(read_ply(tmp_path / "empty.ply")) == 0
-
-
 def test_no_length_but_the_right_one_is_accepted(exported, tmp_path):
     _, path = exported
     data = path.read_bytes()
@@ -128,24 +123,24 @@ def test_a_garbled_header_is_refused_or_reads_the_same_numbers(exported, tmp_pat
     assert refused > end / 2
 
 
+def _header(kind: str = "binary_little_endian", axes: str = "xyz", more: str = "") -> str:
+    properties = "".join(f"property float {axis}\n" for axis in axes)
+    return f"ply\nformat {kind} 1.0\nelement vertex 0\n{properties}{more}end_header\n"
+
+
 @pytest.mark.parametrize(
     "header",
     [
-        b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\n"
-        b"property float z\nend_header\n",
-        b"ply\nformat binary_big_endian 1.0\nelement vertex 0\nproperty float x\n"
-        b"property float y\nproperty float z\nend_header\n",
-        b"ply\nformat binary_little_endian 1.0\nelement vertex 0\nproperty float x\n"
-        b"property float y\nend_header\n",
-        b"ply\nformat binary_little_endian 1.0\nelement vertex 0\nproperty float x\n"
-        b"property float y\nproperty float z\nelement face 3\n"
-        b"property list uchar int vertex_indices\nend_header\n",
-        b"ply\nelement vertex -1\nend_header\n",
-        b"",
+        _header("ascii"),
+        _header("binary_big_endian"),
+        _header(axes="xy"),
+        _header(more="element face 3\nproperty list uchar int vertex_indices\n"),
+        "ply\nelement vertex -1\nend_header\n",
+        "",
     ],
 )
 def test_other_kinds_of_ply_are_refused(header, tmp_path):
-    (tmp_path / "other.ply").write_bytes(header)
+    (tmp_path / "other.ply").write_text(header)
     with pytest.raises(MemoryFileError, match=r"other\.ply"):
         read_ply(tmp_path / "other.ply")
     with pytest.raises(MemoryFileError, match="cannot be read"):
@@ -203,10 +198,6 @@ def _small() -> SpatialMemory:
     return memory
 
 
-def _same(one: SpatialMemory, two: SpatialMemory, folder: Path) -> bool:
-    return saved_bytes(one, folder) == saved_bytes(two, folder)
-
-
 @pytest.mark.parametrize("seed", range(3))
 def test_what_is_loaded_is_what_was_saved(seed, tmp_path):
     memory = random_memory(seed, options=MemoryOptions(merge_angle_deg=7.5, weight_cap=9))
@@ -231,15 +222,17 @@ def test_what_is_loaded_is_what_was_saved(seed, tmp_path):
         np.testing.assert_array_equal(ours.camera.cam_from_world, theirs.camera.cam_from_world)
         np.testing.assert_array_equal(ours.free_depth, theirs.free_depth)
         assert (ours.round, ours.generated) == (theirs.round, theirs.generated)
-    assert _same(loaded, memory, tmp_path)
+    assert saved_bytes(loaded, tmp_path) == saved_bytes(memory, tmp_path)
 
 
 def test_an_empty_memory_survives(tmp_path):
     memory = SpatialMemory(0.1)
+    assert export_memory_ply(memory, tmp_path / "empty.ply") == (0, 0.0)
+    assert len(read_ply(tmp_path / "empty.ply")) == 0
     memory.save(tmp_path / "memory.npz")
     loaded = SpatialMemory.load(tmp_path / "memory.npz")
     assert len(loaded) == 0
-    assert _same(loaded, memory, tmp_path)
+    assert saved_bytes(loaded, tmp_path) == saved_bytes(memory, tmp_path)
 
 
 def _flipped(data: bytes, positions, rng):
@@ -266,15 +259,9 @@ def _altered(kind: str, data: bytes, rng):
             yield more + data
 
 
+# Of flipped bits, those of time stamps and the like.
 @pytest.mark.parametrize(
-    ("kind", "most"),
-    [
-        # Time stamps and the like.
-        ("bits", 1 / 3),
-        ("blocks", 1),
-        ("cut", 0),
-        ("extended", 1),
-    ],
+    ("kind", "most"), [("bits", 1 / 3), ("blocks", 1), ("cut", 0), ("extended", 1)]
 )
 def test_an_altered_file_is_refused_or_exactly_the_memory(kind, most, tmp_path):
     original, path = saved_bytes(_small(), tmp_path), tmp_path / "altered.npz"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from memory_scenes import camera, plane_view, points, random_points, saved_bytes
@@ -136,17 +138,25 @@ def test_points_of_another_origin_and_earlier_rounds_are_refused():
         memory.forget(round=1)
 
 
-@pytest.mark.parametrize("voxel", [0, -1, np.nan, np.inf, 9e-26, 2e25])
-def test_a_voxel_that_float32_cannot_hold_is_refused_in_a_line(voxel):
-    with pytest.raises(OptionError, match=r"positive length in scene units, 1e-25 to 1e\+25") as e:
-        SpatialMemory(voxel)
+EDGE = r"positive length in scene units, 1e-25 to 1e\+25"
+POINT = "three finite numbers"
+
+
+@pytest.mark.parametrize(
+    ("error", "said", "voxel", "frame"),
+    [
+        *((OptionError, EDGE, voxel, {}) for voxel in (0, -1, np.nan, np.inf, 9e-26, 2e25)),
+        *((ShapeError, POINT, 1, {"origin": origin}) for origin in ((0, 0), (0, np.nan, 0))),
+        *(
+            (ShapeError, "rotation", 1, {"axes": axes})
+            for axes in (np.eye(2), 2 * np.eye(3), np.diag([1, 1, -1.0]))
+        ),
+    ],
+)
+def test_a_grid_that_numbers_cannot_hold_is_refused_in_a_line(error, said, voxel, frame):
+    with pytest.raises(error, match=said) as e:
+        SpatialMemory(voxel, **frame)
     assert "\n" not in str(e.value)
-
-
-@pytest.mark.parametrize("origin", [(0, 0), (0, np.nan, 0)])
-def test_an_origin_that_is_no_point_is_refused(origin):
-    with pytest.raises(ShapeError, match="three finite numbers"):
-        SpatialMemory(1, origin=origin)
 
 
 def test_an_observation_takes_at_most_45_bytes():
@@ -170,12 +180,7 @@ def world(turned: bool) -> LocalFrame:
 
 def placed(cameras: Cameras, frame: LocalFrame) -> Cameras:
     """Cameras given in a frame, in the world."""
-    local_from_cam = cameras.world_from_cam
-    pose = local_from_cam.copy()
-    pose[:, :3, :3] = frame.axes @ local_from_cam[:, :3, :3]
-    pose[:, :3, 3] = frame.to_world(local_from_cam[:, :3, 3])
-    cam_from_world = np.linalg.inv(pose).astype(np.float64)
-    return Cameras(cameras.K, cam_from_world, cameras.width, cameras.height, names=cameras.names)
+    return replace(cameras, cam_from_world=frame.cam_from_world(cameras.cam_from_world))
 
 
 def filled(frame: LocalFrame) -> SpatialMemory:
@@ -234,19 +239,11 @@ def test_a_turned_memory_is_saved_exported_and_undone(tmp_path):
     assert not loaded.generated.any() and 0 < len(loaded) < len(memory)
 
 
-@pytest.mark.parametrize("axes", [np.eye(2), 2 * np.eye(3), np.diag([1, 1, -1.0])])
-def test_axes_that_are_no_rotation_are_refused(axes):
-    with pytest.raises(ShapeError, match="rotation"):
-        SpatialMemory(0.1, axes=axes)
-
-
 def test_a_cameras_frame_is_the_cameras_with_an_exact_rotation():
     seen = placed(camera(), world(True))
     crooked = seen.cam_from_world.copy()
     crooked[0, :3, :3] += 1e-7
-    found = LocalFrame.of_camera(
-        Cameras(seen.K, crooked, seen.width, seen.height, names=seen.names)
-    )
+    found = LocalFrame.of_camera(replace(seen, cam_from_world=crooked))
     np.testing.assert_allclose(found.axes.T @ found.axes, np.eye(3), atol=1e-14)
     np.testing.assert_allclose(found.axes, seen.world_from_cam[0, :3, :3], atol=1e-6)
     there = found.from_world(found.to_world([[1.0, 2.0, 3.0]]))

@@ -1,25 +1,33 @@
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numba
 import numpy as np
 import pytest
 import torch
-from memory_scenes import camera, plane_view, points, random_camera, random_memory
+from memory_scenes import (
+    assert_equal_pictures,
+    camera,
+    plane_view,
+    points,
+    random_camera,
+    random_memory,
+)
 from reference_splat import IMAGES, OTHERS, assert_same, reference_project
 
 from gvtools.cameras import concatenate
 from gvtools.errors import OptionError, ShapeError
 from gvtools.guidance import Guidance
 from gvtools.memory.back_projection import FREE_CELL
-from gvtools.memory.culling import FARTHEST, STEP, behind_free_space, in_free_space
+from gvtools.memory.culling import in_free_space
 from gvtools.memory.projection import project
-from gvtools.memory.spatial_memory import SpatialMemory
+from gvtools.memory.spatial_memory import FARTHEST, STEP, SpatialMemory
 from gvtools.memory.splat import torch_splatter as splat_torch
 from gvtools.memory.splat.api import SplatOptions
 from gvtools.memory.splat.one_pixel import project_nearest, project_open3d
-from gvtools.memory.splat.torch_splatter import torch_device
+from gvtools.networks.compute import named_device
 
 
 @pytest.mark.parametrize(
@@ -54,21 +62,30 @@ def test_the_random_memories_cover_every_case():
     assert let_through > 50
 
 
+def by_threads(draw: Callable[[], object]) -> list:
+    """What is drawn by one, two and all threads."""
+    threads, results = numba.get_num_threads(), []
+    try:
+        for count in sorted({1, min(2, threads), threads}):
+            numba.set_num_threads(count)
+            results.append(draw())
+    finally:
+        numba.set_num_threads(threads)
+    return results
+
+
 @pytest.mark.parametrize("seed", [1, 6])
 def test_the_number_of_threads_changes_nothing(seed):
     memory = random_memory(seed, most=2000)
     target = random_camera(np.random.default_rng(seed)).resized(64, 200)
-    threads = numba.get_num_threads()
-    results = []
-    try:
-        for count in sorted({1, min(2, threads), threads}):
-            numba.set_num_threads(count)
-            results.append(project(memory, target))
-    finally:
-        numba.set_num_threads(threads)
-    for name in IMAGES:
-        for other in results[1:]:
-            np.testing.assert_array_equal(getattr(results[0], name), getattr(other, name))
+    first, *others = by_threads(lambda: project(memory, target))
+    for other in others:
+        assert_equal_pictures(first, other)
+    cloud = np.random.default_rng(seed).uniform((-3, -3, -1), (3, 3, 6), (50_000, 3))
+    first, *others = by_threads(lambda: project_nearest(cloud.astype(np.float32), target))
+    for other in others:
+        np.testing.assert_array_equal(first.index, other.index)
+        np.testing.assert_array_equal(first.depth, other.depth)
 
 
 def test_generated_content_never_outranks_observed_content():
@@ -283,9 +300,7 @@ def test_views_of_a_batch_are_those_of_single_cameras():
     batch = project(memory, cameras)
     assert len(batch) == 3
     for i, one in enumerate(cameras):
-        single = project(memory, one)
-        for name in IMAGES:
-            np.testing.assert_array_equal(getattr(batch, name)[i], getattr(single, name)[0])
+        assert_equal_pictures(batch[i], project(memory, one))
 
 
 def test_cameras_of_several_sizes_are_refused():
@@ -354,57 +369,7 @@ def test_cuda_is_refused_where_there_is_none(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(OptionError, match="no CUDA device"):
         project_torch(random_memory(1), _target(1), device="cuda")
-    assert torch_device("auto").type == "cpu"
-    assert torch_device("cpu").type == "cpu"
-
-
-def _turned(seed: int, *, width=160, height=120):
-    rng = np.random.default_rng(seed)
-    return camera(
-        width=width, height=height, focal=130, rotation=rng.normal(0, 0.2, 3),
-        center=rng.normal(0, 0.3, 3),
-    )  # fmt: skip
-
-
-def _cloud(seed: int, count: int) -> np.ndarray:
-    """Around the camera, before and behind it."""
-    rng = np.random.default_rng(seed)
-    return rng.uniform((-3, -3, -1), (3, 3, 6), (count, 3)).astype(np.float32)
-
-
-def _brute(positions, target, depth_max=np.inf):
-    """Nearest point of each pixel in float64, one after the other."""
-    xy, z = target.project(positions)
-    depth = np.zeros((int(target.height[0]), int(target.width[0])))
-    index = np.full(depth.shape, -1)
-    for i in np.flatnonzero((z[0] > 0) & (z[0] <= depth_max)):
-        column, row = np.floor(xy[0, i]).astype(int)
-        if not (0 <= row < depth.shape[0] and 0 <= column < depth.shape[1]):
-            continue
-        if index[row, column] < 0 or z[0, i] < depth[row, column]:
-            depth[row, column], index[row, column] = z[0, i], i
-    return depth, index
-
-
-def test_the_number_of_threads_changes_no_nearest_image():
-    cloud, target = _cloud(9, 50_000), _turned(9)
-    threads = numba.get_num_threads()
-    try:
-        numba.set_num_threads(1)
-        one = project_nearest(cloud, target)
-    finally:
-        numba.set_num_threads(threads)
-    many = project_nearest(cloud, target)
-    np.testing.assert_array_equal(one.index, many.index)
-    np.testing.assert_array_equal(one.depth, many.depth)
-
-
-def test_what_is_beyond_the_farthest_depth_is_left_out():
-    cloud, target = _cloud(5, 20_000), _turned(5)
-    image = project_nearest(cloud, target, depth_max=2.5)
-    _, index = _brute(cloud.astype(float), target, depth_max=2.5)
-    assert (image.index != index).sum() <= 4
-    assert 0 < image.depth.max() <= 2.5
+    assert named_device("auto", option="").type == named_device("cpu", option="").type == "cpu"
 
 
 def test_skew_is_honoured_here_and_refused_for_open3d():
@@ -414,7 +379,7 @@ def test_skew_is_honoured_here_and_refused_for_open3d():
     (xy,), _ = target.project(cloud)
     assert image.index[tuple(np.floor(xy[0, ::-1]).astype(int))] == 0
     with pytest.raises(OptionError, match="ignores skew and K has 8 px"):
-        project_open3d(cloud, cloud, target)
+        project_open3d(cloud, target)
 
 
 def test_the_winners_colours_come_along():
@@ -461,24 +426,21 @@ def test_no_view_and_no_grid_free_nothing():
     assert not in_free_space(where, [_view(camera(), nothing)], tolerance=0.0).any()
 
 
-def test_points_move_back_along_their_rays_until_nothing_saw_past_them():
-    source = camera(width=64, height=48, focal=60)
-    views = [_view(source, plane_view(source, 4.0).free_depth)]
-    rays = np.array([(0, 0, 1), (0.1, 0.1, 1), (0, 0, 1), (0, 0, 1), (5, 0, 1)], float)
-    depth = np.array([2.0, 3.0, 4.1, 4 * 0.96 / FARTHEST / STEP, 2.0])
-    moved = behind_free_space(np.zeros(3), rays, depth, views=views, tolerance=0.03)
-    limit = 4 * 0.97
-    assert ((moved[:2] >= limit) & (moved[:2] < limit * STEP)).all()
-    # Behind the wall already; free for as far as is tried; out of the view.
-    assert moved[2:].tolist() == [4.1, 0.0, 2.0]
-
-
-def test_what_moves_back_is_taken_by_fusion():
+def test_what_moves_back_along_its_rays_is_taken_by_fusion():
     source = camera(width=64, height=48, focal=60)
     beside = camera(width=64, height=48, focal=60, center=(0.5, 0, 0))
     memory = SpatialMemory(0.05)
     grey, wall = np.full((48, 64, 3), 128, np.uint8), np.full((48, 64), 4, np.float32)
     memory.observe(grey, wall, source, round=0)
+    some = np.tile(np.array([2, 3, 4.1, 4 * 0.96 / FARTHEST / STEP], np.float32), (48, 16))
+    away = memory.behind_free_space(some, source, where=some > 0)
+    limit = 4 * 0.97
+    for columns in (away[:, 0::4], away[:, 1::4]):
+        assert ((columns >= limit) & (columns < limit * STEP)).all()
+    # Behind the wall already; free for as far as is tried; out of the view.
+    assert (away[:, 2::4] == some[:, 2::4]).all() and not away[:, 3::4].any()
+    elsewhere = camera(width=64, height=48, focal=60, center=(9, 0, 0))
+    np.testing.assert_array_equal(memory.behind_free_space(some, elsewhere, where=some > 0), some)
     made = np.full((48, 64), 3, np.float32)
     where = np.ones(made.shape, bool)
     moved = memory.behind_free_space(made, beside, where=where)

@@ -45,9 +45,7 @@ NEAREST = 1e-3
 
 
 @compiled(fastmath=FAST)
-def _fill(
-    positions, first, last, M, fx, skew, fy, cx, cy, depth_min, depth_max, width, height, buffer
-):
+def _fill(positions, first, last, M, fx, skew, fy, cx, cy, depth_min, width, height, buffer):
     """Depth bits in the high half and the point's index in the low half: one comparison."""
     pixel = np.empty(CHUNK, np.uint32)
     depth = np.empty(CHUNK, np.float32)
@@ -75,9 +73,7 @@ def _fill(
             inverse = np.float32(1) / pz
             u = (fx * px + skew * py) * inverse + cx + half
             v = fy * py * inverse + cy + half
-            inside = (
-                (u >= 0) & (u < wide) & (v >= 0) & (v < tall) & (pz > depth_min) & (pz <= depth_max)
-            )
+            inside = (u >= 0) & (u < wide) & (v >= 0) & (v < tall) & (pz > depth_min)
             # Out of view goes to a spare cell behind the image, so the loop has no branch.
             pixel[k] = np.uint32(np.int32(v) * columns + np.int32(u)) if inside else spare
             depth[k] = pz
@@ -89,15 +85,13 @@ def _fill(
 
 
 @compiled(parallel=True)
-def _fill_parallel(
-    positions, parts, M, fx, skew, fy, cx, cy, depth_min, depth_max, width, height, buffers
-):
+def _fill_parallel(positions, parts, M, fx, skew, fy, cx, cy, depth_min, width, height, buffers):
     count = len(positions)
     for t in prange(parts):
         buffers[t] = np.iinfo(np.int64).max
         _fill(
             positions, t * count // parts, (t + 1) * count // parts, M, fx, skew, fy, cx, cy,
-            depth_min, depth_max, width, height, buffers[t],
+            depth_min, width, height, buffers[t],
         )  # fmt: skip
 
 
@@ -129,12 +123,11 @@ def project_nearest(
     *,
     colors: NDArray[Any] | None = None,
     depth_min: float = 0.0,
-    depth_max: float = np.inf,
 ) -> NearestImage:
     """Project points (N, 3), N < 2³¹, into one camera, one pixel each; the nearest depth wins.
 
-    Points at ``depth_min`` and before it, and beyond ``depth_max``, are left out. ``colors`` (N, 3)
-    are looked up for the winners.
+    Points at ``depth_min`` and before it are left out. ``colors`` (N, 3) are looked up for the
+    winners.
     """
     height, width = int(camera.height[0]), int(camera.width[0])
     K = camera.K[0]
@@ -145,7 +138,7 @@ def project_nearest(
     _fill_parallel(
         np.ascontiguousarray(positions), parts, camera.cam_from_world[0].astype(np.float32),
         single(K[0, 0]), single(K[0, 1]), single(K[1, 1]), single(K[0, 2] - 0.5),
-        single(K[1, 2] - 0.5), single(depth_min), single(depth_max), width, height, buffers,
+        single(K[1, 2] - 0.5), single(depth_min), width, height, buffers,
     )  # fmt: skip
     depth = np.empty(height * width, np.float32)
     index = np.empty(height * width, np.int32)
@@ -158,10 +151,8 @@ def project_nearest(
     return NearestImage(depth.reshape(height, width), index.reshape(height, width), rgb)
 
 
-def project_open3d(
-    positions: NDArray[np.float32], colors: NDArray[np.float32], camera: Cameras
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """(depth, rgb) of the same through Open3D's ``project_to_rgbd_image``.
+def project_open3d(positions: NDArray[np.float32], camera: Cameras) -> NearestImage:
+    """The same through Open3D's ``project_to_rgbd_image``; the winners' numbers go as colours.
 
     Open3D multiplies depths by 1000 and cuts at 3 units unless told otherwise, and its pixel
     centres are integers; both are set here.
@@ -173,9 +164,10 @@ def project_open3d(
             f"{camera.names[0]}: Open3D's projection ignores skew and K has {camera.K[0, 0, 1]:g} "
             "px of it; choose another splat backend"
         )
-    tensor = o3d.core.Tensor.from_numpy
+    tensor, number = o3d.core.Tensor.from_numpy, np.arange(len(positions))
+    tag = np.stack([number // _SPLIT, number % _SPLIT, np.zeros_like(number)], axis=1)
     cloud = o3d.t.geometry.PointCloud(tensor(np.ascontiguousarray(positions, np.float32)))
-    cloud.point.colors = tensor(np.ascontiguousarray(colors, np.float32))
+    cloud.point.colors = tensor(tag.astype(np.float32))
     K = camera.K[0].copy()
     K[:2, 2] -= 0.5
     pose = camera.cam_from_world[0].copy()
@@ -183,7 +175,9 @@ def project_open3d(
         int(camera.width[0]), int(camera.height[0]), tensor(K), tensor(pose), 1.0, FARTHEST
     )
     depth = image.depth.as_tensor().numpy()[..., 0].copy()
-    return depth, image.color.as_tensor().numpy().copy()
+    tags = image.color.as_tensor().numpy().astype(np.int32)
+    index = tags[..., 0] * _SPLIT + tags[..., 1]
+    return NearestImage(depth, np.where(depth > 0, index, -1).astype(np.int32))
 
 
 def project_one_pixel(store: Store, cameras: Cameras, *, open3d: bool = False) -> Guidance:
@@ -194,14 +188,17 @@ def project_one_pixel(store: Store, cameras: Cameras, *, open3d: bool = False) -
     shape = (len(cameras), int(cameras.height[0]), int(cameras.width[0]))
     depth, index = np.zeros(shape, np.float32), np.full(shape, -1, np.int32)
     for i, camera in enumerate(store.frame.seen_from(cameras)):
-        if len(store) and open3d:
-            depth[i], index[i] = _open3d(store, camera)
-        elif len(store):
-            # A point within the rounding of the camera's plane is neither before nor behind it.
-            image = project_nearest(
-                store.columns.positions, camera, depth_min=NEAREST * store.voxel
-            )
-            depth[i], index[i] = image.depth, image.index
+        if not len(store):
+            break
+        positions = store.columns.positions
+        # A point within the rounding of the camera's plane is neither before nor behind it.
+        least = NEAREST * store.voxel
+        image = (
+            project_open3d(positions, camera)
+            if open3d
+            else project_nearest(positions, camera, depth_min=least)
+        )
+        depth[i], index[i] = image.depth, image.index
     valid = index >= 0
 
     def of_winners(values: NDArray[Any]) -> NDArray[Any]:
@@ -214,12 +211,3 @@ def project_one_pixel(store: Store, cameras: Cameras, *, open3d: bool = False) -
         cameras, np.divide(colors, np.float32(255), dtype=np.float32), depth, valid,
         of_winners(store.confidence), of_winners(store.generated), of_winners(store.scanned),
     )  # fmt: skip
-
-
-def _open3d(store: Store, camera: Cameras) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """The winners' numbers travel through Open3D as colours."""
-    number = np.arange(len(store))
-    tag = np.stack([number // _SPLIT, number % _SPLIT, np.zeros_like(number)], axis=1)
-    depth, tags = project_open3d(store.columns.positions, tag.astype(np.float32), camera)
-    index = tags[..., 0].astype(np.int32) * _SPLIT + tags[..., 1].astype(np.int32)
-    return depth, np.where(depth > 0, index, -1).astype(np.int32)

@@ -154,9 +154,6 @@ class Columns:
             tensor[:] = self.tensor(name).to(there)
         return other
 
-    def __deepcopy__(self, _: dict[int, Any]) -> Columns:
-        return self.to(self.device)
-
     def with_colors(self, colors: NDArray[np.uint8]) -> Columns:
         """The rows in use with other colours (N, 3); the other columns are shared."""
         from gvtools.o3d import o3d
@@ -204,7 +201,8 @@ class GrowableTable:
         """The rows in use, by the arrays' names."""
         return {name: getattr(self, name)[: self.count] for name in self.LAYOUT}
 
-    def _append(self, *columns: NDArray[Any]) -> None:
+    def append_rows(self, *columns: NDArray[Any]) -> None:
+        """Add rows, one array for each of LAYOUT."""
         need = self.count + len(columns[0])
         capacity = len(getattr(self, next(iter(self.LAYOUT))))
         for name, rows in zip(self.LAYOUT, columns, strict=True):
@@ -254,7 +252,7 @@ class Segments(GrowableTable):
     ) -> None:
         """Add rows of equal number; ``changed`` is the first earlier segment whose box grew."""
         first = min(self.count if changed is None else changed, self.count) // self.GROUP
-        self._append(start, length, view, box)
+        self.append_rows(start, length, view, box)
         self._box_groups(first)
 
     def follow(
@@ -316,13 +314,6 @@ class SegmentPlaces(GrowableTable):
     local: NDArray[np.int32]
     row: NDArray[np.int64]
     level: NDArray[np.uint8]
-
-    def append(
-        self, tile: NDArray[np.int32], local: NDArray[np.int32], row: NDArray[np.int64],
-        *, level: NDArray[np.uint8],
-    ) -> None:  # fmt: skip
-        """Add rows of equal number."""
-        self._append(tile, local, row, level)
 
     def move(self, which: NDArray[np.int32], tile: int, segments: Segments) -> None:
         """Segments ``which`` are now all those of a tile, in this order."""

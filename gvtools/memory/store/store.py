@@ -241,12 +241,12 @@ class Store:
         }
         return html_table(type(self).__name__, rows)
 
-    def observed_grids(self, rows: Iterable[int]) -> list[FreeGrid]:
-        """(K, cam_from_local, free_depth) of those views in ``rows`` that are not generated."""
+    def observed_grids(self, rows: Iterable[int] | None = None) -> list[FreeGrid]:
+        """(K, cam_from_local, free_depth) of those views in ``rows``, or of all, not generated."""
         views = self.views
         return [
             (views[i].camera.K[0], views.cam_from_local[i], views[i].free_depth)
-            for i in rows
+            for i in (range(len(views)) if rows is None else rows)
             if not views.generated[i]
         ]
 

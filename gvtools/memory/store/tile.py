@@ -22,10 +22,11 @@ from gvtools.memory.store.observations import (
     Segments,
     SplatColumns,
 )
-from gvtools.memory.store.octree import Node
 from gvtools.memory.store.views import ViewTable
 from gvtools.memory.store.voxel_index import LOCAL_MASK, MOST_LEVEL
 
+# A cube of space: its level (edge of 2**level cells) and its coordinates in such edges.
+Node = tuple[int, int, int, int]
 # In a copy, the observations of a segment that lie in one cube of 2**2, or of 2**4, voxels a side
 # become one, their mean weighted by confidence. So its segments have the same block and view.
 DOUBLINGS = (2, 4)
