@@ -221,7 +221,7 @@ class ColmapPatchMatch:
 
         from gvtools.colmap import pycolmap
 
-        write_workspace(folder, self._scene, self.views)
+        self._write_workspace(folder)
         for name in self.views:
             path = folder / "images" / name
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -233,34 +233,25 @@ class ColmapPatchMatch:
             raise ProjectError(
                 f"{self._scene.root}: COLMAP's PatchMatch failed ({error}); use plane-sweep"
             ) from None
-        out = {}
-        for name in self.views:
-            found = depth_map_path(folder / "stereo" / "depth_maps", name)
-            if found is not None:
-                out[name] = read_depth(found)
-        return out
+        maps = folder / "stereo" / "depth_maps"
+        found = {name: depth_map_path(maps, name) for name in self.views}
+        return {name: read_depth(path) for name, path in found.items() if path is not None}
 
-
-def write_workspace(folder: Path, scene: Scene, views: Sequence[str]) -> None:
-    """Sparse model and configuration of a dense workspace with the named views alone."""
-    points = scene.points
-    assert points is not None
-    row = {view.name: i for i, view in enumerate(scene.views)}
-    kept = np.full(len(scene.views), -1)
-    kept[[row[name] for name in views]] = np.arange(len(views))
-    inside = kept[points.view_index] >= 0
-    point, first = np.unique(points.point_index[inside], return_inverse=True)
-    write_colmap(
-        folder / "sparse",
-        scene.subset(views).cameras,
-        points=points.positions[point],
-        colors=points.colors[point],
-        point_index=first,
-        view_index=kept[points.view_index[inside]],
-        xy=points.xy[inside],
-    )
-    stereo = folder / "stereo"
-    for name in ("depth_maps", "normal_maps", "consistency_graphs"):
-        (stereo / name).mkdir(parents=True, exist_ok=True)
-    lines = [line for name in views for line in (name, f"__auto__, {SOURCES}")]
-    (stereo / "patch-match.cfg").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    def _write_workspace(self, folder: Path) -> None:
+        """Sparse model and configuration of a dense workspace with the views alone."""
+        scene, views, points = self._scene, self.views, self._scene.points
+        assert points is not None
+        kept = np.full(len(scene), -1)
+        kept[[scene.names.index(name) for name in views]] = np.arange(len(views))
+        inside = kept[points.view_index] >= 0
+        point, first = np.unique(points.point_index[inside], return_inverse=True)
+        write_colmap(
+            folder / "sparse", scene.subset(views).cameras, points=points.positions[point],
+            colors=points.colors[point], point_index=first,
+            view_index=kept[points.view_index[inside]], xy=points.xy[inside],
+        )  # fmt: skip
+        stereo = folder / "stereo"
+        for name in ("depth_maps", "normal_maps", "consistency_graphs"):
+            (stereo / name).mkdir(parents=True, exist_ok=True)
+        lines = [line for name in views for line in (name, f"__auto__, {SOURCES}")]
+        (stereo / "patch-match.cfg").write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -22,8 +22,8 @@ from gvtools.completers.geoverse.objective import center_similarity
 from gvtools.completers.geoverse.views import model_size, resample, resample_depth
 from gvtools.depth.options import FoundationOptions
 from gvtools.depth.source import DepthMap, depth_of_points
-from gvtools.errors import CheckpointError, DegenerateError, OptionError
-from gvtools.networks.compute import autocast, inference_type
+from gvtools.errors import CheckpointError, DegenerateError
+from gvtools.networks.compute import autocast, inference_type, named_device
 from gvtools.networks.depth_anything.geometry_head import ViewGeometry, camera_centres
 from gvtools.networks.depth_anything.network import (
     DepthAnything3,
@@ -142,8 +142,7 @@ class FoundationDepth:
                 "model.safetensors of DA3-SMALL or DA3-BASE (gvtools weights list), or use auto"
             )
         self._weights = find_weights(Path(self.options.weights))
-        if self.options.device == "cuda" and not torch.cuda.is_available():
-            raise OptionError("da3.device = 'cuda', and torch sees no CUDA device here")
+        self._device = named_device(self.options.device, option="da3.device")
         self._passes: dict[str, Pass] = {}
         self._scales: dict[str, FoundationScale] = {}
 
@@ -189,14 +188,10 @@ class FoundationDepth:
 
     def _compute(self) -> None:
         """All passes, then the scale: one for the scene with known cameras, else one a pass."""
-        device = self.options.device
-        if device == "auto":
-            device = "cuda" if torch.cuda.is_available() else "cpu"
-        place = torch.device(device)
-        dtype = inference_type(self.options.precision, place)
-        network = load_depth_anything(self._weights, device=place, dtype=dtype)
-        with autocast(place, dtype):
-            passes = [self._pass(network, group, place) for group in self._groups(network)]
+        dtype = inference_type(self.options.precision, self._device)
+        network = load_depth_anything(self._weights, device=self._device, dtype=dtype)
+        with autocast(self._device, dtype):
+            passes = [self._pass(network, *group) for group in self._groups(network)]
         for made in passes:
             self._passes |= dict.fromkeys(made.names, made)
         sharing = [passes] if self.options.cameras else [[made] for made in passes]
@@ -227,21 +222,15 @@ class FoundationDepth:
         return groups
 
     @torch.no_grad()
-    def _pass(
-        self,
-        network: DepthAnything3,
-        group: tuple[tuple[str, ...], tuple[int, int]],
-        device: torch.device,
-    ) -> Pass:
-        """One forward pass over some views."""
-        names, size = group
+    def _pass(self, network: DepthAnything3, names: tuple[str, ...], size: tuple[int, int]) -> Pass:
+        """One forward pass over some views, at a size."""
         views = [self._scene[name] for name in names]
         cameras = concatenate([view.camera for view in views]).resized(size[1], size[0])
         pictures = []
         for view in views:
             rgb = torch.from_numpy(view.load().rgb).permute(2, 0, 1)[None].float() / 255
             pictures.append(resample(rgb, size)[0].clamp(0, 1))
-        images = torch.stack(pictures)[None].to(device)
+        images = torch.stack(pictures)[None].to(self._device)
         # The camera encoder's unit has a floor, a tenth of a scene unit: in shares of the views'
         # extent it means the same in every scene.
         extent, scale = normalised_poses(
@@ -251,8 +240,8 @@ class FoundationDepth:
         known = {}
         if self.options.cameras:
             known = {
-                "cam_from_world": pose.float().to(device),
-                "K": torch.from_numpy(cameras.K).float()[None].to(device),
+                "cam_from_world": pose.float().to(self._device),
+                "K": torch.from_numpy(cameras.K).float()[None].to(self._device),
             }
         geometry: ViewGeometry = network(images, **known)
         centres = camera_centres(geometry.ray, geometry.ray_confidence)[0].double().cpu().numpy()

@@ -22,6 +22,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
+from gvtools.errors import OptionError
+
 # From this compute capability on, CUDA cards multiply bfloat16 themselves.
 BFLOAT16_CAPABILITY = (8, 0)
 # The measured layer: tokens, inputs, outputs. It takes a millisecond in float32, and runs on one
@@ -32,6 +34,16 @@ PROBE_ROUNDS = 5
 # layer (0.73 of the time where the layer takes 0.40), and a narrow choice could fall differently at
 # the next start.
 WORTH = 0.8
+
+
+def named_device(name: str, *, option: str) -> torch.device:
+    """The device of an option that is "auto" (CUDA where there is one), "cpu" or "cuda"."""
+    there = torch.cuda.is_available()
+    if name == "cuda" and not there:
+        raise OptionError(
+            f"{option} = 'cuda', and torch sees no CUDA device here; choose 'auto' or 'cpu'"
+        )
+    return torch.device("cuda" if there and name != "cpu" else "cpu")
 
 
 def has_bfloat16(device: torch.device) -> bool:

@@ -47,10 +47,13 @@ def fuse_scan(
             center = memory.frame.to_world(local[rows].mean(axis=0)[None])[0]
         else:
             center = placement.apply(np.array(station.center))
+        # A camera of one pixel, since a view needs one.
+        pose, name = rigid_poses(np.eye(3), -center), f"{PREFIX}/{scan.name}/{station.name}"
+        camera = Cameras.alike(np.eye(3), pose, size=(1, 1), names=(name,))
         points = PointSet(
             local[rows].astype(np.float32), scan.colors[rows],
             np.ones(len(rows), np.float32), spacing[rows].astype(np.float32),
-            _camera(f"{PREFIX}/{scan.name}/{station.name}", center), memory.frame, None, {},
+            camera, memory.frame, None, {},
         )  # fmt: skip
         report = memory.fuse(points, round=round, scanned=True)
         total += replace(report, dropped=dropped)
@@ -80,9 +83,3 @@ def point_spacing(positions: NDArray[np.float64]) -> tuple[NDArray[np.float64], 
     positive = spacing[spacing > 0]
     least = float(positive.min()) if positive.size else 1.0
     return np.maximum(spacing, least), isolated
-
-
-def _camera(name: str, center: NDArray[np.float64]) -> Cameras:
-    """A camera of one pixel at a station's place (3,), since a view needs one."""
-    pose = rigid_poses(np.eye(3), -center)
-    return Cameras.alike(np.eye(3), pose, size=(1, 1), names=(name,))

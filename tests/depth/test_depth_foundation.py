@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import save_file
-from tiny_scan import SQUARE, WALL, render, write_colmap_scan, write_scan
+from tiny_scan import SQUARE, WALL, render, without_depth, write_colmap_scan, write_scan
 
 from gvtools.completers.geoverse.views import resample
 from gvtools.depth import foundation as module
@@ -90,6 +90,16 @@ def true_depth(view) -> np.ndarray:
 
 
 @pytest.fixture
+def scene(tmp_path) -> Scene:
+    return SEVENSCENES.read(write_scan(tmp_path / "scan"))
+
+
+@pytest.fixture
+def with_points(tmp_path) -> Scene:
+    return read_colmap(write_colmap_scan(tmp_path / "colmap", points=200))
+
+
+@pytest.fixture
 def weights(tmp_path):
     """A file that is only looked for, not read."""
     (tmp_path / "weights").mkdir()
@@ -120,24 +130,18 @@ def relative_errors(scene: Scene, source: FoundationDepth) -> list[float]:
 
 
 @pytest.mark.parametrize("cameras", [True, False])
-def test_depth_gets_the_scale_of_the_sparse_points(tmp_path, monkeypatch, weights, cameras):
-    scene = read_colmap(write_colmap_scan(tmp_path / "colmap", points=200))
+@pytest.mark.parametrize(("support", "exact"), [("points", 0.03), ("cameras", 1e-3)])
+def test_sparse_points_give_the_scale_and_without_them_camera_centres(
+    scene, with_points, monkeypatch, weights, cameras, support, exact
+):
+    scene = with_points if support == "points" else scene
     stand_in(monkeypatch, scene)
     source = da3(scene, weights, cameras=cameras)
     assert max(relative_errors(scene, source)) < 0.02
     fitted = source.scale(scene.names[0])
-    assert fitted.ok and fitted.support == "points" and fitted.count >= 50
-    assert fitted.scale == pytest.approx(UNIT, rel=0.03)
-
-
-@pytest.mark.parametrize("cameras", [True, False])
-def test_without_points_the_camera_centres_give_the_scale(tmp_path, monkeypatch, weights, cameras):
-    scene = SEVENSCENES.read(write_scan(tmp_path / "scan"))
-    stand_in(monkeypatch, scene)
-    source = da3(scene, weights, cameras=cameras)
-    assert max(relative_errors(scene, source)) < 0.02
-    fitted = source.scale(scene.names[0])
-    assert fitted.support == "cameras" and fitted.scale == pytest.approx(UNIT, rel=1e-3)
+    assert fitted.ok and fitted.support == support
+    assert fitted.count >= (50 if support == "points" else 6)
+    assert fitted.scale == pytest.approx(UNIT, rel=exact)
 
 
 def test_passes_share_one_scale_and_are_as_equal_as_can_be(tmp_path, monkeypatch, weights):
@@ -150,12 +154,9 @@ def test_passes_share_one_scale_and_are_as_equal_as_can_be(tmp_path, monkeypatch
 
 
 @pytest.mark.parametrize("wrong", ["centres", "depth"])
-def test_a_scale_without_support_is_refused(tmp_path, monkeypatch, weights, wrong):
+def test_a_scale_without_support_is_refused(scene, with_points, monkeypatch, weights, wrong):
     """Points that fit no scale refuse it, whatever the centres say."""
-    if wrong == "centres":
-        scene = SEVENSCENES.read(write_scan(tmp_path / "scan"))
-    else:
-        scene = read_colmap(write_colmap_scan(tmp_path / "colmap", points=200))
+    scene = scene if wrong == "centres" else with_points
     stand_in(monkeypatch, scene, wrong=wrong)
     source = da3(scene, weights)
     view = scene.views[0]
@@ -194,10 +195,9 @@ def in_another_unit(scene: Scene, factor: float) -> Scene:
 
 
 @pytest.mark.parametrize("factor", [0.01, 100.0])
-def test_the_scenes_unit_changes_the_depths_unit_alone(tmp_path, monkeypatch, weights, factor):
+def test_the_scenes_unit_changes_the_depths_unit_alone(scene, monkeypatch, weights, factor):
     network = Recorder()
     monkeypatch.setattr(module, "load_depth_anything", lambda path, **_: network)
-    scene = SEVENSCENES.read(write_scan(tmp_path / "scan"))
     depths = []
     for other in (scene, in_another_unit(scene, factor)):
         source = da3(other, weights)
@@ -210,8 +210,7 @@ def test_the_scenes_unit_changes_the_depths_unit_alone(tmp_path, monkeypatch, we
     np.testing.assert_allclose(depths[1], factor * depths[0], rtol=1e-5)
 
 
-def test_no_depth_lies_between_two_surfaces(tmp_path, monkeypatch, weights):
-    scene = SEVENSCENES.read(write_scan(tmp_path / "scan"))
+def test_no_depth_lies_between_two_surfaces(scene, monkeypatch, weights):
     oracle = stand_in(monkeypatch, scene)
     original = Oracle.__call__
 
@@ -233,8 +232,7 @@ def test_no_depth_lies_between_two_surfaces(tmp_path, monkeypatch, weights):
     assert 100 < (np.abs(found / SQUARE - 1) < 0.02).sum() < found.size / 2
 
 
-def test_unsure_pixels_and_masked_ones_stay_empty(tmp_path, monkeypatch, weights):
-    scene = SEVENSCENES.read(write_scan(tmp_path / "scan"))
+def test_unsure_pixels_and_masked_ones_stay_empty(scene, monkeypatch, weights):
     stand_in(monkeypatch, scene)
     source = da3(scene, weights)
     view = scene.views[0]
@@ -247,14 +245,8 @@ def test_unsure_pixels_and_masked_ones_stay_empty(tmp_path, monkeypatch, weights
     assert (found.confidence[found.depth > 0] > 0.2).all()
 
 
-def test_choice_takes_it_when_weights_are_given(tmp_path, weights):
-    scene = SEVENSCENES.read(write_scan(tmp_path / "scan"))
-
-    def bare(view):
-        return replace(view, load=lambda: replace(view.load(), depth=None), has_depth=False)
-
-    given = FoundationOptions(weights=weights)
-    without = replace(scene, views=tuple(bare(view) for view in scene.views))
+def test_choice_takes_it_when_weights_are_given(scene, weights):
+    given, without = FoundationOptions(weights=weights), without_depth(scene)
     chosen = choose_source(without, scene.names, "auto", foundation=given)
     assert isinstance(chosen.source, FoundationDepth) and "weights are given" in chosen.reason
     paper = choose_source(without, scene.names, "sensor-or-da3", foundation=given)
@@ -262,7 +254,7 @@ def test_choice_takes_it_when_weights_are_given(tmp_path, weights):
     assert choose_source(scene, scene.names, "sensor-or-da3", foundation=given).source.name != "da3"
     swept = choose_source(without, scene.names, "sensor-or-da3")
     assert "as no weights of a foundation model are given" in swept.reason
-    mixed = replace(scene, views=(scene.views[0], *without.views[1:]))
+    mixed = without_depth(scene, *range(1, 6))
     chosen = choose_source(mixed, scene.names, "auto", foundation=given)
     assert isinstance(chosen.source, MixedDepth) and chosen.source.files
     # A foundation model needs no second view.

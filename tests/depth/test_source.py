@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scenes_workspace import workspace
-from tiny_scan import write_scan
+from tiny_scan import without_depth, write_scan
 
 from gvtools.cameras import Cameras, rigid_poses
 from gvtools.depth import choice
@@ -151,16 +151,6 @@ def scan(tmp_path) -> Scene:
     return SEVENSCENES.read(write_scan(tmp_path / "scan"))
 
 
-def without_depth(scene: Scene, *rows: int) -> Scene:
-    """The scene with some views' depth taken away."""
-
-    def bare(view: View) -> View:
-        return replace(view, load=lambda: replace(view.load(), depth=None), has_depth=False)
-
-    views = tuple(bare(view) if i in rows else view for i, view in enumerate(scene.views))
-    return replace(scene, views=views)
-
-
 def _with_points(scene: Scene) -> Scene:
     none = np.zeros(0, np.int32)
     points = SparsePoints(
@@ -182,13 +172,13 @@ def test_auto_takes_recorded_depth_and_computes_the_rest(scan, monkeypatch):
         found = chosen.source.depth(partly, view, view.load())
         assert found.source == ("computed" if i in (1, 3) else "recorded")
         assert is_recorded(chosen.source, view) == (i not in (1, 3))
-    bare = without_depth(scan, *range(6))
+    bare = without_depth(scan)
     chosen = choose_source(bare, bare.names, "auto")
     assert chosen.source.name == "computed" and "plane-sweep" in chosen.reason
 
 
 def test_settings_that_a_source_ignores_are_said(scan, tmp_path, capsys):
-    bare = without_depth(scan, *range(6))
+    bare = without_depth(scan)
     given = StereoOptions(window=5, planes=64)
     assert set(choose_source(scan, scan.names, "auto", stereo=given).ignored) == {
         "stereo.window=5",
@@ -233,7 +223,7 @@ def test_patch_match_comes_first_where_there_is_cuda(tmp_path, monkeypatch):
 
 
 def test_what_a_project_cannot_give_is_refused(scan, tmp_path):
-    bare = without_depth(scan, *range(6))
+    bare = without_depth(scan)
     workspace(tmp_path / "colmap")
     colmap = read_colmap(tmp_path / "colmap")
     for scene, count, asked, error, said in (

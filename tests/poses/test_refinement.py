@@ -12,7 +12,7 @@ from splat_scene import photographs, pose_errors, walk
 from gvtools.cameras import concatenate
 from gvtools.poses import bundle_adjustment
 from gvtools.poses.bundle_adjustment import Tracks, adjusted_poses
-from gvtools.poses.motions import move_pose, nearest_pairs
+from gvtools.poses.motions import centers_of, move_pose, nearest_pairs, turn_of
 from gvtools.poses.refinement import FitView, agreeing_poses, refined_poses
 from gvtools.scenes.scene import Frame
 from gvtools.similarity import align_poses
@@ -191,14 +191,19 @@ def tracked(cameras, *, by=0.02):
     return replace(cameras, cam_from_world=np.stack(poses))
 
 
+def left_of_turns(found, given, truth):
+    """What is left of the degrees by which relative poses of neighbours were off."""
+    after, before = (relative_turns(p, truth.cam_from_world) for p in (found, given.cam_from_world))
+    return after / before
+
+
 def relative_turns(poses, truth):
     """Degrees by which relative poses of neighbours are off."""
     apart = [
         poses[i + 1] @ np.linalg.inv(poses[i]) @ truth[i] @ np.linalg.inv(truth[i + 1])
         for i in range(len(poses) - 1)
     ]
-    cosines = [(np.trace(each[:3, :3]) - 1) / 2 for each in apart]
-    return float(np.degrees(np.median(np.arccos(np.clip(cosines, -1, 1)))))
+    return float(np.degrees(np.median([turn_of(each) for each in apart])))
 
 
 def tracks_through(cameras, *, noise=0.3):
@@ -218,12 +223,10 @@ def tracks_through(cameras, *, noise=0.3):
 def test_features_correct_a_trackers_poses(room, found):
     frames, cameras = room
     given = tracked(cameras)
-    before = relative_turns(given.cam_from_world, cameras.cam_from_world)
-    assert relative_turns(found.poses, cameras.cam_from_world) < 0.25 * before
+    assert left_of_turns(found.poses, given, cameras) < 0.25
     assert found.errors[1] < 1 < found.errors[0]
-    scaled = found.scaled(frames, given)
-    baselines = [np.ptp(-np.einsum("vji,vj->vi", p[:, :3, :3], p[:, :3, 3]), axis=0).max()
-                 for p in (scaled, cameras.cam_from_world)]  # fmt: skip
+    both = found.scaled(frames, given), cameras.cam_from_world
+    baselines = [np.ptp(centers_of(poses), axis=0).max() for poses in both]
     assert baselines[0] == pytest.approx(baselines[1], rel=0.03)
 
 
@@ -239,8 +242,7 @@ def test_pictures_may_have_several_sizes(room):
     size = {"width": cameras.width * times, "height": cameras.height * times}
     found = adjusted_poses(mixed, replace(given, K=K, **size))
     assert (np.bincount(found.tracks.view, minlength=VIEWS) >= bundle_adjustment.LEAST_SEEN).all()
-    before = relative_turns(given.cam_from_world, cameras.cam_from_world)
-    assert relative_turns(found.poses, cameras.cam_from_world) < 0.25 * before
+    assert left_of_turns(found.poses, given, cameras) < 0.25
 
 
 def test_exact_poses_stay(room):
@@ -256,8 +258,7 @@ def test_known_tracks_need_no_picture(room, monkeypatch):
     assert tracks.exact(cameras)
     assert not tracks.exact(given)
     found = adjusted_poses(frames, given, tracks=tracks)
-    before = relative_turns(given.cam_from_world, cameras.cam_from_world)
-    assert relative_turns(found.poses, cameras.cam_from_world) < 0.25 * before
+    assert left_of_turns(found.poses, given, cameras) < 0.25
 
 
 def test_some_of_the_tracks_tell_whether_poses_err(room, monkeypatch):

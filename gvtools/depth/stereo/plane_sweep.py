@@ -44,8 +44,9 @@ from gvtools.depth.stereo.matching import (
     textured,
 )
 from gvtools.depth.stereo.matching_cpu import CpuMatcher
-from gvtools.errors import DegenerateError, OptionError
+from gvtools.errors import DegenerateError
 from gvtools.kernels import KernelSet
+from gvtools.networks.compute import named_device
 from gvtools.poses.dense_adjustment import PoseEquations, adjust_cameras, pose_equations
 from gvtools.scenes.scene import Frame, Scene, View
 
@@ -330,11 +331,7 @@ def make_matcher(options: StereoOptions) -> tuple[Matcher, torch.device]:
     """The back end of the options, and where its tensors live."""
     if options.backend == "cpu":
         return CpuMatcher(options), torch.device("cpu")
-    there = torch.cuda.is_available()
-    if options.device == "cuda" and not there:
-        raise OptionError("stereo device 'cuda': torch sees no CUDA device; choose 'auto' or 'cpu'")
-    cuda = options.device == "cuda" or (options.device == "auto" and there)
-    return TorchMatcher(options), torch.device("cuda" if cuda else "cpu")
+    return TorchMatcher(options), named_device(options.device, option="stereo.device")
 
 
 def _halve(pyramid: Pyramid) -> Pyramid:

@@ -15,11 +15,11 @@ import torch
 import torch.utils.dlpack
 from numpy.typing import NDArray
 
-from gvtools.errors import OptionError
 from gvtools.memory.culling import summed_area
 from gvtools.memory.splat.api import SplatRequest, thinning
 from gvtools.memory.splat.cpu import CHANNELS, FAINTEST, SMALLEST
 from gvtools.memory.store.observations import SplatColumns
+from gvtools.networks.compute import named_device
 
 if TYPE_CHECKING:
     from gvtools.memory.splat.api import FrameBuffers, SplatOptions
@@ -29,20 +29,12 @@ if TYPE_CHECKING:
 PAIRS = {"cpu": 1 << 20, "cuda": 1 << 24}
 
 
-def torch_device(name: str) -> torch.device:
-    """The device that "auto", "cpu" or "cuda" means here."""
-    there = torch.cuda.is_available()
-    if name == "cuda" and not there:
-        raise OptionError("splat device 'cuda': torch sees no CUDA device; choose 'auto' or 'cpu'")
-    return torch.device("cuda" if name == "cuda" or (name == "auto" and there) else "cpu")
-
-
 class TorchSplatter:
     """Splats segments of a memory on one device; see splat.api.Splatter."""
 
     def __init__(self, store: Store, options: SplatOptions) -> None:
         self.store, self.options = store, options
-        self.device = torch_device(options.device)
+        self.device = named_device(options.device, option="splat.device")
         if store.in_ram:
             # In the store's own memory where that is on this device.
             columns, shared = store.columns, torch.utils.dlpack.from_dlpack

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -36,16 +38,13 @@ def slanted():
     return plane_scene(slope=(0.25, -0.15))
 
 
-@pytest.fixture(scope="module")
-def stereo(slanted):
-    """All views being sources."""
-    return PlaneSweepStereo(slanted.scene, options=OPTIONS, views=slanted.scene.names)
-
-
-def swept(scene: Scene, name: str = "v2", *, options: StereoOptions = OPTIONS) -> DepthMap:
-    """The depth of one view, all views being sources."""
-    stereo = PlaneSweepStereo(scene, options=options, views=scene.names)
-    return stereo.depth(scene, scene[name], scene[name].load())
+def swept(
+    scene: Scene, name: str = "v2", *, views: Sequence[str] = (), **options: Any
+) -> tuple[DepthMap, PlaneSweepStereo]:
+    """The depth of one view, all views being sources unless some are named."""
+    views = tuple(views) or scene.names
+    stereo = PlaneSweepStereo(scene, options=OPTIONS.replaced(**options), views=views)
+    return stereo.depth(scene, scene[name], scene[name].load()), stereo
 
 
 def error_and_share(found: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
@@ -53,14 +52,21 @@ def error_and_share(found: np.ndarray, truth: np.ndarray) -> tuple[float, float]
     return float(np.median(np.abs(found[known] / truth[known] - 1))), float(known.mean())
 
 
-def test_a_slanted_plane_is_measured(slanted, stereo):
-    found = stereo.depth(slanted.scene, slanted.scene["v2"], slanted.scene["v2"].load())
+def test_a_slanted_plane_is_measured_but_for_masked_pixels(slanted):
+    scene = slanted.scene
+    found, stereo = swept(scene)
     error, share = error_and_share(found.depth, slanted.depths[2])
     assert error < 0.005
     assert share > 0.8
     assert found.source == "plane-sweep"
     assert found.depth.dtype == found.confidence.dtype == np.float32
     assert (found.confidence > 0).all() and (found.confidence <= 1).all()
+    frame = scene["v2"].load()
+    mask = np.ones(frame.rgb.shape[:2], bool)
+    mask[:60] = False
+    found = stereo.depth(scene, scene["v2"], replace(frame, mask=mask))
+    assert (found.depth[:60] == 0).all()
+    assert (found.depth[60:] > 0).mean() > 0.7
 
 
 def test_other_views_are_never_looked_at(slanted):
@@ -70,16 +76,13 @@ def test_other_views_are_never_looked_at(slanted):
     scene = slanted.scene
     held_out = replace(scene.views[3], load=forbidden)
     scene = replace(scene, views=(*scene.views[:3], held_out, scene.views[4]))
-    names = tuple(name for name in scene.names if name != "v3")
-    stereo = PlaneSweepStereo(scene, options=OPTIONS.replaced(align=True), views=names)
-    found = stereo.depth(scene, scene["v2"], scene["v2"].load())
+    found, _ = swept(scene, views=("v0", "v1", "v2", "v4"), align=True)
     assert (found.depth > 0).mean() > 0.5
 
 
 def test_a_view_outside_the_pool_gets_depth_but_gives_none(slanted):
     scene = slanted.scene
-    stereo = PlaneSweepStereo(scene, options=OPTIONS, views=("v0", "v1", "v3", "v4"))
-    found = stereo.depth(scene, scene["v2"], scene["v2"].load())
+    found, stereo = swept(scene, views=("v0", "v1", "v3", "v4"))
     error, share = error_and_share(found.depth, slanted.depths[2])
     assert error < 0.005 and share > 0.8
     assert all("v2" not in stereo.raw(scene[name]).sources for name in stereo.views)
@@ -87,20 +90,10 @@ def test_a_view_outside_the_pool_gets_depth_but_gives_none(slanted):
 
 @pytest.mark.slow
 def test_reduced_pictures_give_depth_at_full_size(slanted):
-    found = swept(slanted.scene, options=OPTIONS.replaced(max_side=96))
+    found, _ = swept(slanted.scene, max_side=96)
     assert found.depth.shape == (120, 160)
     error, share = error_and_share(found.depth, slanted.depths[2])
     assert error < 0.01 and share > 0.7
-
-
-def test_masked_pixels_are_left_out(slanted, stereo):
-    scene = slanted.scene
-    frame = scene["v2"].load()
-    mask = np.ones(frame.rgb.shape[:2], bool)
-    mask[:60] = False
-    found = stereo.depth(scene, scene["v2"], replace(frame, mask=mask))
-    assert (found.depth[:60] == 0).all()
-    assert (found.depth[60:] > 0).mean() > 0.7
 
 
 def test_speckles_go_and_surfaces_stay():
@@ -148,8 +141,7 @@ def test_a_view_that_shares_nothing_is_refused_and_stops_no_other(slanted):
     away[0] = np.diag([-1.0, 1, -1, 1]) @ away[0]
     lost = replace(scene.views[4], camera=replace(scene.views[4].camera, cam_from_world=away))
     scene = replace(scene, views=(*scene.views[:4], lost))
-    stereo = PlaneSweepStereo(scene, options=OPTIONS.replaced(align=True), views=scene.names)
-    found = stereo.depth(scene, scene["v1"], scene["v1"].load())
+    found, stereo = swept(scene, "v1", align=True)
     assert (found.depth > 0).mean() > 0.5
     with pytest.raises(DegenerateError, match="shows what v4 does"):
         stereo.depth(scene, lost, lost.load())
@@ -220,10 +212,7 @@ def test_growth_stops_at_colour_at_depth_and_after_its_steps():
 def test_growth_fills_what_no_view_confirms_and_leaves_blank_surfaces_unknown():
     made = plane_scene(blank=True)
     scene, view = made.scene, made.scene["v2"]
-    options = OPTIONS.replaced(tolerance=0.004)
-    known = {
-        pixels: swept(scene, options=options.replaced(regrow=pixels)).depth for pixels in (0, 20)
-    }
+    known = {n: swept(scene, tolerance=0.004, regrow=n)[0].depth for n in (0, 20)}
     x = view.camera.centers[0, 0] + made.depths[2] * view.camera.rays()[..., 0]
     textured = x < 0.15
     assert (known[20][textured] > 0).mean() > (known[0][textured] > 0).mean()
@@ -238,7 +227,7 @@ def test_growth_fills_what_no_view_confirms_and_leaves_blank_surfaces_unknown():
 )
 def test_shaded_walls_are_not_guessed(shading, noise):
     scene = niche_scene(shading, noise)
-    known = swept(scene, options=StereoOptions(align=False)).depth
+    known = swept(scene, levels=3, speckle=100)[0].depth
     truth, inside = niche_depth(scene["v2"].camera)
     back = ndimage.binary_erosion(inside, iterations=5)
     assert (known[back] > 0).mean() < 0.05
@@ -279,11 +268,9 @@ def test_a_slope_is_no_detail_and_noise_no_texture():
 
 @pytest.mark.parametrize("align", [None, False])
 def test_a_turning_camera_is_refused(align):
-    options = OPTIONS.replaced(align=align)
     for scene in (turning_scene(1e-7), turning_scene(1e-9, at=(4e6, 5e5, 100.0))):
-        stereo = PlaneSweepStereo(scene, options=options, views=scene.names)
         with pytest.raises(DegenerateError, match="two viewpoints"):
-            stereo.depth(scene, scene["v1"], scene["v1"].load())
+            swept(scene, "v1", align=align)
 
 
 def test_a_baseline_is_told_from_the_rounding_of_its_coordinates():
@@ -307,10 +294,9 @@ def test_views_at_one_place_are_no_sources_and_warn_of_nothing():
     scene = plane_scene(count=3).scene
     same = View("again", scene["v1"].camera, scene["v1"].load)
     scene = Scene(scene.root, scene.kind, (*scene.views, same))
-    stereo = PlaneSweepStereo(scene, options=OPTIONS, views=scene.names)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        found = stereo.depth(scene, scene["v1"], scene["v1"].load())
+        found, stereo = swept(scene, "v1")
     assert "again" not in stereo.raw(scene["v1"]).sources
     assert (found.depth > 0).mean() > 0.8
 
@@ -324,7 +310,7 @@ def test_depth_follows_the_scene_units(scale):
         pose[:, :3, 3] *= scale
         views.append(replace(view, camera=replace(view.camera, cam_from_world=pose)))
     scene = replace(made.scene, views=tuple(views))
-    depth = swept(scene, "v1").depth
+    depth = swept(scene, "v1")[0].depth
     known = depth > 0
     assert known.mean() > 0.7
     assert np.median(np.abs(depth[known] / (scale * made.depths[1][known]) - 1)) < 0.005
