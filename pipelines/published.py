@@ -6,7 +6,6 @@ files the first digits of the hash alone are known, of others nothing.
 
 from __future__ import annotations
 
-import hashlib
 import http.client
 import re
 import time
@@ -21,6 +20,7 @@ from urllib.parse import quote
 
 from gvtools.errors import CheckpointError, OptionError, ProjectError
 from gvtools.files import check_space, flush_file, make_folder
+from gvtools.scenes.shards import sha256_of
 
 HUB = "https://huggingface.co/{repo}/resolve/{revision}/{path}"
 GIT = "https://raw.githubusercontent.com/{repo}/{revision}/{path}"
@@ -177,15 +177,6 @@ NEXT = {
         "gvtools weights empty-prompt DIR GLD/video",
     ),
 }
-
-
-def sha256_of(path: Path) -> str:
-    """Of a file, in hexadecimal digits."""
-    sums = hashlib.sha256()
-    with path.open("rb") as file:
-        while chunk := file.read(_CHUNK):
-            sums.update(chunk)
-    return sums.hexdigest()
 
 
 def fetch(

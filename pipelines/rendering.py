@@ -42,6 +42,7 @@ from gvtools.trajectories import PATHS, named_path
 from pipelines.options import check_ending
 from pipelines.reconstruction.rounds import CachedProjection, Clock, complete_targets
 from pipelines.reconstruction.settings import RunSettings
+from pipelines.scoring.measurement import evenly
 from pipelines.spherical_metadata import mark_mp4, write_panorama
 from viz.viewer.render import picture_of
 
@@ -367,7 +368,7 @@ class FilmRenderer:
         with np.errstate(divide="ignore"):
             share = (1 / guidance.depth[0] - 1 / far) / (1 / near - 1 / far)
         colors = colormaps["turbo"](np.clip(np.nan_to_num(share), 0, 1))[..., :3]
-        picture = np.rint(255 * colors).astype(np.uint8)
+        picture = to_bytes(colors)
         picture[~guidance.valid[0]] = 255
         return picture
 
@@ -395,10 +396,8 @@ class FilmRenderer:
 
     def _spread_cameras(self, most: int) -> list[Cameras]:
         """At most so many of the cameras, evenly along the path; of a rig twice so many faces."""
-        count = len(self.cameras)
         most = most if self.rig is None else max(1, 2 * most // len(self.rig.faces))
-        rows = np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(int))
-        spread = self.cameras[rows.tolist()]
+        spread = self.cameras[evenly(len(self.cameras), most)]
         return list(spread) if self.rig is None else self.rig.faces_of(spread)
 
 

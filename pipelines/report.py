@@ -22,7 +22,7 @@ from gvtools.files import replaced_when_written, write_text
 from gvtools.runs.context_depth import off_scale
 from gvtools.runs.layout import COMPLETION, GUIDANCE, METRICS, VALID, round_folder
 from gvtools.runs.run import Run, load_run
-from gvtools.runs.target_files import SUPPORT_SCANNED, entry_camera, read_picture
+from gvtools.runs.target_files import entry_camera, read_picture
 from gvtools.settings import dotted
 from gvtools.untrusted import read_json
 from gvtools.view_selection import evenly_spread, nearest_views
@@ -30,7 +30,7 @@ from pipelines.reconstruction.plan import scan_line
 from pipelines.reconstruction.settings import RunSettings
 from viz.plots.trajectories import Trajectories
 from viz.report.page import Measures, ReportedPoses, RunReport, SheetRow, Sheets, report_html
-from viz.report.pictures import TargetPictures, contact_row
+from viz.report.pictures import Thumbnail, contact_row
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -338,11 +338,8 @@ def _estimated_poses(probe: Mapping[str, Any] | None) -> dict[str, Any]:
 
 
 def _inverted(poses: Sequence[Any]) -> NDArray[np.float64]:
-    out = np.full((len(poses), 4, 4), np.nan)
-    for row, pose in enumerate(poses):
-        if pose is not None:
-            out[row] = np.linalg.inv(np.array(pose, np.float64))
-    return out
+    known = [np.full((4, 4), np.nan) if pose is None else pose for pose in poses]
+    return np.asarray(np.linalg.inv(np.reshape(known, (-1, 4, 4))), np.float64)
 
 
 def _errors(probe: Mapping[str, Any] | None) -> list[tuple[str, float | None, float | None]]:
@@ -405,8 +402,8 @@ def contact_sheets(
         if psnr.get(name) is not None:
             heading += f", PSNR {psnr[name]:.2f} dB"
         try:
-            pictures = _pictures(path, number, entry, truth=truths.get(name), given=given)
-            return SheetRow(heading, contact_row(pictures))
+            tiles = _pictures(path, number, entry, truth=truths.get(name), given=given)
+            return SheetRow(heading, tiles)
         except (GvError, OSError, ValueError) as error:
             return f"pictures of {name} (round {number}) cannot be shown: {error}"
 
@@ -438,28 +435,17 @@ def _pictures(
     *,
     truth: View | None,
     given: Scene | None,
-) -> TargetPictures:
-    folder = round_folder(path, number)
-    hint, support, completion = (
-        read_picture(folder, kind, entry["stem"]) for kind in (GUIDANCE, VALID, COMPLETION)
-    )
-    scanned = support == SUPPORT_SCANNED
-    frame = None if truth is None else truth.load()
-    nearest = None
+) -> list[Thumbnail]:
+    folder, context = round_folder(path, number), None
     if given is not None:
         (place,) = nearest_views(given.cameras, entry_camera(entry), 1)
-        nearest = given.views[place]
-    return TargetPictures(
-        name=str(entry["name"]),
-        hint=hint,
-        observed=support >= SUPPORT_SCANNED,
-        scanned=scanned if scanned.any() else None,
-        supported=support > 0,
-        completion=completion,
-        truth=None if frame is None else frame.rgb,
-        mask=None if frame is None else frame.mask,
-        context=None if nearest is None else nearest.load().rgb,
-        context_name="" if nearest is None else nearest.name,
+        context = given.views[place]
+    kinds = {"hint": GUIDANCE, "support": VALID, "completion": COMPLETION}
+    return contact_row(
+        str(entry["name"]),
+        **{name: read_picture(folder, kind, entry["stem"]) for name, kind in kinds.items()},
+        truth=None if truth is None else truth.load(),
+        context=context,
     )
 
 

@@ -68,19 +68,10 @@ class ViewCommand(Arguments):
             self.refuse(("open3d", "screenshot"), why)
             serving.open_recording(self.folder, host=self.host, port=self.port)
             return
-        source, mode = ViewSource(self.folder, project=self.project), self.color
+        source = ViewSource(self.folder, project=self.project)
         if self.live or not (self.open3d or self.screenshot):
             try:
-                serving.serve(
-                    source,
-                    host=self.host,
-                    port=self.port,
-                    max_points=self.max_points,
-                    round=self.round,
-                    mode=mode,
-                    live=self.live,
-                    console=console,
-                )
+                serving.serve(source, self, console)
             except KeyboardInterrupt:
                 console.line("viewer ended")
             return
@@ -91,12 +82,13 @@ class ViewCommand(Arguments):
             from viz.viewer.render import chosen_camera, write_screenshot
 
             camera = chosen_camera(shown, self.camera)
-            write_screenshot(self.screenshot, shown, camera, round=number, mode=mode)
+            write_screenshot(self.screenshot, shown, camera, round=number, mode=self.color)
             console.line(f"{self.screenshot}: round {number} from {camera.name}")
         else:
             from viz.viewer.window import Open3dViewer
 
-            Open3dViewer(shown, round=number, mode=mode, say=console.line).run_until_closed()
+            viewer = Open3dViewer(shown, round=number, mode=self.color, say=console.line)
+            viewer.run_until_closed()
 
 
 class ReportCommand(Arguments):
@@ -157,7 +149,6 @@ class PlotCommand(Arguments):
     """Ends with .png, .svg or .pdf. [FILE]"""
 
     def run(self, console: Console) -> None:
-
         ending = check_ending(self.out, FORMATS)
         figure = _figure(self.what, self.folder)
         with replaced_when_written(self.out) as temporary:

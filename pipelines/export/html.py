@@ -18,6 +18,7 @@ from gvtools.files import write_text
 from gvtools.splats import SH, Splats
 from pipelines.export.formats import ExportOptions
 from pipelines.export.source import ExportSource
+from pipelines.scoring.measurement import evenly
 from viz.page.page import PageCamera, PageGroup, SharedPage, pack_gaussians, page_html
 from viz.report.pictures import thumbnail
 from viz.viewer.run_view import RunView, cameras_of
@@ -98,8 +99,7 @@ def _groups(splats: Splats) -> Iterator[PageGroup]:
 def _cameras(source: ExportSource) -> Iterator[PageCamera]:
     """Cameras of the photographs, with their pictures where they can be read."""
     views = [view.camera for view in source.memory.views.photographed if view.camera.width[0] > 1]
-    chosen = np.unique(np.linspace(0, len(views) - 1, min(len(views), MOST_PICTURES)).round())
-    for camera in (views[int(row)] for row in chosen):
+    for camera in (views[row] for row in evenly(len(views), MOST_PICTURES)):
         name, picture = camera.names[0], None
         if name in source.project:
             with suppress(GvError):

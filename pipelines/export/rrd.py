@@ -7,7 +7,7 @@ where float32 would be too coarse in the world frame; the recording's name says 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -34,14 +34,8 @@ TIMELINE = "round"
 ROUNDING = 0.1
 
 
-@dataclass(frozen=True, eq=False)
-class RecordedCamera:
-    """A camera with its picture."""
-
-    round: int  # that it came with
-    kind: str  # ``context`` or ``generated``
-    camera: Cameras  # a batch of one, world frame
-    picture: NDArray[np.uint8] | None  # (H, W, 3); None where there is none
+# The round that a camera came with, its kind, the camera, and its picture where there is one.
+Shot = tuple[int, str, Cameras, NDArray[np.uint8] | None]
 
 
 def write_rrd(source: ExportSource, path: Path, options: ExportOptions) -> str:
@@ -115,23 +109,17 @@ def _log_fit(
 
 
 def _log(
-    recording: rerun.RecordingStream,
-    shot: RecordedCamera,
-    *,
-    origin: NDArray[np.float64],
-    distance: float,
+    recording: rerun.RecordingStream, shot: Shot, *, origin: NDArray[np.float64], distance: float
 ) -> None:
-    camera, picture = shot.camera, shot.picture
+    number, kind, camera, picture = shot
     if picture is not None:
         image = Image.fromarray(picture)
         image.thumbnail((SIDE, SIDE))
         picture = np.asarray(image)
         camera = camera.resized(picture.shape[1], picture.shape[0])
     pose = camera.world_from_cam[0]
-    entity = rerun.new_entity_path(
-        ["cameras", shot.kind, f"round_{shot.round:03d}", camera.names[0]]
-    )
-    recording.set_time(TIMELINE, sequence=shot.round)
+    entity = rerun.new_entity_path(["cameras", kind, f"round_{number:03d}", camera.names[0]])
+    recording.set_time(TIMELINE, sequence=number)
     recording.log(
         entity,
         rerun.Transform3D(translation=pose[:3, 3] - origin, mat3x3=pose[:3, :3]),
@@ -146,7 +134,7 @@ def _log(
         recording.log(entity, rerun.Image(picture).compress(jpeg_quality=QUALITY))
 
 
-def _shots(source: ExportSource) -> Iterator[RecordedCamera]:
+def _shots(source: ExportSource) -> Iterator[Shot]:
     """Cameras of the memory's views and the run's targets, with pictures where they are there."""
     run = load_run(source.path) if (source.path / RECORD).is_file() else None
     for view in source.memory.views:
@@ -155,10 +143,10 @@ def _shots(source: ExportSource) -> Iterator[RecordedCamera]:
             continue
         if view.generated:
             if run is None:
-                yield RecordedCamera(view.round, "generated", view.camera, None)
+                yield view.round, "generated", view.camera, None
             continue
         picture = source.project[name].load().rgb if name in source.project else None
-        yield RecordedCamera(view.round, "context", view.camera, picture)
+        yield view.round, "context", view.camera, picture
     for target in run.views if run else ():
         if source.up_to is None or target.round <= source.up_to:
-            yield RecordedCamera(target.round, "generated", target.camera, target.read().picture)
+            yield target.round, "generated", target.camera, target.read().picture

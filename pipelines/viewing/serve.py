@@ -11,12 +11,15 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO
+from typing import IO, TYPE_CHECKING
 
 from gvtools.errors import GvError, OptionError, ProjectError
 from pipelines.console import Console
 from pipelines.viewing.source import ViewSource
 from viz.viewer.run_view import RunView
+
+if TYPE_CHECKING:
+    from pipelines.commands.view import ViewCommand
 
 POLL_SECONDS = 1.0
 RECORDING = ".rrd"
@@ -27,41 +30,32 @@ CHILD = (
 )
 
 
-def serve(
-    source: ViewSource,
-    *,
-    host: str,
-    port: int,
-    max_points: int,
-    round: int | None,
-    mode: str,
-    live: bool,
-    console: Console,
-) -> None:
-    """Serve a run's web page until an interrupt; arguments are those of ``gvtools view``.
+def serve(source: ViewSource, args: ViewCommand, console: Console) -> None:
+    """Serve a run's web page until an interrupt.
 
-    ``live``: wait for the first round, and show new ones as they come.
+    ``--live``: wait for the first round, and show new ones as they come.
     """
     from viz.viewer.web import WebViewer, is_loopback
 
-    if live and not source.rounds():
+    if args.live and not source.rounds():
         console.line(f"{source.path}: waiting for its first round")
         while not source.rounds():
             time.sleep(POLL_SECONDS)
-    shown, number = read_round(source, round)
-    viewer = WebViewer(shown, host=host, port=port, budget=max_points, round=number, mode=mode)
+    shown, number = read_round(source, args.round)
+    viewer = WebViewer(
+        shown, host=args.host, port=args.port, budget=args.max_points, round=number, mode=args.color
+    )
     try:
         console.line(f"{source.path}: look at {viewer.url} (Ctrl-C ends)")
-        if not is_loopback(host):
-            console.warn(f"--host {host}: whoever reaches this machine can see the run")
-        lacking = source.lacking()
-        if lacking:
+        if not is_loopback(args.host):
+            console.warn(f"--host {args.host}: whoever reaches this machine can see the run")
+        if lacking := source.lacking():
             console.line(lacking)
             viewer.set_note(lacking)
         following = Following(source, shown, viewer.update, console=console)
         while True:
             time.sleep(POLL_SECONDS)
-            if live:
+            if args.live:
                 following.look()
     finally:
         viewer.stop()

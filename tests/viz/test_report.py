@@ -10,6 +10,8 @@ from contextlib import nullcontext
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,6 +23,7 @@ from PIL import Image
 
 from gvtools.appearance.fit_options import FitOptions
 from gvtools.scenes.project import open_project
+from gvtools.scenes.scene import Frame
 from pipelines.cli import main
 from pipelines.reconstruction.prepare import make_plan
 from pipelines.reconstruction.settings import RunSettings
@@ -28,7 +31,7 @@ from pipelines.report import chosen_targets, collect, write_report
 from viz.plots.canvas import SKY, rgb_of
 from viz.report import pictures as sheets
 from viz.report.page import SheetRow, Sheets, report_html
-from viz.report.pictures import TargetPictures, contact_row
+from viz.report.pictures import contact_row
 
 LABELS = ["context", "hint", "validity", "completion", "truth", "error"]
 
@@ -229,11 +232,11 @@ def test_what_is_no_run_is_refused(own, tmp_path, capsys):
 def test_no_text_of_a_users_files_becomes_markup(own, tmp_path):
     evil = "<img src=x onerror=\"alert(1)\"><script>alert('2')</script>&amp;"
     report = collect(own)
-    black = np.zeros((4, 6, 3), np.uint8)
-    none = np.zeros((4, 6), bool)
+    black = Frame(np.zeros((4, 6, 3), np.uint8))
+    context: Any = SimpleNamespace(name=evil, load=lambda: black)
     tiles = contact_row(
-        TargetPictures(evil, black, none, none, black, truth=black, context=black,
-                       context_name=evil)
+        evil, hint=black.rgb, support=black.rgb[..., 0], completion=black.rgb, truth=black,
+        context=context,
     )  # fmt: skip
     views = [{**view, "name": evil} for view in report.measures.views]
     report = replace(
@@ -315,15 +318,6 @@ def opened(tile: sheets.Thumbnail) -> Image.Image:
     return image.convert("RGB")
 
 
-def pictures(height: int = 300, width: int = 400, **more) -> sheets.TargetPictures:
-    x = np.linspace(0, 255, width)
-    rgb = np.broadcast_to(x[None, :, None], (height, width, 3)).astype(np.uint8)
-    left = np.broadcast_to(np.arange(width) < width // 2, (height, width))
-    return sheets.TargetPictures(
-        "view", hint=rgb, observed=left, supported=left, completion=rgb, **more
-    )  # fmt: skip
-
-
 def test_the_error_map_is_the_mean_absolute_difference():
     picture = RNG.integers(0, 256, (20, 30, 3)).astype(np.uint8)
     truth = RNG.integers(0, 256, (20, 30, 3)).astype(np.uint8)
@@ -344,26 +338,25 @@ def test_what_the_mask_leaves_out_is_grey():
 
 
 def test_observed_generated_and_holes_have_a_colour_each():
-    observed = np.array([[True, True, False, False]])
-    supported = np.array([[True, True, True, False]])
-    scanned = np.array([[False, True, False, False]])
-    shown = sheets.support_map(observed, supported, scanned)[0]
+    shown = sheets.support_map(np.array([[255, 192, 128, 0]], np.uint8))[0]
     assert ["#" + bytes(pixel.tolist()).hex() for pixel in shown] == [
         color.lower() for color in sheets.SUPPORT.values()
     ]
 
 
 def test_the_tiles_stand_in_order_and_hold_the_pictures():
-    white = np.full((30, 20, 3), 255, np.uint8)
-    truth = pictures().completion
-    tiles = sheets.contact_row(pictures(truth=truth, context=white, context_name="given"), side=200)
-    assert [tile.label for tile in tiles] == [
-        "context", "hint", "validity", "completion", "truth", "error"
-    ]  # fmt: skip
+    white = Frame(np.full((30, 20, 3), 255, np.uint8))
+    context: Any = SimpleNamespace(name="given", load=lambda: white)
+    ramp = np.tile(np.linspace(0, 255, 640)[None, :, None], (480, 1, 3)).astype(np.uint8)
+    left = np.tile(np.where(np.arange(640) < 320, 255, 0).astype(np.uint8), (480, 1))
+    tiles = contact_row(
+        "view", hint=ramp, support=left, completion=ramp, truth=Frame(ramp), context=context
+    )
+    assert [tile.label for tile in tiles] == LABELS
     shown = {tile.label: np.asarray(opened(tile)) for tile in tiles}
     assert shown["context"].shape == (30, 20, 3)
-    assert shown["hint"].shape == (150, 200, 3)
-    assert np.diff(shown["completion"][75, :, 0].astype(int)).mean() == pytest.approx(1.28, abs=0.1)
+    assert shown["hint"].shape == (240, 320, 3)
+    assert np.diff(shown["completion"][75, :, 0].astype(int)).mean() == pytest.approx(0.8, abs=0.1)
     assert shown["error"].max() < 20
     left, right = shown["validity"][0, 0], shown["validity"][0, -1]
     assert "#" + bytes(left.tolist()).hex() == sheets.SUPPORT["observed"].lower()

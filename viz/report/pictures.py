@@ -17,10 +17,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gvtools.runs.target_files import SUPPORT_SCANNED
 from viz.plots.canvas import BLUE, GREEN, ORANGE, SKY, rgb_of
 
 if TYPE_CHECKING:
     from PIL.Image import Image
+
+    from gvtools.scenes.scene import Frame, View
 
 # Longer side of a thumbnail, pixels: twice what a phone shows of it, for its dense screen.
 SIDE = 320
@@ -53,22 +56,6 @@ class Thumbnail:
 
 
 @dataclass(frozen=True, eq=False)
-class TargetPictures:
-    """The pictures of a target's row; (H, W, 3) or (H, W), all of one size but the context."""
-
-    name: str
-    hint: Rgb  # the memory's projection that the completer was given
-    observed: Mask  # of the hint what stands on observations, a scan's included
-    supported: Mask  # what the memory supports at all
-    completion: Rgb
-    truth: Rgb | None = None
-    mask: Mask | None = None  # where the truth counts; None is everywhere
-    context: Rgb | None = None  # the given view nearest to the target
-    context_name: str = ""
-    scanned: Mask | None = None  # of the observed what is a scan's alone; None: nothing is
-
-
-@dataclass(frozen=True, eq=False)
 class JudgedView:
     """One view (H, W) with the pictures that methods made of it."""
 
@@ -79,41 +66,42 @@ class JudgedView:
     pictures: Mapping[str, Rgb | None]  # by method; None where it has none of this view
 
 
-def contact_row(pictures: TargetPictures, *, side: int = SIDE) -> list[Thumbnail]:
-    """Context, hint, validity, completion, truth and error map, as far as there are pictures.
-
-    ``side`` is of a thumbnail's longer edge, pixels; smaller pictures keep their size.
-    """
-    name, scanned = pictures.name, pictures.scanned
+def contact_row(
+    name: str,
+    *,
+    hint: Rgb,  # the memory's projection that the completer was given
+    support: NDArray[np.uint8],  # (H, W) what the hint stands on, as ``valid_NAME.png`` has it
+    completion: Rgb,
+    truth: Frame | None = None,
+    context: View | None = None,  # the given view nearest to the target
+) -> list[Thumbnail]:
+    """Context, hint, validity, completion, truth and error map, as far as there are pictures."""
     tiles = []
 
     def add(label: str, alt: str, picture: Rgb, *, flat: bool = False) -> None:
-        tiles.append(Thumbnail(label, alt, *_encoded(picture, side, flat=flat)))
+        tiles.append(Thumbnail(label, alt, *_encoded(picture, SIDE, flat=flat)))
 
-    if pictures.context is not None:
-        text = f"context view {pictures.context_name}, the nearest to {name}"
-        add("context", text, pictures.context)
-    add("hint", f"the memory projected into {name}", pictures.hint)
-    of_scan = "" if scanned is None else f"{scanned.mean():.0%} of it scanned, "
+    if context is not None:
+        add("context", f"context view {context.name}, the nearest to {name}", context.load().rgb)
+    add("hint", f"the memory projected into {name}", hint)
+    observed, scanned = support >= SUPPORT_SCANNED, support == SUPPORT_SCANNED
+    of_scan = f"{scanned.mean():.0%} of it scanned, " if scanned.any() else ""
     text = (
-        f"validity of {name}: {pictures.observed.mean():.0%} observed, {of_scan}"
-        f"{(pictures.supported & ~pictures.observed).mean():.0%} generated before"
+        f"validity of {name}: {observed.mean():.0%} observed, {of_scan}"
+        f"{((support > 0) & ~observed).mean():.0%} generated before"
     )
-    validity = support_map(pictures.observed, pictures.supported, scanned)
-    add("validity", text, validity, flat=True)
-    add("completion", f"completed picture of {name}", pictures.completion)
-    if pictures.truth is not None:
-        add("truth", f"photograph {name}", pictures.truth)
-        error = error_map(pictures.completion, pictures.truth, mask=pictures.mask)
-        add("error", f"error map of {name}", error)
+    add("validity", text, support_map(support), flat=True)
+    add("completion", f"completed picture of {name}", completion)
+    if truth is not None:
+        add("truth", f"photograph {name}", truth.rgb)
+        add("error", f"error map of {name}", error_map(completion, truth.rgb, mask=truth.mask))
     return tiles
 
 
-def support_map(observed: Mask, supported: Mask, scanned: Mask | None = None) -> Rgb:
-    """(H, W, 3): the colours of SUPPORT, of masks as TargetPictures has them."""
-    which = np.where(observed, 0, np.where(supported, 2, 3))
-    if scanned is not None:
-        which[scanned] = 1
+def support_map(support: NDArray[np.uint8]) -> Rgb:
+    """(H, W, 3): the colours of SUPPORT, of a ``valid_NAME.png`` (H, W)."""
+    kinds = [support > SUPPORT_SCANNED, support == SUPPORT_SCANNED, support > 0]
+    which = np.select(kinds, range(3), 3)
     return np.array([rgb_of(color) for color in SUPPORT.values()], np.uint8)[which]
 
 
