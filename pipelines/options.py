@@ -13,6 +13,7 @@ from typing import get_origin as origin_of
 from pydantic import ConfigDict
 
 from gvtools.errors import GvError, OptionError
+from gvtools.files import write_json
 from gvtools.settings import Settings
 from gvtools.settings.base import Entry, entries
 from gvtools.settings.documentation import accepts, text_of
@@ -116,6 +117,19 @@ class Arguments(Settings):
         for name in names:
             if name in self.model_fields_set:
                 raise OptionError(f"{self.key(name)}: {why}; leave it out")
+
+
+class JsonArguments(Arguments):
+    """Where figures are written."""
+
+    json_: Path | None = None
+    """Write the figures there, too. [FILE]"""
+
+    def write_json(self, figures: Mapping[str, Any]) -> bool:
+        """Write figures where ``--json`` wants them; whether it does."""
+        if self.json_ is not None:
+            write_json(self.json_, figures)
+        return self.json_ is not None
 
 
 def check_ending(path: Path, endings: Iterable[str], *, option: str = "--out") -> str:

@@ -8,11 +8,10 @@ lies beside the weights: the settings of each stage (``training_STAGE.json``) an
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from math import prod
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import skimage
@@ -52,10 +51,6 @@ from gvtools.training.run import SETTINGS, WEIGHTS
 from gvtools.untrusted import open_picture, read_json, reading
 from pipelines.published import MODELS
 
-if TYPE_CHECKING:
-    from pipelines.console import Console
-
-
 _FLOAT32 = 4
 
 
@@ -84,27 +79,24 @@ STEPS = {
 }
 
 
-def print_depth(console: Console) -> None:
+def depth_lines() -> Iterator[str]:
     """The models that give depth alone."""
-    console.line(
-        "depth of photographs, by one of the models of depth-anything (approximate sizes):"
-    )
+    yield "depth of photographs, by one of the models of depth-anything (approximate sizes):"
     for name, released in RELEASED.items():
         with shapes_alone():
             network = DepthAnything3(released.config)
         twice = {name for names in tied_norms("head.") for name in names[1:]}
         numbers = sum(p.numel() for name, p in network.named_parameters() if name not in twice)
         figures = [size_text(_FLOAT32 * numbers), f"{numbers:,} numbers", released.licence]
-        console.line(f"  {name}, model.safetensors: {', '.join(figures)}")
-    _print_steps("depth", console)
+        yield f"  {name}, model.safetensors: {', '.join(figures)}"
+    yield from _steps("depth")
 
 
-def _print_steps(name: str, console: Console) -> None:
-    for number, step in enumerate(STEPS.get(name, ()), 1):
-        console.line(f"  step {number}: {step}")
+def _steps(name: str) -> Iterator[str]:
+    yield from (f"  step {number}: {step}" for number, step in enumerate(STEPS.get(name, ()), 1))
 
 
-def print_needed(config: GeoVerseConfig, console: Console) -> None:
+def needed_lines(config: GeoVerseConfig) -> Iterator[str]:
     """The files of a configuration, published ones and one's own.
 
     Sizes are approximate: of our own lists of names and shapes, without headers.
@@ -113,17 +105,17 @@ def print_needed(config: GeoVerseConfig, console: Console) -> None:
     published = {part: expected_of(model, part) for part in parts_of(config)}
     known = _published_shapes()
     if all(shapes == known[part.name] for part, shapes in published.items()):
-        console.line(f"{config.name}, from published files (sizes are approximate):")
+        yield f"{config.name}, from published files (sizes are approximate):"
         for part, shapes in published.items():
-            _print_part(part, shapes, console)
-        console.line(f"{config.name}, in a folder of one's own, instead of the published files:")
+            yield from _part(part, shapes)
+        yield f"{config.name}, in a folder of one's own, instead of the published files:"
     else:
-        console.line(f"{config.name}: nothing of its size is published; a folder of one's own:")
-    _print_part(WHOLE, expected_of(model, WHOLE), console)
+        yield f"{config.name}: nothing of its size is published; a folder of one's own:"
+    yield from _part(WHOLE, expected_of(model, WHOLE))
     if config.video is not None:
-        console.line(f"{config.name}, beside either of the two:")
-        _print_video(config.video, console)
-    _print_steps(config.name, console)
+        yield f"{config.name}, beside either of the two:"
+        yield from _video(config.video)
+    yield from _steps(config.name)
 
 
 @lru_cache(maxsize=1)
@@ -134,7 +126,7 @@ def _published_shapes() -> dict[str, Shapes]:
     return {part.name: expected_of(model, part) for part in parts_of(base)}
 
 
-def _print_part(part: Part, expected: Shapes, console: Console) -> None:
+def _part(part: Part, expected: Shapes) -> Iterator[str]:
     twice = {name for names in part.tied for name in names[1:]}
     stored = {name: shape for name, shape in expected.items() if name not in twice}
     numbers = sum(prod(shape) for shape in stored.values())
@@ -144,10 +136,10 @@ def _print_part(part: Part, expected: Shapes, console: Console) -> None:
     note = part.note
     if part is WHOLE:
         note = f"every tensor, beside {CONFIG_FILE}; half as large in float16 or bfloat16"
-    _print_file(part.files[0], figures, (note, f"from {part.source}"), console=console)
+    return _file(part.files[0], figures, note, f"from {part.source}")
 
 
-def _print_video(config: VideoPriorConfig, console: Console) -> None:
+def _video(config: VideoPriorConfig) -> Iterator[str]:
     default = VideoPriorConfig()
     figures, source = [], "a Wan VACE model of the configuration's width"
     if (config.taps, config.channels) == (default.taps, default.channels):
@@ -158,27 +150,16 @@ def _print_video(config: VideoPriorConfig, console: Console) -> None:
         "the video prior, made by gvtools weights truncate-wan and empty-prompt; needs diffusers "
         "(pip install 'gvtools[wan]')"
     )
-    _print_file(f"{VIDEO_FOLDER}/", figures, (note, f"from {source}"), console=console)
+    return _file(f"{VIDEO_FOLDER}/", figures, note, f"from {source}")
 
 
-def _print_file(
-    path: str, figures: Sequence[str], notes: Sequence[str], *, console: Console
-) -> None:
-    console.line(f"  {path}")
-    for line in (", ".join(filter(None, figures)), *notes):
-        console.line(f"      {line}")
+def _file(path: str, figures: Sequence[str], *notes: str) -> Iterator[str]:
+    yield f"  {path}"
+    yield from (f"      {line}" for line in (", ".join(filter(None, figures)), *notes))
 
 
-def print_parts(
-    folder: Path,
-    config: GeoVerseConfig,
-    parts: Sequence[PartReport],
-    *,
-    checked: str = "",
-    console: Console,
-) -> None:
-    """A line a part, that of the self-check, and whether the folder can be loaded."""
-    console.line(f"{folder}, configuration {config.name}")
+def part_lines(folder: Path, parts: Sequence[PartReport]) -> Iterator[str]:
+    """A line of each part that a folder has or lacks."""
     width = max(len(part.name) for part in parts)
     for part in parts:
         mark = "does not fit" if not part.ok else "ok" if part.path else "absent"
@@ -186,10 +167,7 @@ def print_parts(
         size = f", {size_text(part.bytes)}" if part.bytes else ""
         where = f" ({part.path.relative_to(folder)}{size})" if part.path else ""
         summary = part.summary.removeprefix("absent: ").removeprefix("absent, and not needed: ")
-        console.line(f"  {part.name.ljust(width)}  {mark}{where}: {summary}")
-    if checked:
-        console.line(checked)
-    console.line(f"ok: {'true' if all(part.ok for part in parts) else 'false'}")
+        yield f"  {part.name.ljust(width)}  {mark}{where}: {summary}"
 
 
 # What GLD states of a photograph that is encoded and decoded, dB, and what is too little.

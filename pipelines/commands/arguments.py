@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import BeforeValidator, Field
 
 from gvtools.errors import CheckpointError, OptionError
-from pipelines.options import Arguments
+from pipelines.options import Arguments, JsonArguments
 
 if TYPE_CHECKING:
     from gvtools.cameras import Cameras
@@ -151,11 +151,9 @@ class LpipsArguments(Arguments):
             return None, str(error)
 
 
-class MeasurementArguments(LpipsArguments):
+class MeasurementArguments(LpipsArguments, JsonArguments):
     """What is measured of pictures, and how."""
 
-    json_: Path | None = None
-    """Write the figures there too. [FILE]"""
     parts: str = "images,consistency,poses"
     """What to measure. [NAMES]"""
     no_control: bool = False

@@ -6,16 +6,15 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
+import os
 from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field
 
 from gvtools.errors import OptionError
-from gvtools.files import write_json
 from pipelines.bench.options import CompleteOptions
 from pipelines.machine import load_average
-from pipelines.options import Arguments, add_settings
+from pipelines.options import JsonArguments, add_settings
 
 if TYPE_CHECKING:
     from pipelines.bench.side_by_side import Comparison
@@ -27,7 +26,7 @@ POINTS = {"fuse": 3_200_000, "splat": 4_000_000}
 COMPLETE = {name: name for name in CompleteOptions.model_fields if name != "repeat"}
 
 
-class BenchCommand(Arguments):
+class BenchCommand(JsonArguments):
     """Time fusing or projecting against Open3D, as ratios; or the generative core, by stage."""
 
     examples = (
@@ -49,8 +48,6 @@ class BenchCommand(Arguments):
     projection (4 million; a quarter of them is timed as well). [N]"""
     repeat: int = Field(9, ge=1)
     """Timed turns of each. [N]"""
-    json_: Path | None = None
-    """Write the figures there. [FILE]"""
 
     @classmethod
     def add(cls, parser: argparse.ArgumentParser) -> None:
@@ -75,45 +72,33 @@ class BenchCommand(Arguments):
 
         measure = fuse_rows if self.what == "fuse" else splat_rows
         rows = measure(points, repeat=self.repeat)
-        report(rows, console, self.json_, bench=self.what, points=points, load=load_average())
+        report(self, rows, console, bench=self.what, points=points, load=load_average())
 
 
 def _run_complete(args: BenchCommand, given: dict[str, Any], console: Console) -> None:
-    from pipelines.bench.complete import complete_figures, show
+    from pipelines.bench import complete, memory, prediction
 
     chosen = CompleteOptions(repeat=args.repeat, **given)
+    measure, show = complete.complete_figures, complete.show
     if chosen.memory:
-        from pipelines.bench.memory import memory_figures, show_memory
-
-        figures = memory_figures(chosen)
-        rows = len(figures["inference"]) + len(figures["training"])
-        tables = show_memory
+        measure, show = memory.memory_figures, memory.show_memory
     elif chosen.predict:
-        from pipelines.bench.prediction import prediction_figures, show_prediction
-
-        figures = prediction_figures(chosen)
-        rows, tables = len(figures["results"]), show_prediction
-    else:
-        figures = complete_figures(chosen)
-        rows, tables = len(figures["results"]), show
-    if args.json_ is None:
-        tables(figures, console)
+        measure, show = prediction.prediction_figures, prediction.show_prediction
+    figures = measure(chosen)
+    if not args.write_json(figures):
+        show(figures, console)
         return
-
-    write_json(args.json_, figures)
+    rows = sum(len(figures.get(part, ())) for part in ("results", "inference", "training"))
     console.line(f"{rows} rows written to {args.json_}")
 
 
 def report(
-    rows: list[Comparison], console: Console, path: Path | None, **conditions: object
+    args: JsonArguments, rows: list[Comparison], console: Console, **conditions: object
 ) -> None:
     """A table, or the JSON object with the rows under ``results``."""
     results = [row.to_dict() for row in rows]
-    if path is not None:
-        import os
-
-        write_json(path, {**conditions, "cpus": os.cpu_count(), "results": results})
-        console.line(f"{len(rows)} comparisons written to {path}")
+    if args.write_json({**conditions, "cpus": os.cpu_count(), "results": results}):
+        console.line(f"{len(rows)} comparisons written to {args.json_}")
         return
     columns = ("name", "peer", "ours_s", "peer_s", "ratio", "ratio_of_minima")
     console.table(("what", *columns[1:]), [[row[key] for key in columns] for row in results])

@@ -116,6 +116,7 @@ def capture(
             f"{source}: has poses already; expected a recording without; give it to gvtools "
             "reconstruct as it is"
         )
+    told: dict[str, Any] = {"say": console.line, "draw": partial(_draw, title=out.name)}
     if rgbd:
         from gvtools.capture.rgbd_project import capture_rgbd
 
@@ -124,11 +125,8 @@ def capture(
                 f"--{name}: of photographs and videos; {source} is an RGB-D recording, of which "
                 "all frames are taken and depth tells the metres"
             )
-        recording = capture_rgbd(
-            source, out, options=projects.rgbd_options(reading), say=console.line,
-            draw=partial(_draw, title=out.name),
-        )  # fmt: skip
-        _print_rgbd(recording, console)
+        rgbd_options = projects.rgbd_options(reading)
+        _print_rgbd(capture_rgbd(source, out, options=rgbd_options, **told), console)
     elif reading:
         raise OptionError(
             f"{source}: no folder of colour and depth; expected none of the options of RGB-D "
@@ -139,19 +137,12 @@ def capture(
 
         for name in sorted(set(options) - {"poses", "distance"}):
             raise OptionError(f"--{name}: of captures that find the poses; leave it or --poses out")
-        report = capture_posed(
-            source, out, say=console.line, draw=partial(_draw, title=out.name), **options
-        )
-        _print(report, console)
+        _print(capture_posed(source, out, **told, **options), console)
     else:
         from gvtools.capture.project import capture_photographs
 
         matcher = _matcher(options.pop("features", None), options.pop("weights", None))
-        report = capture_photographs(
-            source, out, learned=matcher, say=console.line, draw=partial(_draw, title=out.name),
-            **options,
-        )  # fmt: skip
-        _print(report, console)
+        _print(capture_photographs(source, out, learned=matcher, **told, **options), console)
     console.line(f"{out}: gvtools check {out}; gvtools reconstruct {out} --out RUN")
 
 

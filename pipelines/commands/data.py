@@ -6,10 +6,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from gvtools.errors import GvError, OptionError, ProjectError
-from gvtools.files import write_json
 from gvtools.specs import name_key
 from pipelines.commands.arguments import SceneArguments
-from pipelines.options import Arguments
+from pipelines.options import Arguments, JsonArguments
 
 if TYPE_CHECKING:
     from gvtools.scenes.inspection import SceneReport
@@ -22,7 +21,7 @@ LEVELS = ("error", "warning", "info")
 NAMED = 5
 
 
-class CheckCommand(SceneArguments):
+class CheckCommand(SceneArguments, JsonArguments):
     """Tell what a run would read of a project, and what is wrong with it."""
 
     examples = (
@@ -33,8 +32,6 @@ class CheckCommand(SceneArguments):
 
     project: Path
     """A folder, a .zip of it, a transforms.json or spec:NAME:SCENE. [PROJECT]"""
-    json_: Path | None = None
-    """Write the report there. [FILE]"""
 
     def run(self, console: Console) -> None:
         from gvtools.scenes.inspection import inspect
@@ -42,14 +39,10 @@ class CheckCommand(SceneArguments):
         try:
             result = inspect(self.open_scene(self.project))
         except GvError as error:
-            if self.json_ is not None:
-                finding = {"level": "error", "message": str(error)}
-                write_json(
-                    self.json_, {"root": str(self.project), "ok": False, "findings": [finding]}
-                )
+            finding = {"level": "error", "message": str(error)}
+            self.write_json({"root": str(self.project), "ok": False, "findings": [finding]})
             raise
-        if self.json_ is not None:
-            write_json(self.json_, result.to_dict())
+        if self.write_json(result.to_dict()):
             console.line(f"report written to {self.json_}")
         else:
             _print(result, console)
@@ -105,7 +98,7 @@ def _span(low: float, high: float) -> str:
     return f"{low:.1f}" if high - low < 0.05 else f"{low:.1f} to {high:.1f}"
 
 
-class ListData(Arguments):
+class ListData(JsonArguments):
     """Data sets there is a spec of, or all that is known of one."""
 
     examples = ("", "hypersim", "--json data_sets.json")
@@ -114,8 +107,6 @@ class ListData(Arguments):
 
     name: str | None = None
     """Print all that is known of this one. [NAME]"""
-    json_: Path | None = None
-    """Write what is known there, with its weight. [FILE]"""
 
     def run(self, console: Console) -> None:
         from pipelines.data_sets.downloads import list_data_sets
@@ -123,7 +114,7 @@ class ListData(Arguments):
         list_data_sets(self, console)
 
 
-class DownloadArguments(Arguments):
+class DownloadArguments(JsonArguments):
     """The download of a data set."""
 
     positional = ("name", "root")
@@ -134,8 +125,6 @@ class DownloadArguments(Arguments):
     """The folder of its download, or of a part. [ROOT]"""
     scene: tuple[str, ...] = ()
     """This one alone; may be repeated. [S]"""
-    json_: Path | None = None
-    """Write the figures there as well. [FILE]"""
 
 
 class CheckDownload(DownloadArguments):

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any, Literal
 from pydantic import Field
 
 from gvtools.errors import DegenerateError, OptionError
-from gvtools.files import folder_for_results, write_json
+from gvtools.files import folder_for_results
 from gvtools.runs.layout import RECORD
 from gvtools.scenes.layout import FORM, is_address
 from pipelines.commands.arguments import MeasurementArguments, RootArguments, SceneArguments
-from pipelines.options import Arguments
+from pipelines.options import Arguments, JsonArguments
 
 if TYPE_CHECKING:
     from gvtools.evaluation.trajectories import PoseErrors
@@ -96,8 +96,7 @@ class EvaluateCommand(MeasurementArguments, ProtocolArguments, SceneArguments):
                 out=out,
                 console=console,
             )
-        if self.json_ is not None:
-            write_json(self.json_, figures)
+        self.write_json(figures)
 
 
 def _folder(args: EvaluateCommand) -> Path:
@@ -164,8 +163,7 @@ class JudgeCommand(MeasurementArguments, SceneArguments):
                 out=self.out,
                 console=console,
             )
-        if self.json_ is not None:
-            write_json(self.json_, figures)
+        self.write_json(figures)
 
 
 def _check_apart(pictures: Sequence[Path], out: Path) -> None:
@@ -196,7 +194,7 @@ def _reference(args: JudgeCommand, console: Console) -> JudgeReference:
 MOST_FOR_AUC = 2000
 
 
-class TrajectoryCommand(RootArguments):
+class TrajectoryCommand(RootArguments, JsonArguments):
     """Measure the pose errors (ATE, RPE, AUC) of a trajectory against its reference."""
 
     examples = (
@@ -227,8 +225,6 @@ class TrajectoryCommand(RootArguments):
     """Of trajectory files."""
     allow_mirrored: bool = False
     """Give figures also where the estimate is the reference's mirror image."""
-    json_: Path | None = None
-    """Write the figures there. [FILE]"""
 
     def run(self, console: Console) -> None:
         from gvtools.evaluation.conventions import wrong_conventions
@@ -280,9 +276,7 @@ class TrajectoryCommand(RootArguments):
         if self.metric == "ate" and auc is None:
             figures["notes"]["auc"] = f"not measured over more than {MOST_FOR_AUC} poses"
         figures["notes"] |= {name: lines for name, lines in notes.items() if lines}
-        if self.json_ is not None:
-            write_json(self.json_, figures)
-        elif errors.ok:
+        if not self.write_json(figures) and errors.ok:
             _print(figures, errors, console)
         if not errors.ok:
             raise DegenerateError(f"no figures: {errors.status}")

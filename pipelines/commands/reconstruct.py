@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from importlib import import_module
-from itertools import count
+from itertools import chain, count, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -17,7 +17,7 @@ from gvtools.files import write_text
 from gvtools.settings import Settings, with_file, with_texts, with_values
 from pipelines.commands.arguments import SceneArguments
 from pipelines.console import Console
-from pipelines.options import Arguments, HelpSettings, add_settings, given_settings
+from pipelines.options import Arguments, HelpSettings, JsonArguments, add_settings, given_settings
 
 if TYPE_CHECKING:
     from pipelines.reconstruction.settings import RunSettings
@@ -42,7 +42,7 @@ METAVARS = {
 }  # fmt: skip
 
 
-class RunArguments(SceneArguments):
+class RunArguments(SceneArguments, JsonArguments):
     """What ``reconstruct`` and ``demo`` share."""
 
     settings_of = OPTIONS
@@ -56,8 +56,6 @@ class RunArguments(SceneArguments):
     """Continue after the last whole round."""
     dry_run: bool = False
     """Say what would be done, and stop."""
-    json_: Path | None = None
-    """Write the figures there too. [FILE]"""
 
     @classmethod
     def add(cls, parser: argparse.ArgumentParser) -> None:
@@ -224,12 +222,10 @@ def free_folder(path: Path, *, resume: bool) -> Path:
 
     A demo is run again and again; its default folder must not refuse.
     """
-    last = candidate = path
-    for number in count(2):
-        if not candidate.exists():
-            return last if resume and last.exists() else candidate
-        last, candidate = candidate, path.with_name(f"{path.name}-{number}")
-    raise AssertionError
+    others = (path.with_name(f"{path.name}-{number}") for number in count(2))
+    places = pairwise(chain((path, path), others))
+    last, free = next(pair for pair in places if not pair[1].exists())
+    return last if resume and last.exists() else free
 
 
 class RefineCommand(Arguments):

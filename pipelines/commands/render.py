@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 from pydantic import Field
 
 from gvtools.errors import OptionError
-from gvtools.files import write_json
 from gvtools.runs.layout import file_stems
 from gvtools.settings import with_texts
 from pipelines.commands.arguments import EMPTY, LensArguments, LpipsArguments, SceneArguments
+from pipelines.options import JsonArguments
 
 if TYPE_CHECKING:
     import numpy as np
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 LOOKED = 8
 
 
-class RenderCommand(LensArguments, LpipsArguments, SceneArguments):
+class RenderCommand(LensArguments, LpipsArguments, SceneArguments, JsonArguments):
     """Project a saved memory into cameras, and measure it against their pictures."""
 
     examples = (
@@ -61,8 +61,6 @@ class RenderCommand(LensArguments, LpipsArguments, SceneArguments):
     """Short for --set splat.backend=NAME (cpu, torch, ...). [NAME]"""
     device: str | None = None
     """Short for --set splat.device=NAME (auto, cpu, cuda). [NAME]"""
-    json_: Path | None = None
-    """Write the figures there. [FILE]"""
 
     def run(self, console: Console) -> None:
         from gvtools.memory.panoramas import WIDEST_STILL
@@ -110,9 +108,7 @@ class RenderCommand(LensArguments, LpipsArguments, SceneArguments):
             console.warn(f"the pictures of {self.cameras} seem to be {other}")
         if poses:
             figures["poses"] = poses
-        if self.json_ is not None:
-            write_json(self.json_, figures)
-        else:
+        if not self.write_json(figures):
             columns = ("view", "psnr", "ssim", "psnr_valid", "ssim_valid", "depth_rel_valid",
                        "coverage", "seconds")  # fmt: skip
             mean = {**figures, "view": "all", "seconds": figures["seconds_per_view"]}

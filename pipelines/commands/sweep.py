@@ -150,7 +150,6 @@ def _chosen_views(text: str | None, benchmark: Benchmark) -> tuple[int, ...]:
 
 
 def _chosen_scenes(text: str | None, known: tuple[str, ...]) -> tuple[str, ...]:
-
     if text is None:
         return known
     names = tuple(dict.fromkeys(part.strip() for part in text.split(",") if part.strip()))

@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Literal
 from pydantic import Field
 
 from gvtools.errors import OptionError
-from gvtools.files import check_parent, make_folder, write_json, write_text
+from gvtools.files import check_parent, make_folder, write_text
 from gvtools.settings import Settings, with_texts, with_values
 from pipelines.commands.arguments import RootArguments
-from pipelines.options import HelpSettings
+from pipelines.options import HelpSettings, JsonArguments
 
 if TYPE_CHECKING:
     from gvtools.scenes.scene import Scene
@@ -68,8 +68,6 @@ def run_tune(args: TrainCommand, console: Console) -> None:
     config = _checked(args)
     weights = args.init or SHIPPED
     check_tunable(weights)
-    if args.json_ is not None:
-        check_parent(args.json_)
     if args.out.exists() and not (args.out.is_dir() and not any(args.out.iterdir())):
         raise OptionError(f"--out {args.out}: holds something already; give a new folder")
     with tempfile.TemporaryDirectory() as folder:
@@ -85,8 +83,7 @@ def run_tune(args: TrainCommand, console: Console) -> None:
             say=console.line,
         )
     console.line(f"gvtools reconstruct ... --completer geoverse --set completer.weights={args.out}")
-    if args.json_ is not None:
-        write_json(args.json_, tuning.to_dict())
+    args.write_json(tuning.to_dict())
 
 
 def _checked(args: TrainCommand) -> RunSettings:
@@ -129,7 +126,7 @@ def context_of(scene: Scene, config: RunSettings, folder: Path, *, console: Cons
     return with_depth(plan.scene, plan.context, cache)
 
 
-class TrainCommand(TuneArguments):
+class TrainCommand(TuneArguments, JsonArguments):
     """Train the generative core: encoder, denoisers, distillation; or tune it to a scene."""
 
     examples = (
@@ -168,8 +165,6 @@ class TrainCommand(TuneArguments):
     """That computes."""
     sheets: int = 250
     """Sample sheets every N steps; 0: none. [N]"""
-    json_: Path | None = None
-    """Write the last figures there. [FILE]"""
 
     @classmethod
     def add(cls, parser: argparse.ArgumentParser) -> None:
@@ -185,6 +180,8 @@ class TrainCommand(TuneArguments):
         from gvtools.training.records import STAGES
         from gvtools.training.run import StageRun
 
+        if self.json_ is not None:
+            check_parent(self.json_)
         if self.config == NAME:
             run_tune(self, console)
             return
@@ -197,8 +194,6 @@ class TrainCommand(TuneArguments):
             if self.init is not None and not (self.init / WHOLE_FILE).is_file():
                 # A published encoder has its training behind it.
                 stages = tuple(stage for stage in stages if stage != "encoder")
-        if self.json_ is not None:
-            check_parent(self.json_)
         make_folder(self.out)
         figures: dict[str, dict[str, float]] = {}
         with ExitStack() as held:

@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from gvtools.errors import CheckpointError, GvError, OptionError, ProjectError
-from gvtools.files import write_json
-from pipelines.options import Arguments
+from pipelines.options import Arguments, JsonArguments
 
 if TYPE_CHECKING:
     from gvtools.completers.geoverse.config import GeoVerseConfig
@@ -22,22 +21,18 @@ DEPTH = "depth"
 _INTERVAL = 10.0
 
 
-class CompletersCommand(Arguments):
+class CompletersCommand(JsonArguments):
     """List the completers: what each needs, its cost a view, what it was measured to give."""
 
     examples = ("gvtools completers", "gvtools completers --json completers.json")
-
-    json_: Path | None = None
-    """Write the list there. [FILE]"""
 
     def run(self, console: Console) -> None:
         from gvtools.completers.base import available, completer_type
 
         listed = [(name, variant) for name in available() for variant in completer_type(name).facts]
         unsaid = [name for name in available() if not completer_type(name).facts]
-        if self.json_ is not None:
-            found = [{"name": name, **variant._asdict()} for name, variant in listed]
-            write_json(self.json_, {"completers": found, "without_figures": unsaid})
+        found = [{"name": name, **variant._asdict()} for name, variant in listed]
+        self.write_json({"completers": found, "without_figures": unsaid})
         for name, variant in listed:
             console.line(f"{name}{variant.of and f', {variant.of}'}: {variant.what}")
             for field in ("needs", "cost", "gives"):
@@ -60,16 +55,14 @@ class ListWeights(Arguments):
 
     def run(self, console: Console) -> None:
         from gvtools.completers.geoverse.config import NAMES
-        from pipelines.weights import print_depth, print_needed
+        from pipelines.weights import depth_lines, needed_lines
 
         names = (DEPTH, *NAMES) if self.config is None else (self.config,)
         for number, name in enumerate(names):
             if number:
                 console.line("")
-            if name == DEPTH:
-                print_depth(console)
-            else:
-                print_needed(_config(name), console)
+            for line in depth_lines() if name == DEPTH else needed_lines(_config(name)):
+                console.line(line)
 
 
 class FetchWeights(Arguments):
@@ -109,7 +102,7 @@ class FetchWeights(Arguments):
             console.line(f"next: {step.replace('DIR', str(self.to))}")
 
 
-class CheckWeights(Arguments):
+class CheckWeights(JsonArguments):
     """Say precisely what does not fit; encode and decode a photograph."""
 
     examples = ("weights/base", "DIR --config tiny")
@@ -121,14 +114,12 @@ class CheckWeights(Arguments):
     """Instead of the folder's own config.json. [NAME|FILE]"""
     photo: Path | None = None
     """To encode and decode; by default one that ships with scikit-image. [FILE]"""
-    json_: Path | None = None
-    """Write the report there. [FILE]"""
 
     def run(self, console: Console) -> None:
         from gvtools.completers.geoverse.weights import check_folder, check_is_folder, config_of
-        from pipelines.weights import other_revisions, print_parts, self_check
+        from pipelines.weights import other_revisions, part_lines, self_check
 
-        folder = self.folder
+        folder, checked, right = self.folder, "", True
         report: dict[str, Any] = {"folder": str(folder), "config": None, "ok": False, "parts": []}
         try:
             check_is_folder(folder)
@@ -136,8 +127,7 @@ class CheckWeights(Arguments):
             report["config"] = config.name
             parts = check_folder(folder, config)
         except GvError as error:
-            if self.json_ is not None:
-                write_json(self.json_, {**report, "problem": str(error)})
+            self.write_json({**report, "problem": str(error)})
             raise
         bad = [part for part in parts if not part.ok]
         problem = None
@@ -148,17 +138,19 @@ class CheckWeights(Arguments):
                 f"{bad[0].summary}"
             )
         notes = other_revisions(config, parts)
-        report["self_check"], right = ("", True) if bad else self_check(folder, config, self.photo)
+        if not bad:
+            checked, right = self_check(folder, config, self.photo)
         if not right:
-            notes.append(f"{report['self_check']}: the files are damaged, or not of one kind")
-        if self.json_ is not None:
-            found = [part.to_dict() for part in parts]
-            report |= {"ok": not bad, "parts": found, "problem": problem, "notes": notes}
-            write_json(self.json_, report)
+            notes.append(f"{checked}: the files are damaged, or not of one kind")
+        found = [part.to_dict() for part in parts]
+        report |= {"self_check": checked, "ok": not bad, "parts": found, "problem": problem}
+        if self.write_json({**report, "notes": notes}):
             console.line(f"report written to {self.json_}")
         else:
-            checked = str(report["self_check"])
-            print_parts(folder, config, parts, checked=checked, console=console)
+            head, told = f"{folder}, configuration {config.name}", [checked] if checked else []
+            ok = f"ok: {'false' if bad else 'true'}"
+            for line in (head, *part_lines(folder, parts), *told, ok):
+                console.line(line)
         for note in notes:
             console.warn(note)
         if problem:

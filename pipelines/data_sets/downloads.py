@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gvtools.errors import GvError, OptionError, ProjectError
-from gvtools.files import json_list_written, write_json
+from gvtools.files import json_list_written
 from gvtools.scenes.data_sets import catalogue
 from gvtools.scenes.inspection import SceneReport, inspect, spread, turn_degrees
 
@@ -37,82 +36,38 @@ def list_data_sets(args: ListData, console: Console) -> None:
     """Print a table of the data sets, or everything about one."""
     names = catalogue.spec_names() if args.name is None else (args.name,)
     specs = [catalogue.load_spec(name) for name in names]
-    if args.json_ is not None:
-        known = [
-            {**spec.model_dump(mode="json"), "weight": spec.weight, "share": share_of(spec)}
-            for spec in specs
-        ]
-        write_json(args.json_, {"data_sets": known})
+    every = [catalogue.load_spec(name) for name in catalogue.spec_names()]
+    every.sort(key=lambda spec: ("training" not in spec.roles, spec.name.casefold()))
+    whole = sum(spec.weight for spec in every if "training" in spec.roles)
+    # Of a mixture of all training sets.
+    shares = {spec.name: spec.weight / whole for spec in every if "training" in spec.roles}
+    known = [
+        {**spec.model_dump(mode="json"), "weight": spec.weight, "share": shares.get(spec.name)}
+        for spec in specs
+    ]
+    if args.write_json({"data_sets": known}):
         console.line(f"{len(specs)} data sets written to {args.json_}")
     elif args.name is None:
-        console.table(COLUMNS, table_rows())
+        rows = []
+        for spec in every:
+            counts = spec.counts.scenes, spec.counts.images
+            texts = [None if count is None else f"{count:,}" for count in counts]
+            share = f"{shares[spec.name]:.1%}" if spec.name in shares else None
+            rows.append([spec.name, spec.kind, *texts, share, ", ".join(spec.roles), spec.layout])
+        console.table(COLUMNS, rows)
         console.line("weight: share in a mixture of all training sets, by the root of their images")
     else:
-        console.line(as_yaml(specs[0]).rstrip())
-        if share_of(specs[0]) is not None:
-            console.line(f"# {share_of(specs[0]):.1%} of a mixture of all training sets")
+        import yaml
 
-
-def all_specs() -> list[catalogue.DataSetSpec]:
-    """Training sets first, then by name."""
-    specs = [catalogue.load_spec(name) for name in catalogue.spec_names()]
-    return sorted(specs, key=lambda spec: ("training" not in spec.roles, spec.name.casefold()))
-
-
-def share_of(spec: catalogue.DataSetSpec) -> float | None:
-    """Its weight in a mixture of all training sets, of 1; None for other data sets."""
-    if "training" not in spec.roles:
-        return None
-    return spec.weight / sum(x.weight for x in all_specs() if "training" in x.roles)
-
-
-def table_rows() -> list[tuple[str | None, ...]]:
-    """A row a data set, as COLUMNS names them."""
-    rows: list[tuple[str | None, ...]] = []
-    for spec in all_specs():
-        share = share_of(spec)
-        rows.append(
-            (
-                spec.name,
-                spec.kind,
-                _count(spec.counts.scenes),
-                _count(spec.counts.images),
-                None if share is None else f"{share:.1%}",
-                ", ".join(spec.roles),
-                spec.layout,
-            )
-        )
-    return rows
-
-
-def as_yaml(spec: catalogue.DataSetSpec) -> str:
-    """What is known of a data set, in the words of its file."""
-    import yaml
-
-    known = spec.model_dump(mode="json", exclude_none=True)
-    return str(yaml.safe_dump(known, sort_keys=False, allow_unicode=True, width=96))
-
-
-def _count(number: int | None) -> str | None:
-    return None if number is None else f"{number:,}"
+        (spec,) = specs
+        told = spec.model_dump(mode="json", exclude_none=True)
+        text = yaml.safe_dump(told, sort_keys=False, allow_unicode=True, width=96)
+        console.line(text.rstrip())
+        if spec.name in shares:
+            console.line(f"# {shares[spec.name]:.1%} of a mixture of all training sets")
 
 
 # --- check ------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class SceneCheck:
-    """A scene of a download."""
-
-    scene: str
-    report: SceneReport | None  # None where nothing of it could be read
-    problem: str | None = None  # the first thing that keeps it from being used
-
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-ready values."""
-        if self.report is None:
-            return {"scene": self.scene, "ok": False, "problem": self.problem}
-        return {"scene": self.scene, **self.report.to_dict(), "problem": self.problem}
 
 
 def check_data_set(args: DownloadArguments, console: Console) -> None:
@@ -127,16 +82,20 @@ def check_data_set(args: DownloadArguments, console: Console) -> None:
         if args.json_ is not None:
             head = {"data_set": spec.name, "root": str(args.root)}
             written = stack.enter_context(json_list_written(args.json_, head, "scenes"))
-        for check in checks(spec, args.root, names):
-            _print_check(check, console, said)
+        for scene in names:
+            report, problem = _checked(spec, args.root, scene)
+            if report is None:
+                console.line(f"{scene}: cannot be read")
+                console.line(f"  error: {problem}")
+            else:
+                _print_check(scene, report, console=console, said=said)
+                counted["views"] += report.views
+                counted["depth"] += report.depth.views if report.depth else 0
             if written is not None:
-                written.add(check.to_dict())
-            if check.report is not None:
-                counted["views"] += check.report.views
-                counted["depth"] += check.report.depth.views if check.report.depth else 0
-            if check.problem is not None:
-                counted["bad"] += 1
-                bad = bad or [f"{check.scene}: {check.problem}"]
+                found = {"ok": False} if report is None else report.to_dict()
+                written.add({"scene": scene, **found, "problem": problem})
+            if problem is not None:
+                bad.append(f"{scene}: {problem}")
     published = (spec.counts.scenes, "scenes"), (spec.counts.images, "images")
     known = ", ".join(f"{number:,} {noun}" for number, noun in published if number is not None)
     console.line(
@@ -145,33 +104,29 @@ def check_data_set(args: DownloadArguments, console: Console) -> None:
     )
     if bad:
         raise ProjectError(
-            f"{args.root}: {counted['bad']} of {len(names)} scenes cannot be used, first {bad[0]}"
+            f"{args.root}: {len(bad)} of {len(names)} scenes cannot be used, first {bad[0]}"
         )
 
 
-def checks(spec: catalogue.DataSetSpec, root: Path, scenes: Iterable[str]) -> Iterator[SceneCheck]:
-    """Read scenes one after the other; none is kept."""
-    for scene in scenes:
-        try:
-            report = inspect(catalogue.read_scene(spec, scene, root), probes=PROBES)
-        except OptionError:
-            raise
-        except GvError as error:
-            yield SceneCheck(scene, None, str(error))
-        else:
-            errors = (item.message for item in report.findings if item.level == "error")
-            yield SceneCheck(scene, report, next(errors, None))
+def _checked(
+    spec: catalogue.DataSetSpec, root: Path, scene: str
+) -> tuple[SceneReport | None, str | None]:
+    """What of a scene can be read, if anything, and the first thing that keeps it from use."""
+    try:
+        report = inspect(catalogue.read_scene(spec, scene, root), probes=PROBES)
+    except OptionError:
+        raise
+    except GvError as error:
+        return None, str(error)
+    errors = (item.message for item in report.findings if item.level == "error")
+    return report, next(errors, None)
 
 
-def _print_check(check: SceneCheck, console: Console, said: set[tuple[str, str]]) -> None:
+def _print_check(
+    scene: str, report: SceneReport, *, console: Console, said: set[tuple[str, str]]
+) -> None:
     """A line for the scene, and one for each finding that no scene before had."""
-    report = check.report
-    if report is None:
-        console.line(f"{check.scene}: cannot be read")
-        console.line(f"  error: {check.problem}")
-        return
-    sizes = ", ".join(report.sizes)
-    line = [f"{check.scene}: {report.views:,} views of {sizes}"]
+    line = [f"{scene}: {report.views:,} views of {', '.join(report.sizes)}"]
     depth = report.depth
     if depth is not None:
         line.append(f"{depth.views:,} with depth")
@@ -338,9 +293,8 @@ def statistics_of_data_set(args: DownloadArguments, console: Console) -> None:
         console.warn(f"{total.skipped} of {len(names)} scenes cannot be read, first {first}")
     if total.unreadable:
         console.warn(f"{total.unreadable} sampled views cannot be read; see gvtools data check")
-    if args.json_ is not None:
-        head = {"data_set": spec.name, "root": str(args.root)}
-        write_json(args.json_, {**head, **total.to_dict()})
+    head = {"data_set": spec.name, "root": str(args.root)}
+    if args.write_json({**head, **total.to_dict()}):
         console.line(f"figures written to {args.json_}")
     else:
         _print_statistics(total, console)

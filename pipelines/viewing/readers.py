@@ -8,11 +8,10 @@ reads in a child process.
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
-from contextlib import contextmanager
 from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from unittest.mock import patch
 from urllib.parse import unquote
 
 import numpy as np
@@ -62,7 +61,8 @@ def load_mesh(path: Path) -> trimesh.Trimesh | trimesh.PointCloud:
         place, kind = io.BytesIO(_checked_glb(path, data)), "glb"
         _, back = glb_axes(split_glb(data)[0])
     del data
-    with _small_pictures(size):
+    # No texture is opened whose pixels the file's size does not explain.
+    with patch("PIL.Image.MAX_IMAGE_PIXELS", _most_pixels(size)):
         beside = _beside(path, absent)
         scene = trimesh.load_scene(place, process=False, resolver=beside, file_type=kind)
         loaded: Any = scene.to_geometry()
@@ -115,19 +115,6 @@ def _beside(path: Path, absent: list[str]) -> Any:
             return data
 
     return Beside(str(path))
-
-
-@contextmanager
-def _small_pictures(size: int) -> Iterator[None]:
-    """Let no texture be opened whose pixels the file's size does not explain."""
-    from PIL import Image
-
-    before = Image.MAX_IMAGE_PIXELS
-    Image.MAX_IMAGE_PIXELS = _most_pixels(size)
-    try:
-        yield
-    finally:
-        Image.MAX_IMAGE_PIXELS = before
 
 
 def _most_pixels(size: int) -> int:

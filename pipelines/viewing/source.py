@@ -9,7 +9,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -105,39 +105,33 @@ class ProjectFrames:
     def __init__(self, run: Run | None) -> None:
         self.run = run
         self._lock = threading.Lock()
-        self._opened = False
-        self._scene: Scene | None = None
-        self._truths: Scene | None = None
-        self._lacking: str | None = None
         # Looking at a camera again, or at another colour of it, is common; a scan would not fit.
         self._load = lru_cache(maxsize=KEPT_FRAMES)(self._load_frame)
 
     def __call__(self, name: str) -> Frame | None:
         """The pixels of a view; None where the project has none or they cannot be read."""
-        self._open()
         return self._load(name)
 
     def lacking(self) -> str | None:
         """Why there are none at all; None when there are."""
-        self._open()
-        return self._lacking
-
-    def _open(self) -> None:
         with self._lock:
-            if self._opened:
-                return
-            self._opened = True
-            if self.run is None:
-                self._lacking = "a memory without a run: no pictures of its cameras"
-                return
-            try:
-                self._scene, self._truths = self.run.scenes
-            except (GvError, KeyError, TypeError) as error:
-                self._lacking = f"no pictures of the project: {error}"
+            return self._opened[1]
+
+    @cached_property
+    def _opened(self) -> tuple[tuple[Scene | None, Scene | None], str | None]:
+        """The project and the targets' truths, and why there are none."""
+        if self.run is None:
+            return (None, None), "a memory without a run: no pictures of its cameras"
+        try:
+            return self.run.scenes, None
+        except (GvError, KeyError, TypeError) as error:
+            return (None, None), f"no pictures of the project: {error}"
 
     def _load_frame(self, name: str) -> Frame | None:
-        given = self.run is not None and name in self.run.context
-        scene = self._scene if given else self._truths
+        with self._lock:
+            scene, truths = self._opened[0]
+        if self.run is None or name not in self.run.context:
+            scene = truths
         if scene is None or name not in scene.names:
             return None
         try:

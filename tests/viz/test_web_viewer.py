@@ -12,6 +12,7 @@ import threading
 import time
 from contextlib import nullcontext
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -208,11 +209,12 @@ def test_of_two_cameras_selected_one_after_the_other_the_last_is_shown(small_run
         camera=SimpleNamespace(wxyz=np.array([1.0, 0, 0, 0]), position=np.zeros(3), fov=1.0),
     )  # fmt: skip
     with served(replace(run, cameras=(slow, fast), frame_of=frame_of)) as viewer:
+        click = partial(viewer.select, clicked=True)
         try:
-            first = threading.Thread(target=viewer._clicked, args=(slow, client), name="first")
+            first = threading.Thread(target=click, args=(slow, client), name="first")
             first.start()
             assert asked.wait(PATIENCE)
-            second = threading.Thread(target=viewer._clicked, args=(fast, client))
+            second = threading.Thread(target=click, args=(fast, client))
             second.start()
             second.join()
             go_on.set()
@@ -248,7 +250,7 @@ def on_screen(client, viewer, shown) -> tuple[float, float]:
     """Where the middle of a camera's frustum is in the canvas, CSS pixels."""
     seen = viewer.frame.client_camera(client, longest=LONGEST)
     pose = shown.camera.world_from_cam[0]
-    inside = pose[:3, 3] + 0.9 * viewer._cameras._depth / viewer.frame.scale * pose[:3, 2]
+    inside = pose[:3, 3] + 0.9 * viewer.cameras._depth / viewer.frame.scale * pose[:3, 2]
     xy, z = seen.project(inside[None])
     assert z[0, 0] > 0
     scale = client.camera.image_width / seen.width[0]
@@ -359,7 +361,7 @@ def run(tmp_path_factory):
 @pytest.fixture(scope="module")
 def splat_viewer(run):
     with served(ViewSource(run.folder).read()) as found:
-        found._show_look(SPLATS)
+        found.show_look(SPLATS)
         yield found
 
 
@@ -395,9 +397,9 @@ def test_nobody_else_can_read_it(splat_viewer):
 
 @pytest.mark.slow
 def test_a_browser_shows_what_the_run_does(splat_viewer, run, tmp_path):
-    splat_viewer._cameras.set_kinds(dict.fromkeys(("context", "target"), False))
+    splat_viewer.cameras.set_kinds(dict.fromkeys(("context", "target"), False))
     # The fit alone.
-    splat_viewer._show_round(0)
+    splat_viewer.show_round(0)
     with open_browser(width=700, height=400) as browser:
         browser.driver.get(splat_viewer.url)
         wait(lambda: "observations after round" in browser.text())
@@ -418,7 +420,7 @@ def test_a_browser_shows_what_the_run_does(splat_viewer, run, tmp_path):
                 return 10 * np.log10(255**2 / np.square(seen - whole).mean()) > 40
 
             wait(alike)
-        splat_viewer._show_look(POINTS)
+        splat_viewer.show_look(POINTS)
         wait(lambda: not browser.driver.find_elements("id", "splats"))
-        splat_viewer._show_look(SPLATS)
+        splat_viewer.show_look(SPLATS)
         assert browser.console_errors() == [] and browser.foreign_requests() == []

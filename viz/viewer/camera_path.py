@@ -11,6 +11,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -72,31 +73,9 @@ class CameraPath:
             save = gui.add_button("Save", hint="for gvtools film --path")
         self._update_status()
 
-        @add.on_click
-        def _(event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
-            if event.client is not None:
-                self.add(event.client)
-
         remove.on_click(lambda _: self.remove_last())
-
-        @preview.on_click
-        def _(event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
-            self._for(event.client, self.preview)
-
-        @save.on_click
-        def _(event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
-            self._for(event.client, self.save)
-
-    def _for(
-        self, client: viser.ClientHandle | None, act: Callable[[viser.ClientHandle], object]
-    ) -> None:
-        """Act for a client, who is told what is wrong."""
-        if client is None:
-            return
-        try:
-            act(client)
-        except GvError as error:
-            client.add_notification("Camera path", str(error), color="red")
+        for button, act in ((add, self.add), (preview, self.preview), (save, self.save)):
+            button.on_click(partial(_act, act))
 
     def add(self, client: viser.ClientHandle) -> None:
         """A key frame where a client stands."""
@@ -201,3 +180,15 @@ class CameraPath:
         count = len(self.keys)
         text = "no key frames yet" if not count else f"{count} key frame{'s' * (count > 1)}"
         self._status.content = f'<div style="padding:0 .8em .4em;font-size:.85em">{text}</div>'
+
+
+def _act(
+    act: Callable[[viser.ClientHandle], object], event: viser.GuiEvent[viser.GuiButtonHandle]
+) -> None:
+    """Act for the client of an event, who is told what is wrong."""
+    if event.client is None:
+        return
+    try:
+        act(event.client)
+    except GvError as error:
+        event.client.add_notification("Camera path", str(error), color="red")

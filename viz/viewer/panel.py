@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -19,6 +18,8 @@ from viz.viewer.run_view import TRUTH, Detail, RunView, ShownCamera
 
 if TYPE_CHECKING:
     import viser
+
+    from viz.viewer.web import WebViewer
 
 NO_CAMERA = "none"
 LOOKS_HINT = "splats: as the page of gvtools export; rendered: as gvtools render draws this view"
@@ -85,27 +86,10 @@ def side_by_side(pictures: list[NDArray[np.uint8]]) -> NDArray[np.uint8]:
 
 
 class Panel:
-    """Controls on the right, pictures below left.
+    """Controls on the right, pictures below left; the viewer is told what was chosen."""
 
-    ``on_round`` and its like are told what was chosen: the round, the colour mode, the look, the
-    camera and by whom, the points' size in spacings, the kinds of cameras to show.
-    """
-
-    def __init__(
-        self,
-        server: viser.ViserServer,
-        *,
-        mode: str,
-        looks: tuple[str, ...],
-        on_round: Callable[[int], None],
-        on_mode: Callable[[str], None],
-        on_look: Callable[[str], None],
-        on_camera: Callable[[ShownCamera, viser.ClientHandle | None], None],
-        on_size: Callable[[float], None],
-        on_kinds: Callable[[dict[str, bool]], None],
-    ) -> None:
-        gui = server.gui
-        self._gui = gui
+    def __init__(self, viewer: WebViewer, *, mode: str) -> None:
+        gui = viewer.server.gui
         self._run: RunView | None = None
         self._by_label: dict[str, ShownCamera] = {}
         gui.main_panel.dock_right()
@@ -115,7 +99,7 @@ class Panel:
         self._counts = gui.add_html("")
         self._mode = gui.add_dropdown("Colour", tuple(MODES.values()), initial_value=MODES[mode])
         self._legend = gui.add_html("")
-        self._look = gui.add_dropdown("Look", looks, hint=LOOKS_HINT)
+        self._look = gui.add_dropdown("Look", viewer.run.looks, hint=LOOKS_HINT)
         self._size = gui.add_slider("Point size", 0.25, 4.0, 0.25, 1.0, hint="in spacings")
         self._camera = gui.add_dropdown("Camera", (NO_CAMERA,), hint="choose or click one")
         kinds = {
@@ -130,18 +114,22 @@ class Panel:
             self._strip = gui.add_image(np.full((8, 24, 3), 255, np.uint8), jpeg_quality=88)
         self._pictures.float(x=12, y=-12, width=PICTURES_WIDTH)
 
-        self._round.on_update(lambda event: on_round(int(event.target.value)))
-        self._mode.on_update(lambda _: on_mode(self.mode))
-        self._look.on_update(lambda event: on_look(str(event.target.value)))
-        self._size.on_update(lambda event: on_size(float(event.target.value)))
+        self._round.on_update(lambda event: viewer.show_round(int(event.target.value)))
+        self._mode.on_update(lambda _: viewer.show_mode(self.mode))
+        self._look.on_update(lambda event: viewer.show_look(str(event.target.value)))
+        self._size.on_update(lambda event: viewer.set_size(float(event.target.value)))
+
+        def show_kinds(_: object) -> None:
+            viewer.cameras.set_kinds({kind: box.value for kind, box in kinds.items()})
+
         for box in kinds.values():
-            box.on_update(lambda _: on_kinds({kind: b.value for kind, b in kinds.items()}))
+            box.on_update(show_kinds)
 
         @self._camera.on_update
         def _(event: viser.GuiEvent[viser.GuiDropdownHandle[str]]) -> None:
             # Without a client the choice was set from here, by a click in the scene.
             if event.client is not None and self._camera.value in self._by_label:
-                on_camera(self._by_label[self._camera.value], event.client)
+                viewer.select(self._by_label[self._camera.value], event.client)
 
         @download.on_click
         def _(event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:

@@ -9,6 +9,7 @@ import socket
 import threading
 from collections.abc import Callable, Mapping
 from contextlib import redirect_stdout
+from functools import partial
 from typing import TYPE_CHECKING, Any
 from unittest.mock import patch
 from urllib.parse import urlsplit
@@ -71,23 +72,13 @@ class WebViewer:
         pages: dict[str, bytes] = {}
         self.server = make_server(host, port, run.title, pages=pages)
         self._points = PointNodes(self.server, self.frame)
-        self._cameras = CameraNodes(self.server, self.frame, self._clicked)
+        self.cameras = CameraNodes(self.server, self.frame, partial(self.select, clicked=True))
         self._mesh = (
             None if run.surface is None else add_surface(self.server, self.frame, run.surface)
         )
         self._backdrop = Backdrop(self.server, self.frame, pages)
         self._look = run.looks[0]
-        self._panel = Panel(
-            self.server,
-            mode=mode,
-            looks=run.looks,
-            on_round=self._show_round,
-            on_mode=self._show_mode,
-            on_look=self._show_look,
-            on_camera=self._select,
-            on_size=self._set_size,
-            on_kinds=self._cameras.set_kinds,
-        )
+        self._panel = Panel(self, mode=mode)
         self.path = CameraPath(self.server, self.frame, run, saves=is_loopback(host))
         self.server.scene.set_up_direction(tuple(run.up()))
         self.server.scene.world_axes.visible = False
@@ -117,8 +108,8 @@ class WebViewer:
             self._panel.set_run(run, chosen, go_to=go_to)
             self._points.set_points(run, chosen, self._colors(chosen.rows))
             self._panel.set_size(self._points.size)
-            self._show_look(self._look)
-            self._cameras.set_cameras(run)
+            self.show_look(self._look)
+            self.cameras.set_cameras(run)
 
     def set_note(self, text: str) -> None:
         """Something that the user should know of the run."""
@@ -127,7 +118,7 @@ class WebViewer:
     def stop(self) -> None:
         """End the server."""
         self._backdrop.stop()
-        self._cameras.stop()
+        self.cameras.stop()
         with redirect_stdout(io.StringIO()):
             self.server.stop()
 
@@ -136,22 +127,25 @@ class WebViewer:
         self._panel.set_legend(colors.legend)
         return colors.rgb
 
-    def _show_round(self, number: int) -> None:
+    def show_round(self, number: int) -> None:
+        """Show the run as it was after a round."""
         with self._lock:
             with self.server.atomic():
                 self._points.show(number)
-                self._cameras.show(number)
+                self.cameras.show(number)
             self._panel.set_counts(self.run, number, self._points.count(number))
             self._backdrop.set_state(self._look, number, self._panel.mode)
 
-    def _show_mode(self, mode: str) -> None:
+    def show_mode(self, mode: str) -> None:
+        """Show the colours of a mode."""
         with self._lock:
             if mode in MODES:
                 self._panel.set_legend(Legend("..."))
                 self._points.recolor(self._colors(self._points.rows))
                 self._backdrop.set_state(self._look, self._panel.round, mode)
 
-    def _show_look(self, look: str) -> None:
+    def show_look(self, look: str) -> None:
+        """Show points, splats, the splatter's picture or a mesh."""
         with self._lock:
             self._look = look
             if look == SPLATS:
@@ -162,19 +156,17 @@ class WebViewer:
             self._points.set_visible(look == POINTS)
             if self._mesh is not None:
                 self._mesh.visible = look == MESH
-            self._show_round(self._panel.round)
+            self.show_round(self._panel.round)
 
-    def _set_size(self, scale: float) -> None:
+    def set_size(self, scale: float) -> None:
+        """Draw points so many spacings wide."""
         with self._lock:
             self._points.set_size(scale)
 
     def _follow(self, client: viser.ClientHandle) -> None:
-        client.camera.on_update(lambda seen: self._cameras.moved(np.array(seen.position)))
+        client.camera.on_update(lambda seen: self.cameras.moved(np.array(seen.position)))
 
-    def _clicked(self, shown: ShownCamera, client: viser.ClientHandle | None) -> None:
-        self._select(shown, client, clicked=True)
-
-    def _select(
+    def select(
         self, shown: ShownCamera, client: viser.ClientHandle | None, *, clicked: bool = False
     ) -> None:
         """Show a camera and fly there, unless another one has been selected meanwhile."""
@@ -183,7 +175,7 @@ class WebViewer:
             number = self._selected
             if clicked:
                 self._panel.select(shown)
-            self._cameras.mark(shown)
+            self.cameras.mark(shown)
             if client is not None:
                 self._flights[client.client_id] = number
         # Photographs may take their time.
@@ -193,14 +185,11 @@ class WebViewer:
                 return
             self._panel.set_pictures(pictures)
             if client is not None:
-                self._cameras.enter(self.frame.placement(shown.camera)[1])
+                self.cameras.enter(self.frame.placement(shown.camera)[1])
         if client is not None:
             flight = client.client_id
             fly_to(
-                client,
-                shown.camera,
-                self.frame,
-                goes_on=lambda: self._flights[flight] == number,
+                client, shown.camera, self.frame, goes_on=lambda: self._flights[flight] == number
             )
 
 
