@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -36,35 +37,51 @@ def list_data_sets(args: ListData, console: Console) -> None:
     """Print a table of the data sets, or everything about one."""
     names = catalogue.spec_names() if args.name is None else (args.name,)
     specs = [catalogue.load_spec(name) for name in names]
-    every = [catalogue.load_spec(name) for name in catalogue.spec_names()]
-    every.sort(key=lambda spec: ("training" not in spec.roles, spec.name.casefold()))
-    whole = sum(spec.weight for spec in every if "training" in spec.roles)
-    # Of a mixture of all training sets.
-    shares = {spec.name: spec.weight / whole for spec in every if "training" in spec.roles}
     known = [
-        {**spec.model_dump(mode="json"), "weight": spec.weight, "share": shares.get(spec.name)}
+        {**spec.model_dump(mode="json"), "weight": spec.weight, "share": shares().get(spec.name)}
         for spec in specs
     ]
     if args.write_json({"data_sets": known}):
         console.line(f"{len(specs)} data sets written to {args.json_}")
     elif args.name is None:
-        rows = []
-        for spec in every:
-            counts = spec.counts.scenes, spec.counts.images
-            texts = [None if count is None else f"{count:,}" for count in counts]
-            share = f"{shares[spec.name]:.1%}" if spec.name in shares else None
-            rows.append([spec.name, spec.kind, *texts, share, ", ".join(spec.roles), spec.layout])
-        console.table(COLUMNS, rows)
+        console.table(COLUMNS, table_rows())
         console.line("weight: share in a mixture of all training sets, by the root of their images")
     else:
-        import yaml
+        console.line(as_yaml(specs[0]).rstrip())
+        if specs[0].name in shares():
+            console.line(f"# {shares()[specs[0].name]:.1%} of a mixture of all training sets")
 
-        (spec,) = specs
-        told = spec.model_dump(mode="json", exclude_none=True)
-        text = yaml.safe_dump(told, sort_keys=False, allow_unicode=True, width=96)
-        console.line(text.rstrip())
-        if spec.name in shares:
-            console.line(f"# {shares[spec.name]:.1%} of a mixture of all training sets")
+
+def all_specs() -> list[catalogue.DataSetSpec]:
+    """Training sets first, then by name."""
+    specs = [catalogue.load_spec(name) for name in catalogue.spec_names()]
+    return sorted(specs, key=lambda spec: ("training" not in spec.roles, spec.name.casefold()))
+
+
+@cache
+def shares() -> dict[str, float]:
+    """Weights of the training sets in a mixture of all of them, of 1, by name."""
+    weights = {spec.name: spec.weight for spec in all_specs() if "training" in spec.roles}
+    return {name: weight / sum(weights.values()) for name, weight in weights.items()}
+
+
+def table_rows() -> list[tuple[str | None, ...]]:
+    """A row a data set, as COLUMNS names them."""
+    rows: list[tuple[str | None, ...]] = []
+    for spec in all_specs():
+        counts = spec.counts.scenes, spec.counts.images
+        texts = [None if count is None else f"{count:,}" for count in counts]
+        share = f"{shares()[spec.name]:.1%}" if spec.name in shares() else None
+        rows.append((spec.name, spec.kind, *texts, share, ", ".join(spec.roles), spec.layout))
+    return rows
+
+
+def as_yaml(spec: catalogue.DataSetSpec) -> str:
+    """What is known of a data set, in the words of its file."""
+    import yaml
+
+    known = spec.model_dump(mode="json", exclude_none=True)
+    return str(yaml.safe_dump(known, sort_keys=False, allow_unicode=True, width=96))
 
 
 # --- check ------------------------------------------------------------------------------------
