@@ -486,7 +486,7 @@ def shown_frames(frames: int, *, fps: float, unit: int) -> tuple[list[int], list
     left out instead. ``unit``: ms that durations are multiples of.
 
     >>> shown_frames(6, fps=60, unit=10)
-    ([0, 2, 3, 4], [30, 20, 20, 30])
+    ([0, 1, 3, 4], [20, 30, 20, 30])
     """
     begins = [unit * round(1000 * number / fps / unit) for number in range(frames + 1)]
     shown = [0]

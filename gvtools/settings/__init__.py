@@ -2,15 +2,8 @@
 
 from __future__ import annotations
 
-from gvtools.settings.base import Settings
+from gvtools.settings.base import Settings, changes, dotted, with_file, with_texts, with_values
 from gvtools.settings.documentation import listing, markdown
-from gvtools.settings.parser import (
-    changes,
-    dotted,
-    with_file,
-    with_texts,
-    with_values,
-)
 
 __all__ = [
     "Settings",
