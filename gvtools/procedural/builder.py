@@ -4,23 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from gvtools.cameras import Float64
 from gvtools.procedural.ray_cast import BOX, RoomGeometry
 from gvtools.procedural.render import Look
 from gvtools.procedural.textures import level_starts, picture, stack_levels, texture
-
-Float64 = NDArray[np.float64]
 
 # Order of a room's materials: walls -x, +x, -y, +y, floor, ceiling.
 FLOOR, CEILING = 4, 5
 
 
-@dataclass(frozen=True, eq=False)
-class Light:
-    """See ``shading.Look``."""
+class Light(NamedTuple):
+    """The last fields of ``render.Look``."""
 
     ambient: Float64
     sun: Float64
@@ -159,20 +158,9 @@ class SceneBuilder:
 
     def look(self, light: Light) -> Look:
         """Materials and a light, for shading."""
-        rows, tile, offset, gain, emission = zip(*self.materials, strict=True)
+        rows, *rest = zip(*self.materials, strict=True)
+        tile, offset, gain, emission = (np.array(part, np.float64) for part in rest)
         side = len(self.textures[0])
-        return Look(
-            np.array(rows, np.int64),
-            np.array(tile, np.float64),
-            np.array(offset, np.float64),
-            np.array(gain, np.float64),
-            np.array(emission, np.float64),
-            stack_levels(self.textures),
-            level_starts(side),
-            side,
-            light.ambient,
-            light.sun,
-            light.lamps,
-            float(light.reach),
-            bool(light.shadows),
-        )
+        texels = stack_levels(self.textures), level_starts(side), side
+        row = np.array(rows, np.int64)
+        return Look(row, tile, offset, gain, emission, *texels, **light._asdict())

@@ -14,12 +14,14 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from PIL import Image
+from scipy.ndimage import gaussian_filter
 
+from gvtools.cameras import Float64
 from gvtools.procedural.builder import Light, ProceduralScene, SceneBuilder
 from gvtools.procedural.ray_cast import BALL, BOX, TUBE
 from gvtools.procedural.textures import photograph
 
-Float64 = NDArray[np.float64]
 UInt8 = NDArray[np.uint8]
 Color = tuple[float, float, float]
 
@@ -54,14 +56,13 @@ def globe(name: str) -> UInt8:
     return _resized(image[height // 5 : -(height // 5), width // 5 : -(width // 5)])
 
 
-def tiled(name: str, color: Color, *, contrast: float = 0.22, turned: bool = False) -> UInt8:
+def tiled(name: str, color: Color, *, contrast: float = 0.22) -> UInt8:
     """The relief of a photograph of a material in an sRGB tint.
 
     ``color``: sRGB in [0, 1], the mean. ``contrast``: standard deviation of the brightness, share
-    of the mean. ``turned``: by 90 degrees.
+    of the mean.
     """
-    relief = np.rot90(_relief(name)) if turned else _relief(name)
-    return _tinted(1 + contrast * relief, color)
+    return _tinted(1 + contrast * _relief(name), color)
 
 
 def paint(color: Color, *, grain: float = 0.05) -> UInt8:
@@ -71,9 +72,6 @@ def paint(color: Color, *, grain: float = 0.05) -> UInt8:
 
 def planks(color: Color, rng: np.random.Generator, *, rows: int = 8) -> UInt8:
     """Boards cut from the table under the cup of coffee, ``rows`` of them one above another."""
-    from PIL import Image
-    from scipy.ndimage import gaussian_filter
-
     # The grain of that table runs 32 degrees up to the right; this quadrilateral (upper left,
     # lower left, lower right, upper right) follows it beside the saucer.
     corners = (424, 120, 424, 340, 510, 285, 510, 66)
@@ -100,8 +98,6 @@ def planks(color: Color, rng: np.random.Generator, *, rows: int = 8) -> UInt8:
 
 
 def _resized(image: UInt8) -> UInt8:
-    from PIL import Image
-
     whole = Image.fromarray(np.ascontiguousarray(image))
     return np.asarray(whole.resize((SIDE, SIDE), Image.Resampling.LANCZOS))
 
@@ -109,8 +105,6 @@ def _resized(image: UInt8) -> UInt8:
 @cache
 def _relief(name: str) -> Float64:
     """(SIDE, SIDE) grey photograph of mean 0 and deviation 1, slow gradients removed."""
-    from scipy.ndimage import gaussian_filter
-
     grey = _resized(photograph(name)).astype(np.float64).mean(-1)
     grey = grey - gaussian_filter(grey, SIDE / 4, mode="mirror")
     return grey / grey.std()

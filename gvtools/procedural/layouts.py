@@ -12,13 +12,11 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gvtools.cameras import Float64
 from gvtools.procedural.builder import CEILING, Light, ProceduralScene, SceneBuilder
 from gvtools.procedural.ray_cast import BALL, BOX, TUBE, RoomGeometry, clearance
 from gvtools.procedural.textures import photograph_names
-
-Float64 = NDArray[np.float64]
 
 
 def add_clutter(

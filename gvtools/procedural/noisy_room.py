@@ -16,24 +16,23 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
+from scipy.ndimage import gaussian_filter, gaussian_filter1d, maximum_filter, minimum_filter
+from scipy.spatial.transform import Rotation
 from scipy.special import ndtr
 
-from gvtools.cameras import Cameras, invert_rigid, rigid_poses
+from gvtools.cameras import Cameras, Float64, invert_rigid, rigid_poses
 from gvtools.procedural.builder import ProceduralScene
 from gvtools.procedural.ray_cast import BOX, cast
 from gvtools.procedural.render import Look, radiance, to_srgb
 from gvtools.procedural.room_sample import check_options, room_views
-from gvtools.procedural.sample_workspace import WrittenSample, is_written, written_whole
+from gvtools.procedural.sample_workspace import WrittenSample, is_written, save_png, written_whole
 from gvtools.scenes.calibration import INTRINSICS
 from gvtools.similarity import align_poses
 
 Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 RANGE = (0.4, 6.0)  # metres
@@ -176,9 +175,9 @@ def write_noisy_room(
     with written_whole(folder, record) as partial:
         np.savetxt(partial / INTRINSICS, K, fmt="%.9g")
         for i, stem in enumerate(stems):
-            _save(partial / f"{stem}.color.png", to_srgb(light[i], key * exposure[i]))
+            save_png(partial / f"{stem}.color.png", to_srgb(light[i], key * exposure[i]))
             millimetres = np.rint(depth[i] / MILLIMETRES).astype(np.uint16)
-            _save(partial / f"{stem}.depth.png", millimetres)
+            save_png(partial / f"{stem}.depth.png", millimetres)
             np.savetxt(partial / f"{stem}.pose.txt", poses[i], fmt="%.12g")
     return sample
 
@@ -188,9 +187,6 @@ def jitter_poses(cam_from_world: Float64, rng: np.random.Generator) -> Float64:
 
     ``cam_from_world``: (V, 4, 4) rigid, metres, in the order of recording.
     """
-    from scipy.ndimage import gaussian_filter1d
-    from scipy.spatial.transform import Rotation
-
     count = len(cam_from_world)
     margin = round(4 * POSE_SMOOTH)
     weights = gaussian_filter1d(np.eye(1, 129, 64)[0], POSE_SMOOTH)
@@ -232,9 +228,3 @@ def _evenly_lit(look: Look) -> Look:
         sun=np.stack([look.sun[0], np.zeros(3)]),
         lamps=np.zeros((0, 2, 3)),
     )
-
-
-def _save(path: Path, array: NDArray[Any]) -> None:
-    from PIL import Image
-
-    Image.fromarray(array).save(path, compress_level=3)

@@ -10,12 +10,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from gvtools.cameras import Cameras, rigid_poses
+from gvtools.cameras import Cameras, Float64, rigid_poses
 from gvtools.procedural.ray_cast import RoomGeometry, cast, clearance
-
-Float64 = NDArray[np.float64]
 
 ATTEMPTS = 40
 # Rays along a side of the pictures that a path is judged by.

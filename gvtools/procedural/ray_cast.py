@@ -15,10 +15,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.cameras import Cameras
+from gvtools.cameras import Cameras, Float64
 from gvtools.kernels import FAST, compiled, in_threads
 
-Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
 BOX, BALL, TUBE = 0, 1, 2
@@ -42,36 +41,18 @@ class RoomGeometry(NamedTuple):
     cutter_material: Int64  # (M,) of the surfaces that cutting makes
 
 
-@compiled()
-def clearance(geometry, points):
+def clearance(geometry: RoomGeometry, points: Float64) -> Float64:
     """(P,) distance of points to the nearest wall or solid's hull, negative inside or outside.
 
     In a room of several boxes, the distance to the walls is that of the best box: never too large.
     """
-    out = np.empty(len(points))
-    for p in range(len(points)):
-        x = points[p, 0]
-        y = points[p, 1]
-        z = points[p, 2]
-        free = -np.inf
-        for r in range(len(geometry.rooms)):
-            inner = min(x - geometry.rooms[r, 0, 0], geometry.rooms[r, 1, 0] - x)
-            inner = min(inner, y - geometry.rooms[r, 0, 1], geometry.rooms[r, 1, 1] - y)
-            inner = min(inner, z - geometry.rooms[r, 0, 2], geometry.rooms[r, 1, 2] - z)
-            free = max(free, inner)
-        for n in range(len(geometry.kind)):
-            outer = 0.0
-            inner = -np.inf
-            for i in range(3):
-                a = geometry.rotation[n, i, 0] * (x - geometry.centre[n, 0])
-                a += geometry.rotation[n, i, 1] * (y - geometry.centre[n, 1])
-                a += geometry.rotation[n, i, 2] * (z - geometry.centre[n, 2])
-                over = abs(a) - geometry.half[n, i]
-                outer += max(over, 0.0) ** 2
-                inner = max(inner, over)
-            free = min(free, np.sqrt(outer) if outer > 0 else inner)
-        out[p] = free
-    return out
+    place = points[:, None]
+    to_walls = np.minimum(place - geometry.rooms[:, 0], geometry.rooms[:, 1] - place).min(2)
+    local = np.einsum("nij,pnj->pni", geometry.rotation, place - geometry.centre)
+    over = np.abs(local) - geometry.half
+    outside = np.linalg.norm(np.maximum(over, 0), axis=2)
+    to_hulls = np.where(outside > 0, outside, over.max(2))
+    return np.minimum(to_walls.max(1), to_hulls.min(1, initial=np.inf))
 
 
 # Ends of intervals nearer to each other than this share of the way are the same place.

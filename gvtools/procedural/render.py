@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.cameras import Cameras
+from gvtools.cameras import Cameras, Float64
 from gvtools.kernels import FAST, compiled, in_threads
 from gvtools.procedural.ray_cast import (
     CODES,
@@ -47,7 +47,6 @@ def encode_srgb(linear: Float32) -> NDArray[np.uint8]:
     return np.rint(value * 255).astype(np.uint8)
 
 
-Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
 

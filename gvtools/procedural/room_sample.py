@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.cameras import Cameras, invert_rigid
+from gvtools.cameras import Cameras, Float64, invert_rigid
 from gvtools.errors import OptionError
 from gvtools.kernels import KernelSet
 from gvtools.procedural.builder import ProceduralScene
@@ -26,7 +26,6 @@ from gvtools.procedural.sample_workspace import (
 from gvtools.trajectories import look_at
 
 Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 CONTEXT_SHARE = 0.4  # of the views
 CONTEXT_SWEEP = (0.0, 1.25)  # radians along the path, from its start
@@ -121,7 +120,6 @@ def _path(
     eye = np.column_stack([size[:2] / 2 + axis, up])
     aim = np.column_stack([size[:2] / 2 - 0.5 * axis, np.full(len(angle), 0.95)])
     poses = invert_rigid(look_at(eye, aim, up=[0.0, 0.0, 1.0]))
-    K = np.repeat(K[None], len(poses), axis=0)
     return Cameras.alike(K, poses, size=(width, height), names=context + targets)
 
 

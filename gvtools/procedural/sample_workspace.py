@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import shutil
-import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
@@ -14,9 +11,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from gvtools.cameras import Cameras
 from gvtools.errors import ProjectError
+from gvtools.files import folder_replaced_when_written, write_json
 from gvtools.scenes.colmap_writer import write_colmap
 from gvtools.scenes.images import write_depth_map
 
@@ -72,14 +71,12 @@ def is_written(folder: Path, record: dict[str, Any]) -> bool:
 
 def write_sample(folder: Path, content: SampleContent, *, record: dict[str, Any]) -> None:
     """Write images, model, depth maps and the record to a folder that is absent or empty."""
-    from PIL import Image
-
     with written_whole(folder, record) as partial:
         (partial / "images").mkdir()
         for name, image, depth in zip(
             content.cameras.names, content.images, content.depths, strict=True
         ):
-            Image.fromarray(image).save(partial / "images" / name, compress_level=3)
+            save_png(partial / "images" / name, image)
             if depth is not None:
                 write_depth_map(partial / "stereo/depth_maps" / f"{name}.geometric.bin", depth)
         point_index, view_index, xy = content.tracks
@@ -97,17 +94,11 @@ def write_sample(folder: Path, content: SampleContent, *, record: dict[str, Any]
 @contextmanager
 def written_whole(folder: Path, record: dict[str, Any]) -> Iterator[Path]:
     """A folder to write a sample into, which becomes ``folder`` with its record at the end."""
-    partial: Path | None = None
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+    with folder_replaced_when_written(folder) as partial:
         yield partial
-        (partial / RECORD).write_text(json.dumps(record, indent=1) + "\n")
-        # mkdtemp makes folders private; a sample is as readable as any other folder.
-        partial.chmod(0o755)
-        os.replace(partial, folder)
-    except OSError as error:
-        raise ProjectError(f"{folder}: the sample could not be written ({error})") from None
-    finally:
-        if partial is not None:
-            shutil.rmtree(partial, ignore_errors=True)
+        write_json(partial / RECORD, record)
+
+
+def save_png(path: Path, pixels: NDArray[Any]) -> None:
+    """A picture, packed fast rather than tightly."""
+    Image.fromarray(pixels).save(path, compress_level=3)

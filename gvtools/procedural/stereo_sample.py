@@ -12,15 +12,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.cameras import Cameras
+from gvtools.cameras import Cameras, Float64
 from gvtools.procedural.sample_workspace import (
     SampleContent,
     WrittenSample,
     is_written,
     write_sample,
 )
-
-Float64 = NDArray[np.float64]
 
 # The calibration of the full-size pair, in its pixels, first pixel's centre at 0; the shipped
 # images average blocks of 4 x 4.

@@ -11,18 +11,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from gvtools.kernels import compiled
 from gvtools.optional import installed, package_folder
 from gvtools.procedural.render import decode_srgb
-
-if TYPE_CHECKING:
-    from PIL.Image import Image
-
 
 # Names in skimage.data, and of scikit-learn's sample images ("sklearn:").
 PHOTOGRAPHS = {
@@ -55,8 +51,6 @@ def photograph_names(split: str) -> tuple[str, ...]:
 @cache
 def photograph(name: str) -> NDArray[np.uint8]:
     """(H, W, 3) uint8 sRGB, at most ``LONGEST`` pixels a side."""
-    from PIL import Image
-
     if name.startswith("sklearn:"):
         package = package_folder("sklearn", extra="train", purpose=f"photograph {name!r}")
         file = package / "datasets" / "images" / f"{name[8:]}.jpg"
@@ -98,14 +92,9 @@ def color(rng: np.random.Generator) -> Float32:
     return (value * (1 - saturation * (1 - ramp))).astype(np.float32)
 
 
-def noise(rng: np.random.Generator, side: int, *, coarsest: int | None = None) -> Float32:
-    """(side, side) float32 in [0, 1]: value noise, each octave finer and weaker than the last.
-
-    ``side``: pixels. ``coarsest``: cells along a side of the first octave; None draws it.
-    """
-    from PIL import Image
-
-    cells = int(rng.integers(2, 9)) if coarsest is None else coarsest
+def noise(rng: np.random.Generator, side: int) -> Float32:
+    """(side, side) float32 in [0, 1]: value noise, each octave finer and weaker than the last."""
+    cells = int(rng.integers(2, 9))  # along a side of the first octave
     persistence = rng.uniform(0.35, 0.75)
     total = np.zeros((side, side), np.float32)
     weight = 1.0
@@ -225,9 +214,7 @@ def picture(rng: np.random.Generator, photographs: Sequence[str]) -> NDArray[np.
     turned by 90 degrees, its channels are exchanged; dark ones are lifted; contrast, gains and tint
     are changed.
     """
-    from PIL import Image
-
-    image = _image(photographs[int(rng.integers(len(photographs)))])
+    image = Image.fromarray(photograph(photographs[int(rng.integers(len(photographs)))]))
     shorter = min(image.size)
     height = shorter * np.exp(rng.uniform(np.log(0.25), 0))
     width = min(height * rng.uniform(0.7, 1.4), image.size[0])
@@ -258,13 +245,6 @@ def _recoloured(crop: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np
         table = (1 - share) * table + share * color(rng)
     table = np.clip(np.rint(table * 255), 0, 255).astype(np.uint8)
     return np.stack([table[crop[..., channel], channel] for channel in range(3)], axis=-1)
-
-
-@cache
-def _image(name: str) -> Image:
-    from PIL import Image
-
-    return Image.fromarray(photograph(name))
 
 
 def level_starts(side: int) -> NDArray[np.int64]:
