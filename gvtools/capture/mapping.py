@@ -18,22 +18,20 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
 from gvtools.cameras import reduced_size
+from gvtools.capture.panoramas import FaceRig
+from gvtools.colmap import pycolmap
 from gvtools.errors import ProjectError
 from gvtools.features import FeatureMatcher, Features, quiet_colmap, root_sift
 from gvtools.poses.colmap import SEED, adjust, extract_sift, fix_cameras, list_pairs, verification
 from gvtools.scenes.images import check_size, read_image, read_mask
-
-if TYPE_CHECKING:
-    import pycolmap
-
-    from gvtools.capture.panoramas import FaceRig
 
 # Up to this many pictures, every pair is matched; fewer with LightGlue, which takes a second a pair
 # on a processor.
@@ -121,8 +119,6 @@ class MappingResult:
 
 def find_cameras(task: MappingTask) -> MappingResult:
     """Find intrinsics and poses of pictures."""
-    from gvtools.colmap import pycolmap
-
     source, count = task.source or task.images, len(task.names)
     with quiet_colmap(errors=False):
         pycolmap.set_random_seed(SEED)
@@ -187,8 +183,6 @@ def _map(
 
     Intrinsics of faces, and their rotations, are fixed. None where neither gives a model.
     """
-    from gvtools.colmap import pycolmap
-
     globally, pipeline = pycolmap.GlobalPipelineOptions(), pycolmap.IncrementalPipelineOptions()
     globally.random_seed = pipeline.random_seed = SEED
     # COLMAP's default drops models of fewer than 10 pictures.
@@ -218,14 +212,11 @@ def _map(
             share = _explained(models, pairs)
             if best is None or share > best[2]:
                 best = how, models, share
-        if how == "global" and not models:
-            task.say("global mapping gives no model; trying incremental mapping")
-        elif how == "global" and share >= ENOUGH:
+        if models and share >= ENOUGH:
             break
-        elif how == "global":
-            task.say(
-                f"global mapping explains {share:.0%} of the matches; trying incremental mapping"
-            )
+        if how == "global":
+            told = f"explains {share:.0%} of the matches" if models else "gives no model"
+            task.say(f"global mapping {told}; trying incremental mapping")
     return best
 
 
@@ -257,10 +248,6 @@ def shared_points(model: pycolmap.Reconstruction) -> Counter[tuple[str, str]]:
 
 def _settle(model: pycolmap.Reconstruction, *, refine: bool) -> None:
     """Deregister pictures that see too few points, then bundle-adjust the rest once more."""
-    from gvtools.colmap import pycolmap
-
-    if model.num_reg_images() < 2:
-        return
     # Counted by frame (COLMAP's word for one shot of a rig): a panorama's faces stay together.
     seen: Counter[int] = Counter()
     for image in model.images.values():
@@ -286,8 +273,6 @@ def _settle(model: pycolmap.Reconstruction, *, refine: bool) -> None:
 
 def match_pictures(task: MappingTask) -> tuple[Path, str]:
     """Fill a database with features and verified matches; returns it, and how pairs were chosen."""
-    from gvtools.colmap import pycolmap
-
     database, learned, rigs = task.work / "database.db", task.learned, task.rigs
     given = {
         rig.names(face)[0]: ("PINHOLE", face.target.params_to_string())
@@ -334,8 +319,6 @@ def match_pictures(task: MappingTask) -> tuple[Path, str]:
 
 def _match_sift(database: Path, task: MappingTask) -> str:
     """Match SIFT of pairs of pictures; returns in words how the pairs were chosen."""
-    from gvtools.colmap import pycolmap
-
     options, count = pycolmap.FeatureMatchingOptions(), len(task.names)
     options.skip_image_pairs_in_same_frame = bool(task.rigs)
     if count <= EXHAUSTIVE:
@@ -385,8 +368,6 @@ def similar_pairs(
     the nearest of WORDS centres, which k-means finds among all of them. Each gets ``nearest``
     partners, and may be chosen by more; ``described`` holds (N, D) unit descriptors by name.
     """
-    import cv2
-
     # In the order of names, so that pairs are chosen alike every time.
     names = sorted(name for name, rows in described.items() if len(rows))
     if len(names) < 2:
@@ -414,8 +395,6 @@ def similar_pairs(
 
 def sift_descriptors(database: Path) -> dict[str, NDArray[np.float32]]:
     """(N, 128) RootSIFT descriptors of each picture in COLMAP's database."""
-    from gvtools.colmap import pycolmap
-
     described = {}
     with pycolmap.Database.open(database) as opened:
         for image in opened.read_all_images():
@@ -472,8 +451,6 @@ def learned_features(
 
 def write_keypoints(database: Path, features: Mapping[str, Features]) -> None:
     """Write keypoints of all of the database's pictures, by their names."""
-    from gvtools.colmap import pycolmap
-
     with pycolmap.Database.open(database) as opened:
         for image in opened.read_all_images():
             opened.write_keypoints(image.image_id, features[image.name].xy.astype(np.float32))
@@ -481,8 +458,6 @@ def write_keypoints(database: Path, features: Mapping[str, Features]) -> None:
 
 def verified(database: Path) -> dict[tuple[str, str], int]:
     """Pairs of pictures that overlap, with the number of their verified matches."""
-    from gvtools.colmap import pycolmap
-
     with pycolmap.Database.open(database) as opened:
         names = {image.image_id: image.name for image in opened.read_all_images()}
         numbers, counts = opened.read_two_view_geometry_num_inliers()
@@ -499,8 +474,6 @@ def flat_pairs(database: Path) -> list[tuple[NDArray[np.float64], tuple[int, int
 
     Two-view geometry then has no depth to go by: the scene is flat, or the camera only turned.
     """
-    from gvtools.colmap import pycolmap
-
     kinds = pycolmap.TwoViewGeometryConfiguration
     flat = (kinds.PLANAR, kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC)
     with pycolmap.Database.open(database) as opened:

@@ -11,7 +11,6 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,12 +18,10 @@ from PIL import Image
 
 from gvtools.cameras import reduced_size
 from gvtools.capture.photographs import JPEG_QUALITY, CapturedPhotograph
+from gvtools.colmap import pycolmap
 from gvtools.errors import OptionError
 from gvtools.scenes.faces import FACE_DEGREES, PANORAMA, Face, face_name, panorama_faces
 from gvtools.scenes.images import read_image, read_mask
-
-if TYPE_CHECKING:
-    import pycolmap
 
 LENSES = ("auto", "perspective", "equirectangular", "fisheye")
 # XMP of Google's photo sphere schema, near the beginning of a file.
@@ -59,8 +56,6 @@ class FaceRig:
 
     def config(self) -> pycolmap.RigConfig:
         """The rig as COLMAP has it: the first face is its reference."""
-        from gvtools.colmap import pycolmap
-
         reference = self.faces[0].rotation
         cameras = []
         for number, face in enumerate(self.faces):
@@ -143,8 +138,6 @@ def write_faces(
     photographs: Sequence[CapturedPhotograph], images: Path, *, masks: Path | None, face_masks: Path
 ) -> list[FaceRig]:
     """Cut panoramas into faces, see ``FaceRig.names``, and their masks ``NAME.png`` likewise."""
-    from gvtools.colmap import pycolmap
-
     sizes: dict[tuple[int, int], list[CapturedPhotograph]] = {}
     for item in photographs:
         sizes.setdefault(item.size, []).append(item)

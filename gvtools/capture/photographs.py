@@ -13,9 +13,11 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageOps
+from scipy.ndimage import gaussian_filter
 
 from gvtools.errors import ProjectError
 from gvtools.scenes.images import (
@@ -137,8 +139,6 @@ def find_photographs(folder: Path) -> tuple[list[CapturedPhotograph], list[Findi
 
 def _copies(found: Sequence[CapturedPhotograph]) -> list[str]:
     """Names of pictures that show what larger ones, or as large ones of shorter names, show."""
-    from scipy.ndimage import gaussian_filter
-
     order = sorted(found, key=lambda item: (-item.size[0] * item.size[1], len(item.name)))
     grey = np.array([item.thumbnail for item in order], np.float32).reshape(-1, *THUMBNAIL)
     whole, detail = _all_ways(grey), _all_ways(grey - gaussian_filter(grey, (0, 2, 2)))
@@ -206,8 +206,6 @@ def _upright(image: Image.Image) -> Image.Image:
 
 def sharpness(grey: np.ndarray) -> float:
     """Variance of the Laplacian of an (H, W) uint8 picture: low where it is blurred."""
-    import cv2
-
     return float(cv2.Laplacian(grey, cv2.CV_64F).var())
 
 

@@ -12,10 +12,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from gvtools.cameras import Cameras
@@ -34,7 +33,9 @@ from gvtools.capture.photographs import (
     copy_upright,
     find_photographs,
 )
+from gvtools.colmap import pycolmap
 from gvtools.errors import OptionError, ProjectError
+from gvtools.features import LightGlueMatcher
 from gvtools.files import write_json
 from gvtools.poses.colmap import SEED
 from gvtools.runs.folder import folder_lock
@@ -42,11 +43,6 @@ from gvtools.scenes.faces import face_name, picture_of
 from gvtools.scenes.matching import named
 from gvtools.scenes.scene import Finding
 from gvtools.trajectories import level_up
-
-if TYPE_CHECKING:
-    import pycolmap
-
-    from gvtools.features import LightGlueMatcher
 
 REPORT = "capture.json"
 IMAGES, MODEL = "images", "sparse/0"
@@ -319,9 +315,8 @@ def place(
     Locations are latitude and longitude [degrees] and height [m] of pictures by name; the distance
     is that of the places where two pictures were taken, metres.
     """
-    from gvtools.colmap import pycolmap
-
-    placed = {name: value for name, value in locations.items() if _found(model, name) is not None}
+    images = {name: _registered(model, name) for name in locations}
+    placed = {image.name: locations[name] for name, image in images.items() if image is not None}
     placement: WorldPlacement | None = None
     findings: list[Finding] = []
     if len(placed) >= LEAST_PLACED:
@@ -333,12 +328,12 @@ def place(
         first, second, metres = distance
         ends = []
         for name in (first, second):
-            centre = _found(model, name)
-            if centre is None:
+            image = _registered(model, name)
+            if image is None:
                 raise OptionError(
                     f"--distance: {name!r} is no registered picture; give two that are"
                 )
-            ends.append(centre)
+            ends.append(image.projection_center())
         apart = float(np.linalg.norm(ends[0] - ends[1]))
         if apart <= 1e-9:
             raise OptionError(f"--distance: {first!r} and {second!r} were taken at one place")
@@ -348,17 +343,15 @@ def place(
     return placement, findings
 
 
-def _found(model: pycolmap.Reconstruction, name: str) -> NDArray[np.float64] | None:
+def _registered(model: pycolmap.Reconstruction, name: str) -> pycolmap.Image | None:
     # All faces of a panorama are at its place.
     image = model.find_image_with_name(name) or model.find_image_with_name(face_name(name, "front"))
-    return None if image is None or not image.has_pose else np.asarray(image.projection_center())
+    return image if image is not None and image.has_pose else None
 
 
 def _by_gps(
     model: pycolmap.Reconstruction, placed: Mapping[str, tuple[float, float, float]]
 ) -> tuple[WorldPlacement | None, list[Finding]]:
-    from gvtools.colmap import pycolmap
-
     names, values = list(placed), np.array(list(placed.values()))
     origin = values.mean(axis=0)
     east = np.asarray(pycolmap.GPSTransform().ellipsoid_to_enu(values, *origin))
@@ -372,16 +365,13 @@ def _by_gps(
         return None, [Finding("info", text)]
     options = pycolmap.RANSACOptions()
     options.max_error, options.random_seed = GPS_ERROR, SEED
-    fronts = [
-        name if model.find_image_with_name(name) is not None else face_name(name, "front")
-        for name in names
-    ]
-    moved = pycolmap.align_reconstruction_to_locations(model, fronts, east, LEAST_PLACED, options)
+    moved = pycolmap.align_reconstruction_to_locations(model, names, east, LEAST_PLACED, options)
     if moved is None:
         text = f"GPS of {len(names)} pictures contradicts the cameras that were found: not used"
         return None, [Finding("warning", text)]
     model.transform(moved)
-    found = np.array([_found(model, name) for name in names])
+    images = {image.name: image for image in model.images.values()}
+    found = np.array([images[name].projection_center() for name in names])
     error = float(np.median(np.linalg.norm(found - east, axis=1)))
     text = f"placed by GPS of {len(names)} pictures, which it differs from by {error:.2f} m"
     latitude, longitude, height = origin.tolist()
@@ -391,8 +381,6 @@ def _by_gps(
 
 def _level(model: pycolmap.Reconstruction) -> None:
     """Rotate the vertical, as the cameras were held, to +z, and move their mean centre to 0."""
-    from gvtools.colmap import pycolmap
-
     images = [image for image in model.images.values() if image.has_pose]
     poses = np.tile(np.eye(4), (len(images), 1, 1))
     poses[:, :3] = [image.cam_from_world().matrix() for image in images]

@@ -193,11 +193,9 @@ def _write(
         np.savetxt(work / f"{stem}.pose.txt", pose, fmt=DIGITS)
     options = recording.options
     np.savetxt(work / INTRINSICS, np.asarray(options.color_K)[:3, :3], fmt=DIGITS)
-    names_kept = ("depth_unit", "depth_K", "color_from_depth", "distortion", "depth_max")
-    sidecar = {name: getattr(options, name) for name in names_kept}
-    write_json(
-        work / SIDECAR, {name: value for name, value in sidecar.items() if value is not None}
-    )
+    fields = ("depth_unit", "depth_K", "color_from_depth", "distortion", "depth_max")
+    given = {name: getattr(options, name) for name in fields}
+    write_json(work / SIDECAR, {name: x for name, x in given.items() if x is not None})
 
 
 def _report(

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -87,8 +88,6 @@ def _measure(
     path: Path, progress: Callable[[int], object]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], int]:
     """(N,) motion up to each frame, in widths, (N,) sharpness of each, and N as announced."""
-    import cv2
-
     try:
         size = regular(path).stat().st_size
     except OSError as error:
@@ -126,8 +125,6 @@ def _measure(
 
 def _motion(before: NDArray[Any], now: NDArray[Any]) -> float:
     """Median motion of corners between two frames, in widths of the picture."""
-    import cv2
-
     corners = cv2.goodFeaturesToTrack(before, CORNERS, 0.01, 5)
     if corners is None or len(corners) < 8:
         return 0.0
@@ -140,8 +137,6 @@ def _motion(before: NDArray[Any], now: NDArray[Any]) -> float:
 
 
 def _write(path: Path, folder: Path, chosen: list[int]) -> None:
-    import cv2
-
     folder.mkdir(parents=True, exist_ok=True)
     video, wanted, number = cv2.VideoCapture(str(path)), set(chosen), 0
     while wanted:

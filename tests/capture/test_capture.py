@@ -16,7 +16,7 @@ from command_line import arguments, refused
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from gvtools.cameras import Cameras, invert_rigid
+from gvtools.cameras import Cameras, invert_rigid, rigid_poses
 from gvtools.capture.mapping import MappingTask, find_cameras, sift_descriptors, similar_pairs
 from gvtools.capture.panoramas import (
     fisheye_params,
@@ -48,21 +48,11 @@ def captured(room: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def centre_error(found: Path, truth: Path) -> float:
-    """Largest error of a centre after a similarity, as a share of the centres' extent."""
-    mine, true = open_project(found), open_project(truth)
-    a = mine.cameras.centers
-    b = np.concatenate([true[name].camera.centers for name in mine.names])
-    similarity = pycolmap.estimate_sim3d(a, b)
-    moved = np.array([similarity * row for row in a])
-    return float(np.linalg.norm(moved - b, axis=1).max() / np.ptp(b, axis=0).max())
-
-
-def test_cameras_are_found_from_the_pictures_alone(room: Path, captured: Path) -> None:
+def test_cameras_are_found_from_the_pictures_alone(captured, centre_error) -> None:
     scene = open_project(captured)
     # The last ones along the path show hardly anything of the others.
     assert len(scene) >= 8
-    assert centre_error(captured, room) < 0.03
+    assert centre_error(scene.names, scene.cameras.centers) < 0.03
     report = json.loads((captured / "capture.json").read_text())
     assert report["registered"] == list(scene.names)
     assert len(report["registered"]) + len(report["left_out"]) == 10
@@ -93,15 +83,11 @@ def test_the_model_is_level_and_takes_a_given_length(captured: Path) -> None:
 
 def test_cameras_that_look_down_are_levelled_by_how_they_are_held() -> None:
     """Their mean up leans by half of how far they look down, where they look one way."""
-    yaw = np.radians(np.linspace(-60, 60, 12))
+    yaw, centers = np.radians(np.linspace(-60, 60, 12)), np.arange(36).reshape(12, 3)
     aim = np.stack([np.sin(yaw), np.cos(yaw), np.full(12, -0.8)], axis=1)
-    world = look_at(np.arange(36).reshape(12, 3), np.arange(36).reshape(12, 3) + aim, up=[0, 0, 1])
-    turn = np.eye(4)
-    turn[:3, :3] = Rotation.from_euler("xyz", [20, -50, 80], degrees=True).as_matrix()
-    one = np.array(64)
-    cameras = Cameras(np.tile(np.diag([60.0, 60, 1]), (12, 1, 1)), invert_rigid(turn @ world),
-                      one, one, ())  # fmt: skip
-    none = np.zeros(0, np.int64)
+    turn = rigid_poses(Rotation.from_euler("xyz", [20, -50, 80], degrees=True).as_matrix())
+    pose = invert_rigid(turn @ look_at(centers, centers + aim, up=[0, 0, 1]))
+    cameras, none = Cameras.alike(np.diag([60.0, 60, 1]), pose, size=(64, 64)), np.zeros(0, int)
     model = build_reconstruction(
         cameras, np.zeros((0, 3)), np.zeros((0, 3), np.uint8), point_index=none, view_index=none,
         xy=np.zeros((0, 2)),
@@ -178,16 +164,15 @@ def test_wrong_inputs_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[
     (tmp_path / "there").mkdir()
     (tmp_path / "there/file").touch()
     (tmp_path / "text.txt").touch()
-    out = ("--out", tmp_path / "out")
-    assert "at least two photographs" in refused(capsys, "capture", tmp_path / "empty", *out)
-    assert "no such file" in refused(capsys, "capture", tmp_path / "nothing", *out)
-    assert "expected a folder (or .zip) of photographs" in refused(
-        capsys, "capture", tmp_path / "text.txt", *out
-    )
-    assert "nothing is overwritten" in refused(
-        capsys, "capture", tmp_path / "empty", "--out", tmp_path / "there"
-    )
-    assert "A,B,METRES" in refused(capsys, "capture", tmp_path / "empty", *out, "--distance", "a,b")
+    for said, source, out, *more in (
+        ("at least two photographs", "empty", "out"),
+        ("no such file", "nothing", "out"),
+        ("expected a folder (or .zip) of photographs", "text.txt", "out"),
+        ("nothing is overwritten", "empty", "there"),
+        ("A,B,METRES", "empty", "out", "--distance", "a,b"),
+    ):
+        command = ("capture", tmp_path / source, "--out", tmp_path / out, *more)
+        assert said in refused(capsys, *command)
 
 
 def test_pairs_are_found_by_what_pictures_look_like(room: Path, tmp_path: Path) -> None:
@@ -367,6 +352,10 @@ def panorama():
 
 
 def test_panoramas_are_told_from_wide_pictures(tmp_path):
+    xmp = b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><GPano:ProjectionType>equirectangular</x:xmpmeta>'
+    pixels = np.random.default_rng(0).integers(0, 255, (64, 128, 3), np.uint8)
+    assert lens_of([photograph(tmp_path, "d.jpg", pixels)], "auto") == "perspective"
+    assert lens_of([photograph(tmp_path, "e.jpg", pixels, xmp=xmp)], "auto") == "equirectangular"
     whole = photograph(tmp_path, "a.png", panorama())
     half = photograph(tmp_path, "b.png", np.ascontiguousarray(panorama()[:, 20:84][:32]))
     assert half.size == (64, 32)
@@ -378,13 +367,6 @@ def test_panoramas_are_told_from_wide_pictures(tmp_path):
     square = photograph(tmp_path, "c.png", np.full((50, 50, 3), 99, np.uint8))
     with pytest.raises(OptionError, match="not twice as wide as high"):
         lens_of([square], "equirectangular")
-
-
-def test_xmp_names_a_panorama(tmp_path):
-    xmp = b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><GPano:ProjectionType>equirectangular</x:xmpmeta>'
-    pixels = np.random.default_rng(0).integers(0, 255, (64, 128, 3), np.uint8)
-    assert lens_of([photograph(tmp_path, "a.jpg", pixels)], "auto") == "perspective"
-    assert lens_of([photograph(tmp_path, "b.jpg", pixels, xmp=xmp)], "auto") == "equirectangular"
 
 
 def test_fisheyes_have_dark_corners(tmp_path):
@@ -411,14 +393,7 @@ def test_faces_become_a_rig_with_one_centre(tmp_path):
     assert all((tmp_path / "images" / name).is_file() for name in names)
     database = tmp_path / "database.db"
     pycolmap.Database.open(database).close()
-    for face in rig.faces:
-        reader = pycolmap.ImageReaderOptions()
-        reader.camera_model = "PINHOLE"
-        reader.camera_params = face.target.params_to_string()
-        pycolmap.import_images(
-            database, tmp_path / "images", camera_mode=pycolmap.CameraMode.SINGLE,
-            image_names=rig.names(face), options=reader,
-        )  # fmt: skip
+    pycolmap.import_images(database, tmp_path / "images", pycolmap.CameraMode.PER_FOLDER)
     with pycolmap.Database.open(database) as opened:
         pycolmap.apply_rig_config([rig.config()], opened)
         frames = opened.read_all_frames()

@@ -149,12 +149,6 @@ def test_frames_that_cannot_be_read_are_left_out_and_named(walked, tmp_path, cap
     assert "5 of 6 frames" in line and "copy these again" in line
 
 
-def test_a_phone_export_with_poses_is_no_capture(tmp_path, capsys) -> None:
-    polycam(tmp_path / "walk")
-    line = refused(capsys, "capture", tmp_path / "walk", "--out", tmp_path / "out")
-    assert "has poses already; expected a recording without; give it to" in line
-
-
 def test_features_start_pairs_that_motion_alone_does_not(walked, recording) -> None:
     poses = walked[0]
     found = read_unposed(recording, RgbdOptions())
@@ -191,32 +185,30 @@ def test_a_flat_wall_does_not_let_the_camera_slide(tmp_path) -> None:
 
 
 def test_what_cannot_be_captured_is_refused(walked, recording, captured, tmp_path, capsys) -> None:
-    out = tmp_path / "out"
-    assert "has poses already" in refused(capsys, "capture", captured, "--out", out)
-    assert "--frames: of photographs" in refused(
-        capsys, "capture", recording, "--frames", 5, "--out", out
-    )
-    assert "12 RGB-D frames without poses; find the cameras first: gvtools capture" in refused(
-        capsys, "check", recording
-    )
-    photographs = tmp_path / "photographs"
+    out, (_, rgb, depth) = tmp_path / "out", walked
+    photographs, bag = tmp_path / "photographs", tmp_path / "damaged.bag"
     photographs.mkdir()
     (photographs / "a.jpg").write_bytes((recording / "frame-000000.color.png").read_bytes())
-    assert "no folder of colour and depth" in refused(
-        capsys, "capture", photographs, "--depth-unit", 0.001, "--out", out
-    )
-    single = write_sevenscenes(tmp_path / "single", walked[1][:1], walked[2][:1])
-    assert "1 frames with picture and depth" in refused(capsys, "capture", single, "--out", out)
-    (single / "camera-intrinsics.txt").unlink()
-    assert "no camera-intrinsics.txt" in refused(capsys, "capture", single, "--out", out)
-    strange = write_sevenscenes(
-        tmp_path / "strange", walked[1][:2], np.stack([walked[2][0], np.zeros_like(walked[2][0])])
-    )
-    assert "no two of 2 frames agree" in refused(capsys, "capture", strange, "--out", out)
-    (tmp_path / "damaged.bag").write_bytes(bytes(1000))
-    assert "Open3D cannot read it" in refused(
-        capsys, "capture", tmp_path / "damaged.bag", "--out", out
-    )
+    polycam(tmp_path / "walk")
+    single = write_sevenscenes(tmp_path / "single", rgb[:1], depth[:1])
+    alone = write_sevenscenes(tmp_path / "alone", rgb[:1], depth[:1])
+    (alone / "camera-intrinsics.txt").unlink()
+    blind = np.stack([depth[0], np.zeros_like(depth[0])])
+    strange = write_sevenscenes(tmp_path / "strange", rgb[:2], blind)
+    bag.write_bytes(bytes(1000))
+    for said, source, *more in (
+        ("has poses already", captured),
+        ("has poses already; expected a recording without; give it to", tmp_path / "walk"),
+        ("--frames: of photographs", recording, "--frames", 5),
+        ("no folder of colour and depth", photographs, "--depth-unit", 0.001),
+        ("1 frames with picture and depth", single),
+        ("no camera-intrinsics.txt", alone),
+        ("no two of 2 frames agree", strange),
+        ("Open3D cannot read it", bag),
+    ):
+        assert said in refused(capsys, "capture", source, *more, "--out", out)
+    line = refused(capsys, "check", recording)
+    assert "12 RGB-D frames without poses; find the cameras first: gvtools capture" in line
     assert not out.exists()
     assert not list(tmp_path.glob(".*"))
 

@@ -16,7 +16,6 @@ from gvtools.capture import mapping
 from gvtools.capture.mapping import MappingTask, find_cameras
 from gvtools.errors import CheckpointError, OptionError
 from gvtools.features import Features, LightGlueMatcher, SiftMatcher
-from gvtools.scenes.project import open_project
 
 
 @pytest.fixture(scope="module")
@@ -93,33 +92,21 @@ def test_keypoints_are_in_the_pictures_pixels(tmp_path: Path) -> None:
     assert np.allclose(np.asarray(stored)[:, :2], whole.xy)
 
 
-def error_of(model: pycolmap.Reconstruction, room: Path, *, least: int) -> float:
-    """Largest error of a centre after a similarity, as a share of the centres' extent."""
-    true = open_project(room)
-    images = [image for image in model.images.values() if image.has_pose]
-    assert len(images) >= least
-    found = np.stack([image.projection_center() for image in images])
-    truth = np.concatenate([true[image.name].camera.centers for image in images])
-    similarity = pycolmap.estimate_sim3d(found, truth)
-    moved = np.array([similarity * row for row in found])
-    return float(np.linalg.norm(moved - truth, axis=1).max() / np.ptp(truth, axis=0).max())
+NETWORKS = [pytest.param(name, marks=pytest.mark.slow) for name in ("aliked", "disk")]
 
 
-def test_what_a_matcher_finds_becomes_a_model(room: Path, tmp_path: Path) -> None:
-    """SIFT by the way that learned features take: the same cameras as by COLMAP's own."""
-    names = sorted(path.name for path in (room / "images").iterdir())[:7]
-    mapped = find_cameras(MappingTask(room / "images", [names], tmp_path, learned=SiftMatcher()))
-    assert mapped.matching == "all pairs"
-    assert error_of(mapped.model, room, least=6) < 0.03
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("extractor", ["aliked", "disk"])
-def test_a_model_comes_of_published_networks(extractor: str, room: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("extractor", ["sift", *NETWORKS])
+def test_what_a_matcher_finds_becomes_a_model(extractor, room, centre_error, tmp_path):
+    """Of SIFT by the way that learned features take: the same cameras as by COLMAP's own."""
+    sift = extractor == "sift"
     try:
-        matcher = LightGlueMatcher(extractor, max_features=1024)
+        matcher = SiftMatcher() if sift else LightGlueMatcher(extractor)
     except CheckpointError as absent:
         pytest.skip(str(absent))
     names = sorted(path.name for path in (room / "images").iterdir())[:7]
     mapped = find_cameras(MappingTask(room / "images", [names], tmp_path, learned=matcher))
-    assert error_of(mapped.model, room, least=6) < 0.05
+    assert mapped.matching == "all pairs"
+    images = [image for image in mapped.model.images.values() if image.has_pose]
+    assert len(images) >= 6
+    centers = [image.projection_center() for image in images]
+    assert centre_error([image.name for image in images], centers) < (0.03 if sift else 0.05)

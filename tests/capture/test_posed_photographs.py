@@ -27,8 +27,20 @@ pytestmark = pytest.mark.usefixtures("unpainted")
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def refused_poses(capsys, images, poses, out):
-    return refused(capsys, "capture", images, "--poses", poses, "--out", out)
+def refused_poses(capsys, images, poses):
+    out = poses.with_name("refused")
+    line = refused(capsys, "capture", images, "--poses", poses, "--out", out)
+    assert not out.exists()
+    return line
+
+
+def saved(folder, cameras, pictures, **arrays):
+    """Photographs, and what a network saved of them."""
+    (folder / "images").mkdir()
+    for name, rgb in zip(cameras.names, pictures, strict=True):
+        cv2.imwrite(str(folder / "images" / name), rgb)
+    np.savez(folder / "x.npz", extrinsics=cameras.cam_from_world, intrinsics=cameras.K, **arrays)
+    return folder / "images", folder / "x.npz"
 
 
 @pytest.fixture(scope="module")
@@ -198,76 +210,62 @@ def test_a_wrong_count_is_refused(truth, depths, room, tmp_path, capsys):
     (tmp_path / "model.safetensors").touch()
     shutil.copytree(room / "images", tmp_path / "fewer")
     next(iter(sorted((tmp_path / "fewer").iterdir()))).unlink()
-    line = refused_poses(capsys, tmp_path / "fewer", poses.parent, tmp_path / "out")
+    line = refused_poses(capsys, tmp_path / "fewer", poses.parent)
     assert "10 cameras without names" in line and "9 pictures" in line
-    assert not (tmp_path / "out").exists()
 
 
-def test_pictures_in_another_order_are_refused(truth, room, tmp_path, capsys):
+def test_pictures_in_another_order_are_refused(truth, tmp_path, capsys):
     """Faint ones, as those of a slow film: each resembles its neighbours."""
-    cameras, pictures = truth
-    faint = [100 + rgb // 6 for rgb in pictures]
-    (tmp_path / "images").mkdir()
-    for name, rgb in zip(cameras.names, faint, strict=True):
-        cv2.imwrite(str(tmp_path / "images" / name), rgb)
-    np.savez(
-        tmp_path / "x.npz", extrinsics=cameras.cam_from_world, intrinsics=cameras.K,
-        images=np.roll(faint, 1, axis=0),
-    )  # fmt: skip
-    line = refused_poses(capsys, tmp_path / "images", tmp_path / "x.npz", tmp_path / "out")
+    faint = np.stack([100 + rgb // 6 for rgb in truth[1]])
+    others = np.roll(faint, 1, axis=0)
+    line = refused_poses(capsys, *saved(tmp_path, truth[0], faint, images=others))
     assert "picture 1 is to be 0.png, which looks like number 2" in line
 
 
-def test_pictures_of_several_shapes_need_those_of_the_network(truth, room, tmp_path, capsys):
-    cameras, pictures = truth
-    (tmp_path / "images").mkdir()
-    for row, (name, rgb) in enumerate(zip(cameras.names, pictures, strict=True)):
-        cv2.imwrite(str(tmp_path / "images" / name), rgb[: 120 - 40 * (row == 3)])
-    np.savez(
-        tmp_path / "x.npz", extrinsics=cameras.cam_from_world, intrinsics=cameras.K,
-        depth=np.ones((10, 70, 84)),
-    )  # fmt: skip
-    line = refused_poses(capsys, tmp_path / "images", tmp_path / "x.npz", tmp_path / "out")
+def test_pictures_of_several_shapes_need_those_of_the_network(truth, tmp_path, capsys):
+    shapes = [rgb[: 120 - 40 * (row == 3)] for row, rgb in enumerate(truth[1])]
+    line = refused_poses(capsys, *saved(tmp_path, truth[0], shapes, depth=np.ones((10, 70, 84))))
     assert "of 84x70 pixels, and the photographs are of several shapes" in line
 
 
 def test_a_name_that_two_cameras_share_is_no_pictures(truth, room, tmp_path, capsys):
     cameras = replace(truth[0], names=tuple(f"{'ab'[row % 2]}/{row // 2}.png" for row in range(10)))
-    write_colmap(tmp_path / "sparse", cameras)
-    line = refused_poses(capsys, room / "images", tmp_path, tmp_path / "out")
+    write_colmap(tmp_path / "net/sparse", cameras)
+    line = refused_poses(capsys, room / "images", tmp_path / "net")
     assert "cameras of a/0.png" in line
 
 
 def test_poses_alone_of_pictures_without_features_become_a_project(truth, tmp_path):
-    cameras = truth[0][:3]
-    (tmp_path / "images").mkdir()
-    for row, name in enumerate(cameras.names):
-        rgb = np.repeat(np.mgrid[:120, :160].sum(axis=0)[..., None] * (row + 2) // 8, 3, axis=2)
-        cv2.imwrite(str(tmp_path / "images" / name), rgb.astype(np.uint8))
-    np.savez(tmp_path / "x.npz", extrinsics=cameras.cam_from_world, intrinsics=cameras.K)
-    run_command(
-        "capture", tmp_path / "images", "--poses", tmp_path / "x.npz", "--out", tmp_path / "out"
-    )
+    ramp = np.repeat(np.mgrid[:120, :160].sum(axis=0)[..., None], 3, axis=2)
+    pictures = [(ramp * steep // 8).astype(np.uint8) for steep in (2, 3, 4)]
+    images, poses = saved(tmp_path, truth[0][:3], pictures)
+    run_command("capture", images, "--poses", poses, "--out", tmp_path / "out")
     assert len(open_project(tmp_path / "out")) == 3
 
 
+EYES, KS = np.tile(np.eye(4), (3, 1, 1)), np.tile(np.diag([9.0, 9, 1]), (3, 1, 1))
+LOST = np.where(np.arange(3)[:, None, None] == 1, np.nan, EYES)
+
+
 @pytest.mark.parametrize(
-    ("arrays", "reason"),
+    ("name", "content", "reason"),
     [
-        ({"extrinsics": np.array([None])}, "type object"),
-        ({"depth": np.ones((2, 4, 4))}, "no poses"),
-        ({"extrinsics": np.tile(np.eye(4), (3, 1, 1))}, "no intrinsics"),
-        (
-            {"extrinsics": np.tile(2 * np.eye(4)[:3], (10, 1, 1)),
-             "intrinsics": np.tile(np.diag([9.0, 9, 1]), (10, 1, 1))},
-            "no rotation",
-        ),
+        ("x.npz", {"extrinsics": np.array([None])}, "type object"),
+        ("x.npz", {"depth": np.ones((2, 4, 4))}, "no poses"),
+        ("x.npz", {"extrinsics": EYES}, "no intrinsics"),
+        ("x.npz", {"extrinsics": 2 * EYES[:, :3], "intrinsics": KS}, "no rotation"),
+        ("nan.npz", {"extrinsics": LOST, "intrinsics": KS}, "nan.npz: unreadable (pose 1"),
+        ("scene.glb", b"glTF", "ends early"),
+        ("model.pt", b"glTF", "needs pickle"),
+        ("x.txt", b"glTF", "'.txt'"),
+        ("points.ply", b"glTF", "without cameras"),
     ],
-)  # fmt: skip
-def test_other_files_are_refused(arrays, reason, room, tmp_path, capsys):
-    np.savez(tmp_path / "x.npz", **arrays)
-    line = refused_poses(capsys, room / "images", tmp_path / "x.npz", tmp_path / "o")
-    assert reason in line
+)
+def test_other_files_are_refused_for_what_they_lack(name, content, reason, room, tmp_path, capsys):
+    file = tmp_path / name
+    file.write_bytes(content) if isinstance(content, bytes) else np.savez(file, **content)
+    line = refused_poses(capsys, room / "images", file)
+    assert reason in line and "expected poses" in line
 
 
 def test_cameras_of_depth_anything_are_decoded(truth):
@@ -396,8 +394,7 @@ def test_cameras_that_dust3r_and_mast3r_draw(cameras, depth, room, tmp_path, cap
     scene.apply_transform(turn)
     scene.export(str(tmp_path / "scene.glb"))
     if not drawn:
-        line = refused(capsys, "capture", room / "images", "--poses", tmp_path / "scene.glb",
-                       "--out", tmp_path / "out")  # fmt: skip
+        line = refused_poses(capsys, room / "images", tmp_path / "scene.glb")
         assert "no cameras are drawn with their pictures" in line
         return
     found = read_predictions(tmp_path / "scene.glb")
@@ -412,23 +409,6 @@ def test_cameras_that_dust3r_and_mast3r_draw(cameras, depth, room, tmp_path, cap
 
 @pytest.mark.parametrize("K", [(3, 3), (1, 3, 3)])
 def test_one_k_is_of_all_pictures(cameras, tmp_path, K):
-    np.savez(
-        tmp_path / "x.npz", extrinsics=cameras.cam_from_world, intrinsics=cameras.K[0].reshape(K)
-    )
+    arrays = {"extrinsics": cameras.cam_from_world, "intrinsics": cameras.K[0].reshape(K)}
+    np.savez(tmp_path / "x.npz", **arrays)
     assert_same(read_predictions(tmp_path / "x.npz"), cameras)
-
-
-@pytest.mark.parametrize(
-    ("name", "reason"),
-    [("scene.glb", "ends early"), ("model.pt", "needs pickle"), ("x.txt", "'.txt'"),
-     ("points.ply", "without cameras"), ("nan.npz", "nan.npz: unreadable (pose 1")],
-)  # fmt: skip
-def test_other_files_are_refused_for_what_they_lack(cameras, room, tmp_path, capsys, name, reason):
-    file, poses = tmp_path / name, cameras.cam_from_world.copy()
-    poses[1, 0, 0] = np.nan
-    if file.suffix == ".npz":
-        np.savez(file, extrinsics=poses, intrinsics=cameras.K)
-    else:
-        file.write_bytes(b"glTF")
-    line = refused(capsys, "capture", room / "images", "--poses", file, "--out", tmp_path / "o")
-    assert reason in line and "expected poses" in line
