@@ -133,16 +133,14 @@ class Cameras:
         K = self.K.copy()
         K[:, 0] *= (width / self.width)[:, None]
         K[:, 1] *= (height / self.height)[:, None]
-        count = len(self)
-        return replace(self, K=K, width=np.full(count, width), height=np.full(count, height))
+        return replace(self, K=K, width=np.array(width), height=np.array(height))
 
     def cropped(self, left: int, top: int, *, width: int, height: int) -> Cameras:
         """The same cameras for the window of the images that starts at (left, top), pixels."""
         K = self.K.copy()
         K[:, 0, 2] -= left
         K[:, 1, 2] -= top
-        count = len(self)
-        return replace(self, K=K, width=np.full(count, width), height=np.full(count, height))
+        return replace(self, K=K, width=np.array(width), height=np.array(height))
 
     def project(self, points: ArrayLike) -> tuple[Float64, Float64]:
         """World points seen by each camera.

@@ -15,12 +15,13 @@ import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, PrivateAttr
+from pydantic import Field
 
 from gvtools.errors import CheckpointError, OptionError, ShapeError
 from gvtools.networks.config_json import check_range
@@ -90,14 +91,13 @@ class SiftMatcher(Settings):
     """A match is kept when its distance is below this share of the second nearest's."""
     max_distance: float = Field(0.7, gt=0, le=2)
     """Between the unit descriptors of a match (0.7 is COLMAP's)."""
-    _extractor: list[Any] = PrivateAttr(default_factory=list)
 
     def extract(self, rgb: NDArray[np.uint8]) -> Features:
         """The keypoints of a picture (H, W, 3), those of the largest scale first."""
         _check_picture(rgb, "SIFT")
         height, width = rgb.shape[:2]
         grey = np.rint(rgb.astype(np.float32) @ LUMA).astype(np.uint8)
-        keypoints, described = self._sift().extract_from_uint8_array(grey)
+        keypoints, described = self._sift.extract_from_uint8_array(grey)
         rows = np.array([(p.x, p.y, p.compute_scale()) for p in keypoints], np.float64)
         rows = rows.reshape(-1, 3)
         order = np.argsort(-rows[:, 2], kind="stable")[: self.max_features]
@@ -111,19 +111,16 @@ class SiftMatcher(Settings):
             first.descriptors, second.descriptors, ratio=self.ratio, max_distance=self.max_distance
         )
 
+    @cached_property
     def _sift(self) -> Any:
         """The extractor, created once."""
         from gvtools.colmap import pycolmap
 
-        if not self._extractor:
-            options = pycolmap.FeatureExtractionOptions()
-            options.use_gpu = False
-            options.sift.max_num_features = max(8192, self.max_features)
-            with quiet_colmap():
-                self._extractor.append(
-                    pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
-                )
-        return self._extractor[0]
+        options = pycolmap.FeatureExtractionOptions()
+        options.use_gpu = False
+        options.sift.max_num_features = max(8192, self.max_features)
+        with quiet_colmap():
+            return pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
 
 
 def mutual_nearest(

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gvtools.cameras import rigid_poses
+from gvtools.cameras import Float64, rigid_poses
 from gvtools.errors import GvError, MemoryFileError, OptionError
 from gvtools.glb import (
     GLTF_ENDS,
@@ -52,7 +52,6 @@ from gvtools.splats import (
 from gvtools.untrusted import DAMAGED, other_version, read_bytes, regular
 
 Float32 = NDArray[np.float32]
-Float64 = NDArray[np.float64]
 
 # From 0 and from 1, of opacities that are read: their logits are finite.
 LEAST = 1e-4

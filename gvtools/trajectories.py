@@ -9,12 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from gvtools.cameras import Cameras, invert_rigid, rigid_poses
+from gvtools.cameras import Cameras, Float64, invert_rigid, rigid_poses
 from gvtools.errors import DegenerateError, OptionError
-
-Float64 = NDArray[np.float64]
 
 PATHS = ("orbit", "spiral", "interpolate")
 # Centres nearer than this share of their coordinates' magnitude differ by rounding alone.
@@ -231,14 +229,8 @@ def spiral(cameras: Cameras, count: int) -> Cameras:
 
 def _like_first(cameras: Cameras, world_from_cam: Float64) -> Cameras:
     """Cameras at the given poses, with the intrinsics and the size of the first of ``cameras``."""
-    count = len(world_from_cam)
-    return Cameras(
-        np.repeat(cameras.K[:1], count, axis=0),
-        invert_rigid(world_from_cam),
-        np.repeat(cameras.width[:1], count),
-        np.repeat(cameras.height[:1], count),
-        (),
-    )
+    size = int(cameras.width[0]), int(cameras.height[0])
+    return Cameras.alike(cameras.K[0], invert_rigid(world_from_cam), size=size)
 
 
 def named_path(

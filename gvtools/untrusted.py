@@ -27,7 +27,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, Protocol, cast
+from typing import IO, TYPE_CHECKING, Any, cast
 
 from gvtools.errors import ProjectError
 
@@ -307,17 +307,10 @@ def other_version(found: object, known: int, advice: str) -> str:
     return advice
 
 
-class SupportsRead(Protocol):
-    """What unpacks as it is read."""
-
-    def read(self, size: int, /) -> bytes:
-        """Read on."""
-
-
 class LimitedReader:
     """A stream of which no more than so many bytes can be read."""
 
-    def __init__(self, stream: SupportsRead, most: int) -> None:
+    def __init__(self, stream: gzip.GzipFile, most: int) -> None:
         self.stream, self.left = stream, most
 
     def read(self, size: int) -> bytes:

@@ -5,7 +5,7 @@ import runpy
 import shlex
 import sys
 from pathlib import Path
-from types import ModuleType
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,16 +20,9 @@ README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
 @pytest.fixture(scope="module")
-def hooks() -> ModuleType:
+def hooks() -> SimpleNamespace:
     pytest.importorskip("mkdocs")
-    from importlib.util import module_from_spec, spec_from_file_location
-
-    spec = spec_from_file_location("documentation_hooks", ROOT / "docs" / "hooks.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return SimpleNamespace(**runpy.run_path(str(ROOT / "docs/hooks.py")))
 
 
 def test_the_readme_is_short_and_its_links_lead_somewhere() -> None:
@@ -66,16 +59,19 @@ def test_the_completer_of_the_page_on_completers_works(monkeypatch: pytest.Monke
     assert np.all(completion.rgb == 0.25)
 
 
-def test_the_generated_pages_hold_every_command_and_public_name(hooks: ModuleType) -> None:
+def test_the_generated_pages_hold_every_command_name_and_setting(hooks: SimpleNamespace) -> None:
     from pipelines.cli import COMMANDS
 
     commands, python = hooks.commands_page(), hooks.python_page()
     assert [name for name in COMMANDS if f"\n## gvtools {name}\n" not in commands] == []
     assert [name for name in gvtools._SOURCES if f"\n## {name}\n" not in python] == []
+    rows = [line.split(" | ") for line in hooks.settings_page().splitlines() if "| `" in line]
+    assert {"voxel", "seed", "memory.weight_cap"} <= {row[0].strip("| `") for row in rows}
+    assert [row[0] for row in rows if len(row[-1].strip(" |")) < 3] == []
 
 
 def test_the_gallery_shows_what_its_commands_write(
-    hooks: ModuleType, monkeypatch: pytest.MonkeyPatch
+    hooks: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.syspath_prepend(ROOT / "docs")
     from gallery import EXHIBITS, SAMPLES, gallery_page
@@ -92,14 +88,7 @@ def test_the_gallery_shows_what_its_commands_write(
     assert all(f"gallery/{exhibit.shown}" in page for exhibit in EXHIBITS)
 
 
-def test_every_setting_has_a_row_with_its_meaning(hooks: ModuleType) -> None:
-    rows = [line.split(" | ") for line in hooks.settings_page().splitlines() if "| `" in line]
-    names = [row[0].strip("| `") for row in rows]
-    assert {"voxel", "seed", "memory.weight_cap"} <= set(names)
-    assert [row[0] for row in rows if len(row[-1].strip(" |")) < 3] == []
-
-
-def test_every_data_set_has_a_row_and_its_facts(hooks: ModuleType) -> None:
+def test_every_data_set_has_a_row_and_its_facts(hooks: SimpleNamespace) -> None:
     from gvtools.scenes.data_sets.catalogue import load_spec, spec_names
 
     page = hooks.data_sets_page()
@@ -113,7 +102,7 @@ def test_every_data_set_has_a_row_and_its_facts(hooks: ModuleType) -> None:
     assert set(type(spec).model_fields) <= names
 
 
-FOLDER = Path(gvtools.__file__).parent.parent / "examples"
+FOLDER = ROOT / "examples"
 SCRIPTS = sorted(FOLDER.glob("0*.py"))
 # Of each script: a file that it leaves, and a figure that it prints with its bounds. Holes that
 # stay black give 10 to 15 dB, a projection through a wrong camera about as much.

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from gvtools.cameras import Cameras, invert_rigid
+from gvtools.cameras import Cameras, invert_rigid, rigid_poses
 from gvtools.errors import DegenerateError, OptionError
 from gvtools.trajectories import focus_point, interpolate, look_at, mean_up, orbit, spiral
 
@@ -18,10 +18,8 @@ FOCUS = np.array([3.0, -1.0, 2.0])
 
 
 def _cameras(world_from_cam: np.ndarray) -> Cameras:
-    count = len(world_from_cam)
-    K = np.tile(np.array([[500.0, 0, 320], [0, 510, 240], [0, 0, 1]]), (count, 1, 1))
-    size = np.full(count, 640), np.full(count, 480)
-    return Cameras(K, invert_rigid(world_from_cam), *size, ())
+    K = np.array([[500.0, 0, 320], [0, 510, 240], [0, 0, 1]])
+    return Cameras.alike(K, invert_rigid(world_from_cam), size=(640, 480))
 
 
 def _ring(count: int = 7, *, arc: float = 1.5, radius: float = 4.0) -> Cameras:
@@ -55,40 +53,31 @@ def test_look_at_puts_the_target_on_the_axis_and_up_upwards():
 
 def test_interpolation_goes_through_its_keys():
     rng = np.random.default_rng(0)
-    pose = np.tile(np.eye(4), (5, 1, 1))
-    pose[:, :3, :3] = Rotation.random(5, rng=rng).as_matrix()
-    pose[:, :3, 3] = rng.standard_normal((5, 3)) + 1e6
-    keys = _cameras(pose)
-    path = interpolate(keys, 20_001)
+    turns = Rotation.random(5, rng=rng).as_matrix()
+    given = _cameras(rigid_poses(turns, rng.standard_normal((5, 3)) + 1e6))
+    path = interpolate(given, 20_001)
     _assert_rigid(path)
-    apart = np.linalg.norm(path.centers[:, None] - keys.centers, axis=2)
+    apart = np.linalg.norm(path.centers[:, None] - given.centers, axis=2)
     assert apart.min(axis=0).max() < 1e-3
     at = apart.argmin(axis=0)
     assert (np.diff(at) > 0).all()
     turn = (
         Rotation.from_matrix(path.cam_from_world[at, :3, :3])
-        * Rotation.from_matrix(keys.cam_from_world[:, :3, :3]).inv()
+        * Rotation.from_matrix(given.cam_from_world[:, :3, :3]).inv()
     )
     assert turn.magnitude().max() < 2e-3
     for end in (0, -1):
-        np.testing.assert_allclose(path.centers[end], keys.centers[end], atol=1e-8)
+        np.testing.assert_allclose(path.centers[end], given.centers[end], atol=1e-8)
 
 
 def test_intrinsics_are_interpolated_and_sizes_are_the_nearest_keys():
-    keys = _ring(2)
-    K = keys.K.copy()
+    ends = _ring(2)
+    K = ends.K.copy()
     K[1, 0, 0] = 600
-    mixed = Cameras(K, keys.cam_from_world, np.array([640, 320]), np.array([480, 240]), keys.names)
+    mixed = Cameras(K, ends.cam_from_world, np.array([640, 320]), np.array([480, 240]), ends.names)
     path = interpolate(mixed, 5)
     np.testing.assert_allclose(path.K[:, 0, 0], [500, 525, 550, 575, 600])
     assert path.width.tolist() == [640, 640, 640, 320, 320]
-
-
-def test_interpolation_needs_two_different_cameras():
-    with pytest.raises(OptionError, match="2 or more"):
-        interpolate(_ring(1), 5)
-    with pytest.raises(DegenerateError, match="same"):
-        interpolate(_ring(3)[[1, 1]], 5)
 
 
 def test_the_focus_point_is_where_the_axes_meet():
@@ -97,14 +86,6 @@ def test_the_focus_point_is_where_the_axes_meet():
     far = _ring().world_from_cam
     far[:, :3, 3] += offset
     np.testing.assert_allclose(focus_point(_cameras(far)), FOCUS + offset, atol=1e-6)
-
-
-def test_parallel_axes_have_no_focus_point():
-    pose = np.tile(np.eye(4), (3, 1, 1))
-    pose[:, 0, 3] = (0, 1, 2)
-    with pytest.raises(DegenerateError, match="parallel"):
-        focus_point(_cameras(pose))
-    orbit(_cameras(pose), 4, center=(0, 0, 5))
 
 
 def test_an_orbit_looks_at_its_middle_with_a_steady_up():
@@ -138,7 +119,15 @@ def test_a_spiral_stays_within_the_capture_and_looks_at_one_point():
     assert np.linalg.norm(focus_point(path) - target) < 1.0
 
 
-def test_degenerate_orbits_say_why():
+def test_degenerate_paths_say_why():
+    with pytest.raises(OptionError, match="2 or more"):
+        interpolate(_ring(1), 5)
+    with pytest.raises(DegenerateError, match="same"):
+        interpolate(_ring(3)[[1, 1]], 5)
+    parallel = keys([(0, 0, 0), (1, 0, 0), (2, 0, 0)])
+    with pytest.raises(DegenerateError, match="parallel"):
+        focus_point(parallel)
+    orbit(parallel, 4, center=(0, 0, 5))
     with pytest.raises(OptionError, match="1 or more"):
         orbit(_ring(), 0)
     with pytest.raises(DegenerateError, match="on the axis"):
@@ -153,13 +142,8 @@ MAKERS: tuple[Callable[..., Cameras], ...] = (interpolate, orbit, spiral)
 
 def keys(centers: Any, turns: Any = None) -> Cameras:
     """Cameras at centres (V, 3) with rotation vectors (V, 3), world from camera."""
-    count = len(centers)
-    pose = np.tile(np.eye(4), (count, 1, 1))
-    pose[:, :3, 3] = centers
-    if turns is not None:
-        pose[:, :3, :3] = Rotation.from_rotvec(np.asarray(turns, np.float64)).as_matrix()
-    K = np.tile(np.array([[50.0, 0, 32], [0, 50, 24], [0, 0, 1]]), (count, 1, 1))
-    return Cameras(K, invert_rigid(pose), np.full(count, 64), np.full(count, 48), ())
+    turns = np.zeros((len(centers), 3)) if turns is None else np.asarray(turns, np.float64)
+    return _cameras(rigid_poses(Rotation.from_rotvec(turns).as_matrix(), centers))
 
 
 def arc(unit: float = 1.0) -> Cameras:
