@@ -67,7 +67,6 @@ class Pass:
     confidence: dict[str, NDArray[np.float32]]  # (h, w) in [0, 1) by view
     # (V, 3) predicted camera centres, frame of the first view, its unit.
     centres: NDArray[np.float64]
-    names: tuple[str, ...]  # of the V views
     unit: float  # scene units a unit of the known cameras that the network saw; 1 without them
 
 
@@ -78,8 +77,8 @@ def _fit_scale(scene: Scene, passes: Sequence[Pass], *, min_centres: int) -> Fou
     pairs = [
         (measured.astype(np.float64) * part.unit, known)
         for part in passes
-        for name in part.names
-        for measured, known in [depth_of_points(scene, name, part.depth[name])]
+        for name, depth in part.depth.items()
+        for measured, known in [depth_of_points(scene, name, depth)]
     ]
     depth, reference = (np.concatenate([np.zeros(0), *side]) for side in zip(*pairs, strict=True))
     fitted = align_depth_scale(
@@ -97,7 +96,7 @@ def _fit_cameras(scene: Scene, passes: Sequence[Pass], *, min_centres: int) -> F
     """The median of the passes' own fits, weighted by their views."""
     scales, weights, reason = [], [], "no pass"
     for part in passes:
-        known = np.concatenate([scene[name].camera.centers for name in part.names])
+        known = np.concatenate([scene[name].camera.centers for name in part.depth])
         fitted = center_similarity(
             torch.from_numpy(part.centres * part.unit)[None], torch.from_numpy(known)[None]
         )
@@ -107,7 +106,7 @@ def _fit_cameras(scene: Scene, passes: Sequence[Pass], *, min_centres: int) -> F
             reason = f"centres correlate by {float(fitted.correlation[0]):.2f}"
         else:
             scales.append(float(fitted.scale[0]))
-            weights.append(len(part.names))
+            weights.append(len(part.depth))
     if scales and max(weights) < min_centres:
         # Each of them would fit by chance; several that agree do not.
         agree = len(scales) >= MIN_PASSES and max(scales) <= PASSES_AGREE * min(scales)
@@ -193,12 +192,12 @@ class FoundationDepth:
         with autocast(self._device, dtype):
             passes = [self._pass(network, *group) for group in self._groups(network)]
         for made in passes:
-            self._passes |= dict.fromkeys(made.names, made)
+            self._passes |= dict.fromkeys(made.depth, made)
         sharing = [passes] if self.options.cameras else [[made] for made in passes]
         for together in sharing:
             fitted = _fit_scale(self._scene, together, min_centres=self.options.min_centres)
             for made in together:
-                self._scales |= dict.fromkeys(made.names, fitted)
+                self._scales |= dict.fromkeys(made.depth, fitted)
 
     def _groups(self, network: DepthAnything3) -> list[tuple[tuple[str, ...], tuple[int, int]]]:
         """Views that go together, in order, all of one size at the network's resolution."""
@@ -251,6 +250,5 @@ class FoundationDepth:
             dict(zip(names, depth, strict=True)),
             dict(zip(names, confidence, strict=True)),
             centres,
-            names,
             float(unit[0] / scale[0]) if self.options.cameras else 1.0,
         )

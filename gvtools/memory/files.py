@@ -27,6 +27,7 @@ from gvtools.memory.store.array_file import ArrayFile, write_arrays
 from gvtools.memory.store.store import MemoryOptions, Store
 from gvtools.memory.store.tile import (
     Tile,
+    check_fit,
     check_observations,
     fill,
     observation_arrays,
@@ -217,12 +218,14 @@ def _check_views(arrays: dict[str, NDArray[Any]], views: int) -> None:
     if "view_scanned" not in arrays:
         del shapes["view_scanned"]
     for name, shape in shapes.items():
-        if arrays[name].shape != shape or not np.isfinite(arrays[name]).all():
-            raise ValueError(f"{name} of shape {arrays[name].shape}; expected {shape}, finite")
+        found = arrays[name]
+        fits = found.shape == shape and np.isfinite(found).all()
+        check_fit(fits, f"{name} of shape {found.shape}; expected {shape}, finite")
     # Depth of free space may be infinite.
     grids = arrays["grid_depth"]
-    if np.isnan(grids).any() or int(arrays["grid_shape"].prod(axis=1).sum()) != len(grids):
-        raise ValueError("the free-space grids do not fill their array, or are not finite")
+    filled = int(arrays["grid_shape"].prod(axis=1).sum()) == len(grids)
+    known = filled and not np.isnan(grids).any()
+    check_fit(known, "the free-space grids do not fill their array, or are not finite")
 
 
 INDEX, SUFFIX = "memory.index", ".tiles"
@@ -305,19 +308,18 @@ def _add_tiles(
     tiles.clear()
     tiles.octree.divided = {tuple(node) for node in meta["divided"]}
     of_tile, local = arrays["segment_tile"], arrays["segment_local"]
-    unknown = len(of_tile) and not 0 <= of_tile.min() <= of_tile.max() < len(meta["tiles"])
-    if unknown or int(arrays["segment_level"].max(initial=0)) > MOST_LEVEL:
-        raise ValueError("a segment names a tile or a level that is not there")
+    known = not len(of_tile) or 0 <= of_tile.min() <= of_tile.max() < len(meta["tiles"])
+    known &= int(arrays["segment_level"].max(initial=0)) <= MOST_LEVEL
+    check_fit(known, "a segment names a tile or a level that is not there")
     order = np.lexsort((local, of_tile))
     ends = np.searchsorted(of_tile[order], np.arange(len(meta["tiles"]) + 1))
     n = len(of_tile)
     start, length = np.empty(n, np.int64), np.empty(n, np.int32)
     view, box = np.empty(n, np.int32), np.empty((n, 7), np.float32)
     for i, (node, name, checksum, size, count, voxels, agreed) in enumerate(meta["tiles"]):
-        if not all(
-            type(n) is int and 0 <= n < 2**48 for n in (*node, size, count, voxels, *agreed)
-        ):
-            raise ValueError(f"tile {name!r}: of {node!r}, {size!r}, {count!r}, {voxels!r}")
+        numbers = (*node, size, count, voxels, *agreed)
+        whole = all(type(n) is int and 0 <= n < 2**48 for n in numbers)
+        check_fit(whole, f"tile {name!r}: of {node!r}, {size!r}, {count!r}, {voxels!r}")
         path = folder / Path(name).name
         tiles.write_after(path.name)
         file = ArrayFile(path)

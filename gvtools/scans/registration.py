@@ -64,7 +64,8 @@ VOLUME = 0.2
 MATCH, STEPS = 1.5, (4.0, 2.0, 1.0, 0.5)
 # A point supports a placement if the other surface has a point within this, in cells.
 TOLERANCE = 1 / 3
-POLISHING = 200  # iterations of ICP for the placement that is returned
+# Iterations of ICP at a distance, and for the placement that is returned.
+ROUGH_STEPS, POLISHING = 30, 200
 # Factors of the ratio of extents that are tried as scales, the likeliest first.
 SCALES = tuple(2.0 ** (k / 2) for k in (0, 1, -1, 2, -2, 3, -3, 4, -4, 5, -5))
 # Scales that are tried first in metric scenes: scans in metres and in millimetres.
@@ -310,7 +311,7 @@ class _Task:
     def polished(self, placement: Placement) -> Placement:
         """A placement after more iterations of ICP, in which scale converges slowly."""
         local = self.of_world(placement.world_from_scan)
-        local = self._refined(local, (STEPS[-1], TOLERANCE), steps=POLISHING)
+        local = self._refined(local, polish=True)
         return self.judged(local, placement.how)
 
     def in_units(self, placement: Placement) -> Placement:
@@ -323,19 +324,12 @@ class _Task:
         middle = np.linalg.inv(local)[:3, 3]
         local[:3, :3] *= unit / placement.scale
         local[:3, 3] = -local[:3, :3] @ middle
-        local = self._refined(local, (STEPS[-1], TOLERANCE), steps=POLISHING, scaled=False)
+        local = self._refined(local, polish=True, scaled=False)
         exact = self.judged(local, placement.how)
         return exact if _support(exact) >= AS_WELL * _support(placement) else placement
 
-    def _refined(
-        self,
-        placed: Float64,
-        reach: tuple[float, ...] = STEPS,
-        *,
-        steps: int = 30,
-        scaled: bool = True,
-    ) -> Float64:
-        """After ICP, with scale or without, at ever smaller correspondence distances."""
+    def _refined(self, placed: Float64, *, polish: bool = False, scaled: bool = True) -> Float64:
+        """After ICP, with scale or without, at ever smaller distances, to ``polish`` the last."""
         from gvtools.o3d import o3d
 
         registration = o3d.pipelines.registration
@@ -345,6 +339,7 @@ class _Task:
         inverse = np.linalg.inv(placed)
         scale = float(np.cbrt(np.linalg.det(placed[:3, :3])))
         source, target = cloud_of(self.target_sample), cloud_of(self.scan.positions)
+        reach, steps = ((STEPS[-1], TOLERANCE), POLISHING) if polish else (STEPS, ROUGH_STEPS)
         ends = registration.ICPConvergenceCriteria(1e-9, 1e-9, steps)
         for step in reach:
             result = registration.registration_icp(

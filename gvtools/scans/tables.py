@@ -207,7 +207,8 @@ def _chunk(columns: Columns, kinds: Mapping[str, np.dtype[Any]]) -> Chunk:
     for name in packed_names(columns)[:1]:
         colors = _unpacked_colors(columns[name], kinds[name])
     intensities = [columns[name].astype(np.float32) for name in intensity_names(columns)]
-    chunk = Chunk(_positions(columns), colors, next(iter(intensities), None))
+    positions = np.stack([columns[axis].astype(np.float64) for axis in "xyz"], axis=1)
+    chunk = Chunk(positions, colors, next(iter(intensities), None))
     return chunk.without(columns[GENERATED] != 0, GENERATED) if GENERATED in columns else chunk
 
 
@@ -236,10 +237,6 @@ def _unpacked_colors(packed: NDArray[Any], kind: np.dtype[Any]) -> NDArray[np.ui
     else:
         bits = packed.astype(np.int64).astype(np.uint32)
     return np.stack([(bits >> shift) & 255 for shift in (16, 8, 0)], axis=1).astype(np.uint8)
-
-
-def _positions(columns: Columns) -> NDArray[np.float64]:
-    return np.stack([columns[axis].astype(np.float64) for axis in "xyz"], axis=1)
 
 
 def open_pcd(path: Path) -> ScanFile:

@@ -306,25 +306,25 @@ def check_observations(arrays: Mapping[str, NDArray[Any]], views: int) -> None:
     count = len(arrays["view"])
     for name in COLUMNS:
         width, shape = LAYOUT[name][1], arrays[name].shape
-        if shape != ((count, width) if width > 1 else (count,)):
-            raise ValueError(f"{name} has shape {shape} beside {count} views")
+        fits = shape == ((count, width) if width > 1 else (count,))
+        check_fit(fits, f"{name} has shape {shape} beside {count} views")
     level, row = arrays["level"], arrays["agreement_row"]
-    _require(_within(arrays["view"], views), "an observation names a view that is not there")
+    check_fit(_within(arrays["view"], views), "an observation names a view that is not there")
     known = level.dtype == np.uint8 and _within(level, MOST_LEVEL + 1)
-    _require(known, "an observation is of a level that is not there")
+    check_fit(known, "an observation is of a level that is not there")
     for name in ("spacing", "confidence"):
-        _require(not (arrays[name] < 0).any(), f"{name} is negative in places")
+        check_fit(not (arrays[name] < 0).any(), f"{name} is negative in places")
     _check_segments(arrays, views, count)
     start = arrays["agreement_start"]
-    _require(_within(row, count), "an agreement names an observation that is not there")
+    check_fit(_within(row, count), "an agreement names an observation that is not there")
     log = len(start) == len(arrays["agreement_round"]) + 1 and _covers(start, len(row))
-    _require(log, "agreements do not fill their log")
+    check_fit(log, "agreements do not fill their log")
     for name, array in arrays.items():
         if name in ("agreement_weight", "agreement_before"):
-            _require(array.shape == row.shape, f"{name} has shape {array.shape}, not {row.shape}")
+            check_fit(array.shape == row.shape, f"{name} has shape {array.shape}, not {row.shape}")
         # A box of nothing is infinite.
         finite = array.dtype.kind != "f" or name == "segment_box" or np.isfinite(array).all()
-        _require(finite, f"{name} holds numbers that are not finite")
+        check_fit(finite, f"{name} holds numbers that are not finite")
 
 
 def _check_segments(arrays: Mapping[str, NDArray[Any]], views: int, count: Any) -> None:
@@ -332,10 +332,10 @@ def _check_segments(arrays: Mapping[str, NDArray[Any]], views: int, count: Any) 
     start, length, view, box = (arrays[f"segment_{name}"] for name in Segments.LAYOUT)
     ends = np.cumsum(length, dtype=np.int64)
     behind = bool((length > 0).all()) and np.array_equal(start, ends - length)
-    _require(behind, "segments are not contiguous")
-    _require(length.sum(dtype=np.int64) == count, "segments do not cover the observations")
-    _require(_within(view, views), "a segment names a view that is not there")
-    _require(not np.isnan(box).any(), "segment_box holds numbers that are not finite")
+    check_fit(behind, "segments are not contiguous")
+    check_fit(length.sum(dtype=np.int64) == count, "segments do not cover the observations")
+    check_fit(_within(view, views), "a segment names a view that is not there")
+    check_fit(not np.isnan(box).any(), "segment_box holds numbers that are not finite")
 
 
 def _within(numbers: NDArray[Any], end: int) -> bool:
@@ -347,7 +347,8 @@ def _covers(start: NDArray[Any], count: int) -> bool:
     return bool(start[0] == 0 and start[-1] == count and (np.diff(start) >= 0).all())
 
 
-def _require(fits: Any, fault: str) -> None:
+def check_fit(fits: Any, fault: str) -> None:
+    """Refuse parts of a memory that contradict each other."""
     if not fits:
         raise ValueError(fault)
 
