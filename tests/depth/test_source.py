@@ -41,9 +41,11 @@ pytestmark = pytest.mark.usefixtures("unpainted")
 HEIGHT, WIDTH, FAR = 40, 60, 3.0
 
 
-def camera(x: float = 0.0, name: str = "one") -> Cameras:
+def camera(
+    x: float = 0.0, name: str = "one", *, size: tuple[int, int] = (WIDTH, HEIGHT), focal: float = 50
+) -> Cameras:
     pose = rigid_poses(np.eye(3), (-x, 0, 0))
-    return Cameras.pinhole(WIDTH, HEIGHT, focal=50, cam_from_world=pose, name=name)
+    return Cameras.pinhole(*size, focal=focal, cam_from_world=pose, name=name)
 
 
 def wall(depth: float = FAR) -> np.ndarray:
@@ -151,11 +153,13 @@ def scan(tmp_path) -> Scene:
     return SEVENSCENES.read(write_scan(tmp_path / "scan"))
 
 
-def _with_points(scene: Scene) -> Scene:
-    none = np.zeros(0, np.int32)
+def with_points(scene: Scene, positions=(), xy=()) -> Scene:
+    """The scene with sparse points (N, 3) that its first view sees at (N, 2) pixels."""
+    count = len(positions)
     points = SparsePoints(
-        np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0, np.float32), none, none,
-        np.zeros((0, 2)),
+        np.reshape(positions, (-1, 3)), np.zeros((count, 3), np.uint8),
+        np.zeros(count, np.float32), np.arange(count, dtype=np.int32),
+        np.zeros(count, np.int32), np.reshape(xy, (-1, 2)),
     )  # fmt: skip
     return replace(scene, points=points)
 
@@ -203,7 +207,7 @@ def test_a_rough_source_is_a_small_sweep_without_posing(scan, tmp_path):
     assert (rough.options.window, rough.options.align) == (5, False)
     assert rough.options.max_side <= 160
     assert rough.views == bare.names
-    patch_match = rough_source(bare, ColmapPatchMatch(_with_points(bare), bare.names))
+    patch_match = rough_source(bare, ColmapPatchMatch(with_points(bare), bare.names))
     assert isinstance(patch_match, PlaneSweepStereo)
     assert patch_match.views == bare.names
     recorded = RecordedDepth()
@@ -307,11 +311,7 @@ def test_the_scale_of_depth_is_that_of_the_sparse_points(scan, factor):
     z = frame.depth[xy[:, 1].astype(int), xy[:, 0].astype(int)].astype(float)
     rays = np.column_stack([xy, np.ones(60)]) @ np.linalg.inv(view.camera.K[0]).T
     world = np.column_stack([rays * z[:, None], np.ones(60)]) @ view.camera.world_from_cam[0].T
-    points = SparsePoints(
-        world[:, :3], np.zeros((60, 3), np.uint8), np.zeros(60, np.float32),
-        np.arange(60, dtype=np.int32), np.zeros(60, np.int32), xy,
-    )  # fmt: skip
-    scene = replace(scan, points=points)
+    scene = with_points(scan, world[:, :3], xy)
     fit = scale_to_points(scene, view.name, frame.depth / np.float32(factor))
     assert fit is not None
     assert fit.scale == pytest.approx(factor, rel=1e-3)
@@ -328,8 +328,7 @@ CELLS = np.random.default_rng(3).integers(40, 200, (64, 64, 3), dtype=np.uint8)
 
 
 def camera_at(x: float = 0.0) -> Cameras:
-    pose = rigid_poses(np.eye(3), (-x, 0, 0))
-    return Cameras.pinhole(80, 60, focal=80, cam_from_world=pose, name="c")
+    return camera(x, size=SHOWN[::-1], focal=80)
 
 
 def slanted_wall(x: float = 0.0) -> tuple[np.ndarray, np.ndarray]:

@@ -117,15 +117,16 @@ def test_every_back_end_is_free_of_units(power, backend, home):
 
 
 @pytest.mark.parametrize("far", [1e3, 1e7])
-@pytest.mark.parametrize("scale", [0.03, 1e3])
-def test_utm_coordinates_change_no_picture(scale, far, home):
+@pytest.mark.parametrize(("scale", "backends"), [(0.03, ("cpu",)), (1e3, BACKENDS)])
+def test_utm_coordinates_change_no_picture(scale, backends, far, home):
     offset = np.array((far, -far, far / 3)) + 0.4
     memory, reports = square_before_wall(scale, offset=offset)
     assert [r.points for r in reports] == [r.points for r in home[1]]
     apart, _ = cKDTree((memory.positions - offset) / scale).query(home[0].positions)
     assert (apart > 1e-6).mean() < 1e-3
-    seen = _seen(memory, scale, offset=offset)
-    assert share_that_differs(seen, home[2]["cpu"], scale=scale) < 1e-3
+    for backend in backends:
+        seen = _seen(memory, scale, offset=offset, backend=backend)
+        assert share_that_differs(seen, home[2][backend], scale=scale) < 1e-3
 
 
 @pytest.mark.parametrize("far", [1e3, 2.0**20, 2.0**22, 2.0**23 - 200])

@@ -201,60 +201,6 @@ def test_fusion_does_what_a_plain_dictionary_does(seed, views, capacity, degrees
             assert one.agreement == pytest.approx(two.agreement, rel=1e-5)
 
 
-def test_points_of_one_voxel_are_averaged_by_confidence():
-    memory = SpatialMemory(1.0, options=ONE_EDGE)
-    fresh = points(
-        [(0.2, 0.2, 2.2), (0.6, 0.2, 2.2)], colors=[(0, 0, 0), (200, 100, 40)], confidence=(1, 3),
-        spacing=(1.0, 5.0),
-    )  # fmt: skip
-    memory.fuse(fresh, round=0)
-    assert len(memory) == 1
-    np.testing.assert_allclose(memory.positions, [(0.5, 0.2, 2.2)], rtol=1e-6)
-    np.testing.assert_array_equal(memory.columns.colors[0], (150, 75, 30))
-    assert memory.columns.spacing[0] == 4
-    # Pixels of one view are no independent witnesses: their confidence does not add up.
-    assert memory.confidence[0] == 3
-
-
-def test_views_of_one_direction_merge_and_the_weight_is_capped():
-    memory = SpatialMemory(1.0, options=MemoryOptions(weight_cap=2.5))
-    for number, (x, weight) in enumerate(((0.2, 1.0), (0.4, 1.0), (0.8, 2.0))):
-        source = camera(name=f"v{number}")
-        memory.fuse(points([(x, 0.5, 5.5)], source=source, confidence=weight), round=0)
-    assert len(memory) == 1
-    assert memory.columns.view[0] == 0  # ties and capped weights stay with the earlier view
-    np.testing.assert_allclose(memory.positions[0, 0], 0.3 + 0.5 * (0.8 - 0.3), rtol=1e-6)
-    assert memory.confidence[0] == 2.5
-    last = camera(name="last")
-    memory.fuse(points([(0.5, 0.5, 5.5)], source=last, confidence=2.6), round=0)
-    assert memory.columns.view[0] == 3  # the more confident view wins, numbers are not averaged
-
-
-@pytest.mark.parametrize(("degrees", "kept"), [(1.9, 1), (2.1, 2)])
-def test_directions_beyond_the_threshold_stand_side_by_side(degrees, kept):
-    memory = SpatialMemory(0.5, options=MemoryOptions(merge_angle_deg=2))
-    for angle in (0, np.radians(degrees)):
-        source = camera(center=(-4 * np.sin(angle), 0, 4.25 - 4 * np.cos(angle)))
-        memory.fuse(points([(0, 0, 4.25)], source=source), round=0)
-    assert len(memory) == kept
-    assert memory.voxels == 1
-
-
-def test_observed_points_pass_generated_ones_by():
-    """Generated neighbours neither take observed points in nor stop them from merging."""
-    memory = SpatialMemory(1.0)
-    place = [(0.5, 0.5, 5.5)]
-    assert memory.fuse(points(place), round=0, generated=True).added == 1
-    assert memory.fuse(points(place, colors=(9, 9, 9)), round=0).added == 1
-    for _ in range(5):
-        assert memory.fuse(points(place, colors=(9, 9, 9)), round=0).merged == 1
-    assert memory.generated.tolist() == [True, False]
-    np.testing.assert_array_equal(memory.columns.colors[:2], [(128,) * 3, (9,) * 3])
-    assert memory.columns.confidence[:2].tolist() == [1, 6]
-    report = memory.fuse(points(place * 3), round=1, generated=True)
-    assert (report.rejected_observed, report.added, report.merged) == (3, 0, 0)
-
-
 def test_keys_tell_voxels_apart_and_mark_what_is_out_of_reach():
     edge = 0.5
     where = np.array(

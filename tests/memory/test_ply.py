@@ -203,25 +203,12 @@ def test_what_is_loaded_is_what_was_saved(seed, tmp_path):
     memory = random_memory(seed, options=MemoryOptions(merge_angle_deg=7.5, weight_cap=9))
     memory.save(tmp_path / "memory.npz")
     loaded = SpatialMemory.load(tmp_path / "memory.npz")
-    assert loaded.voxel == memory.voxel
     assert loaded.options == memory.options
-    np.testing.assert_array_equal(loaded.origin, memory.origin)
-    assert len(loaded) == len(memory)
     assert loaded.voxels == memory.voxels
     for name in LAYOUT:
         np.testing.assert_array_equal(
             getattr(loaded.columns, name), getattr(memory.columns, name), err_msg=name
         )
-    for name in memory.segments.LAYOUT:
-        one, two = (getattr(m.segments, name)[: m.segments.count] for m in (loaded, memory))
-        np.testing.assert_array_equal(one, two, err_msg=name)
-    for i in range(len(memory.views)):
-        ours, theirs = loaded.views[i], memory.views[i]
-        assert ours.camera.names == theirs.camera.names
-        np.testing.assert_array_equal(ours.camera.K, theirs.camera.K)
-        np.testing.assert_array_equal(ours.camera.cam_from_world, theirs.camera.cam_from_world)
-        np.testing.assert_array_equal(ours.free_depth, theirs.free_depth)
-        assert (ours.round, ours.generated) == (theirs.round, theirs.generated)
     assert saved_bytes(loaded, tmp_path) == saved_bytes(memory, tmp_path)
 
 

@@ -276,23 +276,6 @@ def test_an_image_of_one_pixel(backend):
     assert seen.confidence[0, 0, 0] == pytest.approx(0.7)
 
 
-@pytest.mark.parametrize("backend", ["cpu", "torch", "nearest", "open3d"])
-def test_a_far_origin_keeps_millimetres(backend):
-    """A georeferenced scene gives the image of the same scene at home."""
-    offset = np.array([4.1e6, 1e6, -2.2e6])
-    depth = np.linspace(2, 2.2, 64)[None, :] * np.ones((48, 1))
-    seen = []
-    for shift in (np.zeros(3), offset):
-        source = camera(width=64, height=48, focal=60, center=shift)
-        memory = SpatialMemory(0.01, origin=shift)
-        memory.fuse(plane_view(source, depth, origin=shift), round=0)
-        seen.append(memory.project(source, options=SplatOptions(backend=backend)))
-    assert (seen[0].valid == seen[1].valid).mean() > 0.999
-    both = seen[0].valid & seen[1].valid
-    assert both.mean() > 0.9
-    assert abs(seen[0].depth - seen[1].depth)[both].max() < 1e-3
-
-
 def test_views_of_a_batch_are_those_of_single_cameras():
     memory = random_memory(3)
     rng = np.random.default_rng(5)

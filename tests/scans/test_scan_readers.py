@@ -239,20 +239,20 @@ def write_points(path, positions, colors, *, names=RED, text=False, change=lambd
     table = np.zeros(len(positions), fields)
     for (name, _), values in zip(fields, [*positions.T, *colors.T], strict=True):
         table[name] = values
-    count, kinds = len(table), [kind for _, kind in fields]
+    count = len(table)
     if path.suffix == ".ply":
         head = ["ply", f"format {'ascii' if text else 'binary_little_endian'} 1.0"]
         head += [f"element vertex {count}"]
         head += [*(f"property {KINDS[kind]} {name}" for name, kind in fields), "end_header"]
     else:
-        rows = {"FIELDS": table.dtype.names, "SIZE": [kind[1] for kind in kinds],
-                "TYPE": [kind[0].upper() for kind in kinds], "COUNT": "1" * len(kinds)}  # fmt: skip
-        head = ["VERSION 0.7", *(" ".join([key, *words]) for key, words in rows.items()),
+        rows = zip(*((name, kind[1], kind[0].upper(), "1") for name, kind in fields), strict=True)
+        keys = zip(("FIELDS", "SIZE", "TYPE", "COUNT"), rows, strict=True)
+        head = ["VERSION 0.7", *(" ".join([key, *words]) for key, words in keys),
                 f"WIDTH {count}", "HEIGHT 1", "VIEWPOINT 0 0 0 1 0 0 0", f"POINTS {count}",
                 f"DATA {'ascii' if text else 'binary'}"]  # fmt: skip
-    head = "\n".join([*head, ""])
+    whole = "\n".join([*head, ""])
     lines = "".join(" ".join(map(str, row)) + "\n" for row in table.tolist())
-    path.write_bytes(change(head + lines).encode() if text else head.encode() + table.tobytes())
+    path.write_bytes(change(whole + lines).encode() if text else whole.encode() + table.tobytes())
     return path
 
 
@@ -337,9 +337,9 @@ def test_gaussians_given_as_a_scan_are_their_opaque_centres(tmp_path):
 def written(path, change=lambda text: text, *, places=None):
     """A PLY or PCD as text, of 300 coloured points; colours of the latter are whole floats."""
     positions, colors = surface(300)
-    channels, names = colors, RED
+    channels, names = colors, [*RED]
     if path.suffix == ".pcd":
-        channels, names = (colors @ [[1 << 16], [1 << 8], [1]]).astype("i4"), ("rgb",)
+        channels, names = (colors @ [[1 << 16], [1 << 8], [1]]).astype("i4"), ["rgb"]
     write_points(
         path, positions if places is None else places, channels, names=names, text=True,
         change=lambda text: change(text.replace("F F F I", "F F F F")),

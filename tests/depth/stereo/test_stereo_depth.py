@@ -12,6 +12,7 @@ import pytest
 import torch
 from scipy import ndimage
 from stereo_scenes import niche_depth, niche_scene, plane_scene, turning_scene
+from tiny_scan import in_another_unit
 
 from gvtools.depth.options import StereoOptions
 from gvtools.depth.source import DepthMap
@@ -304,13 +305,7 @@ def test_views_at_one_place_are_no_sources_and_warn_of_nothing():
 @pytest.mark.parametrize("scale", [1e-6, 1e9])
 def test_depth_follows_the_scene_units(scale):
     made = plane_scene(slope=(0.25, -0.15), count=3)
-    views = []
-    for view in made.scene:
-        pose = view.camera.cam_from_world.copy()
-        pose[:, :3, 3] *= scale
-        views.append(replace(view, camera=replace(view.camera, cam_from_world=pose)))
-    scene = replace(made.scene, views=tuple(views))
-    depth = swept(scene, "v1")[0].depth
+    depth = swept(in_another_unit(made.scene, scale), "v1")[0].depth
     known = depth > 0
     assert known.mean() > 0.7
     assert np.median(np.abs(depth[known] / (scale * made.depths[1][known]) - 1)) < 0.005
