@@ -163,18 +163,21 @@ def test_passes_share_one_scale_and_are_as_equal_as_can_be(tmp_path, monkeypatch
     assert len({source.scale(name).scale for name in scene.names}) == 1
 
 
-@pytest.mark.parametrize("wrong", ["centres", "depth"])
-def test_a_scale_without_support_is_refused(scene, with_points, monkeypatch, weights, wrong):
-    """Points that fit no scale refuse it, whatever the centres say."""
-    scene = scene if wrong == "centres" else with_points
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [("centres", "unsupported"), ("depth", "unsupported"), ("", "unsupported: .*at least 4")],
+)
+def test_a_scale_without_support_is_refused(scene, with_points, monkeypatch, weights, wrong, said):
+    """Points that fit no scale refuse it, whatever the centres say; two centres are none."""
+    scene = {"centres": scene, "depth": with_points}.get(wrong, scene.subset(scene.names[:2]))
     stand_in(monkeypatch, scene, wrong=wrong)
     source = da3(scene, weights)
     view = scene.views[0]
-    with pytest.raises(DegenerateError, match="unsupported"):
+    with pytest.raises(DegenerateError, match=said):
         source.depth(scene, view, view.load())
     fitted = source.scale(view.name)
     assert not fitted.ok
-    assert wrong == "centres" or fitted.support == "points"
+    assert fitted.support == ("points" if wrong == "depth" else "cameras")
 
 
 @pytest.mark.parametrize("factor", [0.01, 100.0])
@@ -268,11 +271,3 @@ def test_the_released_small_model_is_known_by_its_width(tmp_path):
     assert network.config == RELEASED["DA3-SMALL"].config
     assert not any(parameter.requires_grad for parameter in network.parameters())
     assert next(network.parameters()).dtype == torch.float32
-
-
-def test_two_centres_alone_are_no_support(tmp_path, monkeypatch, weights):
-    scene = SEVENSCENES.read(write_scan(tmp_path / "scan", views=2))
-    stand_in(monkeypatch, scene)
-    source = da3(scene, weights)
-    with pytest.raises(DegenerateError, match="at least 4"):
-        source.depth(scene, scene.views[0], scene.views[0].load())

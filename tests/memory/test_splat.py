@@ -237,13 +237,6 @@ def test_in_one_tier_the_z_buffer_alone_decides(backend):
     assert_same(seen, reference_project(memory, target, options))
 
 
-def test_an_object_whose_place_a_near_view_saw_to_be_free_is_not():
-    memory, target = _scene_with_a_far_witness(saw_through=True)
-    seen = project(memory, target, options=SplatOptions(nearest_views=1))
-    assert seen.coverage > 0.95
-    assert (seen.rgb[0, ..., 0] == 0).all()
-
-
 @pytest.mark.parametrize("case", OTHERS)
 @pytest.mark.parametrize("saw_through", [False, True])
 def test_the_reference_agrees_about_occluders(saw_through, case):
