@@ -15,17 +15,16 @@ import pytest
 from browser import open_browser
 from export_runs import export_run
 from scipy.spatial.transform import Rotation
+from splat_scene import psnr
+from web_page import PATIENCE, wait
 
 from gvtools.appearance.appearance import Appearance
 from gvtools.appearance.gaussians import Gaussians
 from gvtools.cameras import Cameras
-from gvtools.errors import OptionError
 from gvtools.memory.store.local_frame import LocalFrame
 from pipelines.export.formats import ExportOptions
 from pipelines.export.source import ExportSource
 from viz.page.page import PageCamera, PageGroup, SharedPage, pack_gaussians, page_html
-
-PATIENCE = 60.0
 
 
 def halves(words):
@@ -145,16 +144,6 @@ def test_a_folder_whose_name_is_no_text_has_a_page(bare_run, tmp_path):
     assert "<h1>run_\\udcff</h1>" in (tmp_path / "page.html").read_text("utf-8")
 
 
-def test_pages_that_are_no_export_are_kept(fitted_run, tmp_path):
-    report = tmp_path / "report.html"
-    report.write_text("<!DOCTYPE html>\n<html>mine</html>")
-    with pytest.raises(OptionError, match="no HTML file of this format"):
-        export_run(fitted_run.folder, "html", report)
-    assert "mine" in report.read_text()
-    with pytest.raises(OptionError, match=r"ends with \.html"):
-        export_run(fitted_run.folder, "html", tmp_path / "page.htm")
-
-
 def reaches(browser, state):
     end = time.monotonic() + PATIENCE
     while (now := browser.driver.execute_script("return document.body.dataset.state")) != state:
@@ -173,10 +162,6 @@ def still(browser):
             return now.astype(float)
         assert time.monotonic() < end
         last = now
-
-
-def psnr(one, two):
-    return float(-10 * np.log10(np.square((one - two) / 255).mean()))
 
 
 @pytest.mark.slow
@@ -201,7 +186,7 @@ def test_the_page_shows_what_the_run_does(scene, fitted_run, tmp_path, monkeypat
         browser.resize(int(camera.width[0]), int(camera.height[0]))
         browser.driver.get(f"{out.as_uri()}#v={numbers}&generated=0&bare=1")
         reaches(browser, "shown")
-        assert psnr(still(browser), 255 * np.clip(expected, 0, 1)) > 40
+        assert psnr(still(browser) / 255, np.clip(expected, 0, 1)) > 40
         assert browser.console_errors() == [] and browser.foreign_requests() == []
 
 
@@ -234,7 +219,7 @@ def test_a_click_flies_and_the_address_keeps_view_and_choices(fitted_run, tmp_pa
         browser.driver.get("about:blank")
         browser.driver.get(f"{kept}&round=9")
         reaches(browser, "shown")
-        assert psnr(still(browser)[60:, :700], third[60:, :700]) > 45
+        assert psnr(still(browser)[60:, :700] / 255, third[60:, :700] / 255) > 45
         assert "after round 2" in browser.text().replace("\n", " ")
         # In a window of the size that frames have, the scene alone.
         browser.resize(300, 150)
@@ -252,8 +237,5 @@ def test_without_webgl_a_line_says_so(bare_run, tmp_path):
             {"source": "HTMLCanvasElement.prototype.getContext = () => null"},
         )
         browser.driver.get(out.as_uri())
-        end = time.monotonic() + PATIENCE
-        while "This browser has no WebGL 2" not in browser.text():
-            assert time.monotonic() < end
-            time.sleep(0.1)
+        wait(lambda: "This browser has no WebGL 2" in browser.text())
         assert browser.console_errors() == []

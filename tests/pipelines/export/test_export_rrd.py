@@ -23,21 +23,16 @@ def chunks(path):
             yield str(chunk.entity_path), batch.select(names).to_pydict()
 
 
-def points(path):
-    """By entity: round and positions (N, 3)."""
-    return {
-        entity: (columns["round"][0], np.array(columns["Points3D:positions"][0]))
-        for entity, columns in chunks(path)
-        if "Points3D:positions" in columns
-    }
-
-
 def test_points_come_with_their_rounds(reconstructed_run, tmp_path):
     export_run(reconstructed_run.path, "rrd", tmp_path / "out.rrd")
     memory = reconstructed_run.memory
     rows = thin(memory, None).rows
     rounds, made = memory.columns.round[rows], memory.generated[rows]
-    found = points(tmp_path / "out.rrd")
+    found = {
+        entity: (columns["round"][0], np.array(columns["Points3D:positions"][0]))
+        for entity, columns in chunks(tmp_path / "out.rrd")
+        if "Points3D:positions" in columns
+    }
     expected = {}
     for number in memory.rounds:
         for kind, chosen in (("observed", ~made), ("generated", made)):
