@@ -51,7 +51,7 @@ def test_dropped_pictures_stand_beside_the_verdict(tmp_path, capsys):
 def test_json_holds_the_report(tmp_path):
     reconstruction = workspace(tmp_path / "project", "PINHOLE")
     check(tmp_path / "project", "--json", tmp_path / "report.json")
-    data = json.loads((tmp_path / "report.json").read_text())
+    data = report(tmp_path / "report.json")
     assert data["ok"] is True
     assert data["views"] == data["views_opened"] == reconstruction.num_reg_images()
     assert data["sparse_points"] == reconstruction.num_points3D()
@@ -68,15 +68,12 @@ def test_an_unreadable_picture_is_an_error_after_the_report(tmp_path, capsys):
     assert out.index("error: ") < out.index("info: ")
     with pytest.raises(ProjectError):
         check(tmp_path / "project", "--json", tmp_path / "report.json")
-    data = json.loads((tmp_path / "report.json").read_text())
-    assert data["ok"] is False
-    assert data["views_opened"] == 2
-
-
-def test_what_cannot_be_opened_is_in_the_json_too(tmp_path):
+    data = report(tmp_path / "report.json")
+    assert (data["ok"], data["views_opened"]) == (False, 2)
+    # What cannot be opened is in the JSON, too.
     with pytest.raises(ProjectError, match="no such folder"):
         check(tmp_path / "absent", "--json", tmp_path / "report.json")
-    data = json.loads((tmp_path / "report.json").read_text())
+    data = report(tmp_path / "report.json")
     assert data["ok"] is False
     assert "no such folder" in data["findings"][0]["message"]
 
@@ -329,89 +326,64 @@ def test_shards_that_cannot_be_are_one_line(arguments, complaint, download, tmp_
 ADDRESS = "spec:7-Scenes:wall/seq-01"
 
 
-@pytest.fixture
-def recordings(tmp_path: Path) -> Path:
-    """Two recordings of one place, in the layout of 7-Scenes."""
-    write_scan(tmp_path / "7scenes" / "wall" / "seq-01")
-    write_scan(tmp_path / "7scenes" / "wall" / "seq-02", views=5)
-    return tmp_path / "7scenes"
-
-
-def test_a_scene_of_a_data_set_is_a_project(recordings: Path) -> None:
-    scene = gvtools.open_project(ADDRESS, root=recordings)
+def test_a_scene_of_a_data_set_is_a_project(root: Path) -> None:
+    scene = gvtools.open_project(ADDRESS, root=root)
     assert len(scene) == 6
-    assert scene.root == recordings / "wall" / "seq-01"
+    assert scene.root == root / "wall" / "seq-01"
     assert scene.address == "spec:7scenes:wall/seq-01"
     assert scene.subset(scene.names[:2]).origin == scene.origin
     np.testing.assert_allclose(scene.cameras.world_from_cam[1], world_from_cam(1), atol=1e-9)
-    other = gvtools.open_project("spec:7SCENES:wall/seq-01", root=recordings)
+    other = gvtools.open_project("spec:7SCENES:wall/seq-01", root=root)
     assert other.address == scene.address
     # A plain folder is opened by itself.
     assert gvtools.open_project(scene.root).address == str(scene.root.resolve())
 
 
-def test_what_is_not_said_or_not_there(recordings: Path) -> None:
-    for address, message in (
-        ("spec:7-Scenes:wall/seq-1", "no scene 'wall/seq-1' there; did you mean 'wall/seq-01'"),
-        ("spec:7-Scenes", "holds 2 scenes of 7-Scenes, first 'wall/seq-01'; say which"),
-        ("spec:7-Scenes:", "say which, as spec:NAME:SCENE"),
+def test_what_is_not_said_or_not_there(root: Path) -> None:
+    here: dict[str, Any] = {"root": root}
+    for error, address, places, message in (
+        (ProjectError, "spec:7-Scenes:wall/seq-1", here, "there; did you mean 'wall/seq-01'"),
+        (ProjectError, "spec:7-Scenes", here, "2 scenes of 7-Scenes, first 'wall/seq-01'; say"),
+        (ProjectError, "spec:7-Scenes:", here, "say which, as spec:NAME:SCENE"),
+        (ProjectError, ADDRESS, {"root": root / "gone"}, "no such folder"),
+        (OptionError, "spec:7-Scene:wall", here, "'7-Scene' is unknown; did you mean '7scenes'"),
+        (OptionError, "spec::wall/seq-01", here, "names no data set; expected spec:NAME:SCENE"),
+        (OptionError, ADDRESS, {}, r"where 7-Scenes lies is not said.*--root DIR"),
+        (OptionError, ADDRESS, {**here, "images": root}, "expected no images"),
+        (OptionError, root / FIRST, here, "expected no root"),
     ):
-        with pytest.raises(ProjectError, match=message):
-            gvtools.open_project(address, root=recordings)
-    for address, message in (
-        ("spec:7-Scene:wall", "data set '7-Scene' is unknown; did you mean '7scenes'"),
-        ("spec::wall/seq-01", "names no data set; expected spec:NAME:SCENE"),
-    ):
-        with pytest.raises(OptionError, match=message):
-            gvtools.open_project(address, root=recordings)
-    with pytest.raises(OptionError, match=r"where 7-Scenes lies is not said.*--root DIR"):
-        gvtools.open_project(ADDRESS)
-    with pytest.raises(OptionError, match="expected no images"):
-        gvtools.open_project(ADDRESS, root=recordings, images=recordings)
-    with pytest.raises(OptionError, match="expected no root"):
-        gvtools.open_project(recordings / "wall" / "seq-01", root=recordings)
-    with pytest.raises(ProjectError, match="no such folder"):
-        gvtools.open_project(ADDRESS, root=recordings / "gone")
+        with pytest.raises(error, match=message):
+            gvtools.open_project(address, **places)
 
 
-def test_commands_take_it(
-    recordings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    report = tmp_path / "check.json"
-    assert main(["check", ADDRESS, "--root", str(recordings), "--json", str(report)]) == 0
-    assert json.loads(report.read_text())["views"] == 6
-    figures = tmp_path / "ate.json"
-    words = [
-        ADDRESS,
-        str(recordings / "wall" / "seq-01"),
-        "--root",
-        str(recordings),
-        "--align",
-        "none",
-    ]
+def test_commands_take_it(root: Path, tmp_path: Path, capsys) -> None:
+    checked, figures = tmp_path / "check.json", tmp_path / "ate.json"
+    assert main(["check", ADDRESS, "--root", str(root), "--json", str(checked)]) == 0
+    assert report(checked)["views"] == 6
+    words = [ADDRESS, str(root / FIRST), "--root", str(root), "--align", "none"]
     assert main(["trajectory", "ate", *words, "--json", str(figures)]) == 0
     assert json.loads(figures.read_text())["associated"] == 6
     capsys.readouterr()
     assert "is not said" in refused(capsys, "check", ADDRESS)
-    plain = recordings / "wall" / "seq-01"
-    assert "expected no root" in refused(capsys, "check", plain, "--root", recordings)
-    line = refused(capsys, "trajectory", "ate", plain, plain, "--root", recordings)
+    plain = root / "wall" / "seq-01"
+    assert "expected no root" in refused(capsys, "check", plain, "--root", root)
+    line = refused(capsys, "trajectory", "ate", plain, plain, "--root", root)
     assert "belongs to spec:NAME:SCENE" in line
     line = refused(capsys, "train", "tune", "--scene", ADDRESS, "--out", tmp_path / "tuned")
     assert "is not said" in line
-    line = refused(capsys, "train", "tiny", "--root", recordings, "--out", tmp_path / "trained")
+    line = refused(capsys, "train", "tiny", "--root", root, "--out", tmp_path / "trained")
     assert "--root: belongs to 'gvtools train tune'" in line
 
 
 @pytest.mark.slow
-def test_a_run_is_resumed_and_evaluated(recordings, tmp_path, monkeypatch, capsys):
+def test_a_run_is_resumed_and_evaluated(root, tmp_path, monkeypatch, capsys):
     out = tmp_path / "run"
     options = ["--context", "every:2", "--targets", "every:2+1", "--views-per-round", "2"]
     options += ["--voxel", "0.05", "--refine", "0", "--out", str(out), "--quiet"]
-    assert main(["reconstruct", ADDRESS, "--root", str(recordings), *options]) == 0
+    assert main(["reconstruct", ADDRESS, "--root", str(root), *options]) == 0
     record = json.loads((out / "run.json").read_text())
     assert record["project"] == "spec:7scenes:wall/seq-01"
-    assert record["reading"] == {"root": str(recordings.resolve())}
+    assert record["reading"] == {"root": str(root.resolve())}
     # The last round again, the project named in other words and from another folder.
     whole = (out / "round_002" / "report.json").read_text()
     shutil.rmtree(out / "round_002")
@@ -426,7 +398,7 @@ def test_a_run_is_resumed_and_evaluated(recordings, tmp_path, monkeypatch, capsy
     measure = ["evaluate", str(out), "--parts", "images", "--quiet", "--json"]
     assert main([*measure, str(tmp_path / "before.json")]) == 0
     # The download moves: its new folder is said as that of any project.
-    moved = recordings.rename(tmp_path / "elsewhere")
+    moved = root.rename(tmp_path / "elsewhere")
     assert "gone" in refused(capsys, "refine", out, "--steps", 1)
     words = ["--project", str(moved)]
     assert main([*measure, str(tmp_path / "after.json"), *words]) == 0
@@ -436,11 +408,11 @@ def test_a_run_is_resumed_and_evaluated(recordings, tmp_path, monkeypatch, capsy
     assert load_run(out, project=moved).scenes[0].root == moved / "wall" / "seq-01"
 
 
-def test_targets_of_another_scene_of_the_download(recordings: Path, tmp_path: Path) -> None:
+def test_targets_of_another_scene_of_the_download(root: Path, tmp_path: Path) -> None:
     run = gvtools.reconstruct(
         ADDRESS,
         tmp_path / "run",
-        root=recordings,
+        root=root,
         context="first:3",
         targets="spec:7-Scenes:wall/seq-02@frame-000003.color.png,frame-000004.color.png",
         completer="none",
@@ -448,7 +420,7 @@ def test_targets_of_another_scene_of_the_download(recordings: Path, tmp_path: Pa
     )
     assert run.record["targets_project"] == "spec:7scenes:wall/seq-02"
     scene, truths = run.scenes
-    assert truths is not None and truths.root == recordings / "wall" / "seq-02"
+    assert truths is not None and truths.root == root / "wall" / "seq-02"
     assert [truth is not None for _, _, truth in run.targets()] == [True, True]
     with pytest.raises(OptionError, match="none of a data set"):
         gvtools.reconstruct(
@@ -456,9 +428,9 @@ def test_targets_of_another_scene_of_the_download(recordings: Path, tmp_path: Pa
         )
 
 
-def test_a_recorded_project_says_where_it_lies_now(recordings: Path) -> None:
+def test_a_recorded_project_says_where_it_lies_now(root: Path) -> None:
     reading = {"root": "/nowhere"}
-    scene = open_recorded(ADDRESS, reading, moved=recordings)
+    scene = open_recorded(ADDRESS, reading, moved=root)
     assert int(scene.cameras.width[0]) == WIDTH
     # A plain folder takes the place of the data set's scene as well as of another folder.
     with pytest.raises(OptionError):

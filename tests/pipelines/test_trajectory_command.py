@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -28,10 +29,10 @@ def measured(tmp_path, *arguments: object) -> dict:
 
 def test_files_of_one_layout(tmp_path):
     reference = path()
-    for layout, write in (("tum", write_tum), ("kitti", write_kitti)):
+    for layout, written in (("tum", write_tum), ("kitti", write_kitti)):
         one, two = tmp_path / f"{layout}.a.txt", tmp_path / f"{layout}.b.txt"
-        write(one, cameras(reference))
-        write(two, cameras(moved(reference, scale=3)))
+        written(one, cameras(reference))
+        written(two, cameras(moved(reference, scale=3)))
         figures = measured(tmp_path, "ate", one, two)
         assert figures["status"] == "aligned"
         assert figures["rmse"] < 1e-9
@@ -43,15 +44,10 @@ def test_files_of_one_layout(tmp_path):
 
 
 def test_an_euroc_file_against_a_tum_file(tmp_path):
-    reference = path()
-    write_tum(tmp_path / "tum.txt", cameras(reference))
-    rows = ["#timestamp, p_x, p_y, p_z, q_w, q_x, q_y, q_z, v_x, v_y, v_z"]
-    for i, pose in enumerate(disturbed(reference, metres=0.1)):
-        x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat()
-        values = [*pose[:3, 3], w, x, y, z, 0, 0, 0]
-        rows.append(",".join([str(i * 10**9), *(f"{v:.17g}" for v in values)]))
-    (tmp_path / "data.csv").write_text("\n".join(rows))
-    figures = measured(tmp_path, "ate", tmp_path / "tum.txt", tmp_path / "data.csv")
+    head = "#timestamp, p_x, p_y, p_z, q_w, q_x, q_y, q_z, v_x, v_y, v_z\n"
+    lines = [[*row, "0", "0", "0"] for row in rows(disturbed(path(), metres=0.1), "wxyz", 1e-9)]
+    tum = write(tmp_path / "tum.txt", rows(path()))
+    figures = measured(tmp_path, "ate", tum, write(tmp_path / "data.csv", lines, ",", head))
     assert figures["associated"] == 40
     assert 0.1 < figures["rmse"] < 0.25
     assert figures["rotation_deg"]["max"] < 5
@@ -92,6 +88,12 @@ def rows(poses: np.ndarray, order: str = "xyzw", unit: float = 1.0) -> list[list
     return [[time, *(f"{v:.17g}" for v in row)] for time, row in zip(stamps, values, strict=True)]
 
 
+def write(file: Path, lines: list[list[str]], between: str = " ", head: str = "") -> Path:
+    """Lines in a file, and the file."""
+    file.write_text(head + "\n".join(map(between.join, lines)))
+    return file
+
+
 EUROC_HEAD = "#timestamp [ns], p_RS_R_x [m], p_y [m], p_z [m], q_RS_w [], q_x [], q_y [], q_z []\n"
 
 
@@ -113,12 +115,11 @@ def test_heads_and_numbers_decide_columns_and_units(
     tmp_path, capsys, name, head, order, unit, comma, said
 ):
     reference = path()
-    (tmp_path / "tum.txt").write_text("\n".join(" ".join(row) for row in rows(reference)))
     lines = rows(reference, order, unit)
     if head.startswith("num"):
         lines = [[str(i), *row] for i, row in enumerate(lines)]
-    (tmp_path / name).write_text(head + "\n".join(comma.join(row) for row in lines))
-    figures = measured(tmp_path, "ate", tmp_path / "tum.txt", tmp_path / name)
+    tum, other = write(tmp_path / "tum.txt", rows(reference)), tmp_path / name
+    figures = measured(tmp_path, "ate", tum, write(other, lines, comma, head))
     assert figures["associated"] == 40
     assert figures["rotation_deg"]["max"] < 1e-5
     assert said in capsys.readouterr().err
@@ -126,28 +127,23 @@ def test_heads_and_numbers_decide_columns_and_units(
 
 
 def test_contradictions_are_refused_with_the_layout(tmp_path, capsys):
-    file = tmp_path / "a.txt"
-    file.write_text(EUROC_HEAD + "\n".join(",".join(row) for row in rows(path(), "wxyz", 1e-9)))
-    assert "leave --layout out" in refused(
-        capsys, "trajectory", "ate", file, file, "--layout", "tum"
-    )
-    file.write_text(EUROC_HEAD + "\n".join(",".join(row) for row in rows(path(), "wxyz")))
-    assert "mend the head" in refused(capsys, "trajectory", "ate", file, file)
-    start = path() @ np.linalg.inv(path()[0])
-    file.write_text("\n".join(" ".join(row) for row in rows(start, "wxyz")))
+    file = write(tmp_path / "a.txt", rows(path(), "wxyz", 1e-9), ",", EUROC_HEAD)
+    words = ("trajectory", "ate", file, file)
+    assert "leave --layout out" in refused(capsys, *words, "--layout", "tum")
+    write(file, rows(path(), "wxyz"), ",", EUROC_HEAD)
+    assert "mend the head" in refused(capsys, *words)
+    write(file, rows(path() @ np.linalg.inv(path()[0]), "wxyz"))
     assert "--layout" in refused(capsys, "trajectory", "ate", file, file)
     assert measured(tmp_path, "ate", file, file, "--layout", "euroc")["rmse"] < 1e-9
 
 
 def test_shuffled_and_repeated_stamps_change_no_figure(tmp_path, capsys):
     reference, estimate = path(), disturbed(path(), metres=0.05)
-    one, two = tmp_path / "a.txt", tmp_path / "b.txt"
-    one.write_text("\n".join(" ".join(row) for row in rows(reference)))
-    lines = [" ".join(row) for row in rows(estimate)]
-    two.write_text("\n".join(lines))
+    lines = rows(estimate)
+    one, two = write(tmp_path / "a.txt", rows(reference)), write(tmp_path / "b.txt", lines)
     pairs = ((one, two), (two, one))
     right = [measured(tmp_path, "rpe", *pair)["rmse"] for pair in pairs]
-    two.write_text("\n".join([*lines[20:], *lines[:25]]))
+    write(two, [*lines[20:], *lines[:25]])
     assert [measured(tmp_path, "rpe", *pair)["rmse"] for pair in pairs] == right
     assert "1 of 45 time stamps not in order, sorted" in (text := capsys.readouterr().err)
     assert "5 repeated, merged" in text
@@ -155,16 +151,14 @@ def test_shuffled_and_repeated_stamps_change_no_figure(tmp_path, capsys):
 
 def test_pictures_named_by_their_time_are_paired_as_stamps(tmp_path, capsys):
     reference = path()
-    a, b, tum = tmp_path / "a", tmp_path / "b", tmp_path / "tum.txt"
+    a, b = tmp_path / "a", tmp_path / "b"
     write_colmap(a, cameras(reference, tuple(f"{100 + i / 10:.2f}.png" for i in range(40))))
     write_colmap(b, cameras(reference, tuple(f"{100.04 + i / 10:.2f}.png" for i in range(40))))
     assert "no pair within 0.01 s" in refused(capsys, "trajectory", "ate", a, b)
-    tum.write_text("\n".join(" ".join(row) for row in rows(reference)))
-    (tmp_path / "data.csv").write_text(
-        "\n".join(",".join(row) for row in rows(reference, "wxyz", 1e-9))
-    )
+    tum = write(tmp_path / "tum.txt", rows(reference))
+    euroc = write(tmp_path / "data.csv", rows(reference, "wxyz", 1e-9), ",")
     write_colmap(b, cameras(reference, tuple(f"cam0/{100 + i / 10:.1f}.jpg" for i in range(40))))
-    for file in (tum, tmp_path / "data.csv", b):
+    for file in (tum, euroc, b):
         figures = measured(tmp_path, "ate", a, file)
         assert (figures["association"], figures["associated"]) == ("time", 40)
         assert figures["rmse"] < 1e-9
@@ -193,12 +187,10 @@ def test_times_within_names_are_paired_with_a_file_s(tmp_path, capsys, named):
     stamps = [(1_600_000_000 + i // 10, i % 10 * 10**8) for i in range(40)]
     write_colmap(tmp_path / "a", cameras(path(), tuple(named.format(*stamp) for stamp in stamps)))
     values = [row[1:] for row in rows(path())]
-    lines = [",".join([*map(str, stamp), *row]) for stamp, row in zip(stamps, values, strict=True)]
-    file = tmp_path / "b.csv"
+    lines = [[*map(str, stamp), *row] for stamp, row in zip(stamps, values, strict=True)]
+    head = '"sec","nsec","x","y","z","qx","qy","qz","qw"\n'
     # Not the first pose, but as many: paired by order, all would be of other moments.
-    file.write_text(
-        "\n".join(['"sec","nsec","x","y","z","qx","qy","qz","qw"', *lines[1:], lines[0]])
-    )
+    file = write(tmp_path / "b.csv", [*lines[1:], lines[0]], ",", head)
     figures = measured(tmp_path, "ate", tmp_path / "a", file)
     assert (figures["association"], figures["associated"]) == ("time", 40)
     assert figures["rmse"] < 1e-9
@@ -210,12 +202,9 @@ def test_pairs_of_doubtful_moments_are_warned_of(tmp_path, capsys):
     write_colmap(tmp_path / "a", cameras(path(), names))
     files = [tmp_path / "b.txt", tmp_path / "c.txt"]
     for file, late in zip(files, (0, 0.04), strict=True):
-        lines = [[f"{float(time) + late}", *rest] for time, *rest in rows(path())]
-        file.write_text("\n".join(" ".join(line) for line in lines))
-    assert (
-        "order alone"
-        in measured(tmp_path, "ate", tmp_path / "a", files[0])["notes"]["association"][0]
-    )
+        write(file, [[f"{float(time) + late}", *rest] for time, *rest in rows(path())])
+    figures = measured(tmp_path, "ate", tmp_path / "a", files[0])
+    assert "order alone" in figures["notes"]["association"][0]
     figures = measured(tmp_path, "ate", *files, "--max-difference", "1")
     assert "differ by 0.04 s (median)" in figures["notes"]["association"][0]
     assert capsys.readouterr().err.count("warning") == 2
@@ -223,8 +212,7 @@ def test_pairs_of_doubtful_moments_are_warned_of(tmp_path, capsys):
 
 def test_numbers_of_frames_against_seconds_are_warned_of(tmp_path, capsys):
     for name, rate in (("a.txt", 10), ("b.txt", 1)):
-        lines = (" ".join([f"{i / rate}", *row[1:]]) for i, row in enumerate(rows(path())))
-        (tmp_path / name).write_text("\n".join(lines))
+        write(tmp_path / name, [[f"{i / rate}", *row[1:]] for i, row in enumerate(rows(path()))])
     figures = measured(tmp_path, "ate", tmp_path / "a.txt", tmp_path / "b.txt")
     assert figures["associated"] == 4
     assert "--associate index" in figures["notes"]["association"][0]
@@ -243,8 +231,7 @@ def test_numbers_of_frames_against_seconds_are_warned_of(tmp_path, capsys):
 def test_clocks_of_another_rate_are_warned_of(tmp_path, rate, dense, said):
     every = path(39 * dense + 1)
     for name, poses, step in (("a", every, 0.1 / dense), ("b", every[::dense], 0.1 * rate)):
-        lines = (" ".join([f"{i * step}", *row[1:]]) for i, row in enumerate(rows(poses)))
-        (tmp_path / name).write_text("\n".join(lines))
+        write(tmp_path / name, [[f"{i * step}", *row[1:]] for i, row in enumerate(rows(poses))])
     notes = measured(tmp_path, "ate", tmp_path / "a", tmp_path / "b")["notes"]
     assert said in "".join(notes.get("association", []))
     assert bool(said) == ("association" in notes)
@@ -296,9 +283,8 @@ def test_matrices_of_every_writing(tmp_path, kind):
 
 @pytest.mark.parametrize("between", [" ", ";"])
 def test_decimal_commas_are_refused_by_name(tmp_path, capsys, between):
-    file = tmp_path / "a.txt"
-    lines = (between.join(row).replace(".", ",") for row in rows(path()))
-    file.write_text("\n".join(lines))
+    lines = [[value.replace(".", ",") for value in row] for row in rows(path())]
+    file = write(tmp_path / "a.txt", lines, between)
     assert "decimal commas" in refused(capsys, "trajectory", "ate", file, file)
 
 

@@ -489,25 +489,10 @@ def test_a_run_that_fails_at_once_says_no_more_than_why(tmp_path, capfd):
     assert "Traceback" not in said.err and "KeyboardInterrupt" not in said.err
 
 
-def test_a_round_that_came_while_the_viewer_started_is_shown(small_run, tmp_path, capsys):
-    growing, later = tmp_path / "growing", tmp_path / "later"
-    shutil.copytree(small_run, growing)
-    (growing / "round_002").rename(later)
-    source = ViewSource(growing)
-    shown = source.read()
-    later.rename(growing / "round_002")
-    rounds: list[int] = []
-    following = serve.Following(
-        source, shown, lambda r: rounds.append(r.last_round), console=Console()
-    )
-    following.look()
-    following.look()
-    assert rounds == [2]
-    assert capsys.readouterr().out == "round 2 is there\n"
-
-
-@pytest.mark.parametrize("report", ['{"round": 2,', "[]", '{"round": 2, "views": []}'])
-def test_a_report_that_cannot_be_read_does_not_end_the_viewer(small_run, tmp_path, capsys, report):
+@pytest.mark.parametrize("report", ["", '{"round": 2,', "[]", '{"round": 2, "views": []}'])
+def test_a_round_that_came_meanwhile_is_shown_once_its_report_is_whole(
+    small_run, tmp_path, capsys, report
+):
     growing, kept = tmp_path / "growing", tmp_path / "kept"
     shutil.copytree(small_run, growing)
     (growing / "round_002").rename(kept)
@@ -515,13 +500,16 @@ def test_a_report_that_cannot_be_read_does_not_end_the_viewer(small_run, tmp_pat
     following = serve.Following(
         source, source.read(), lambda run: rounds.append(run.last_round), console=Console()
     )
-    (growing / "round_002").mkdir()
-    (growing / "round_002" / "report.json").write_text(report)
-    for _ in range(3):
-        following.look()
-    said = capsys.readouterr().err
-    assert len(said.splitlines()) == 1 and "round_002" in said
-    shutil.rmtree(growing / "round_002")
+    if report:
+        (growing / "round_002").mkdir()
+        (growing / "round_002" / "report.json").write_text(report)
+        for _ in range(3):
+            following.look()
+        said = capsys.readouterr().err
+        assert len(said.splitlines()) == 1 and "round_002" in said
+        shutil.rmtree(growing / "round_002")
     kept.rename(growing / "round_002")
     following.look()
+    following.look()
     assert rounds == [2]
+    assert capsys.readouterr().out == "round 2 is there\n"
