@@ -186,11 +186,7 @@ def _check_capture(
         raise UnposedError(
             args.project, unposed.found, f"find the cameras first: {command}; or add --capture"
         )
-    for name in ("images", "model"):
-        if getattr(args, name) is not None:
-            raise OptionError(
-                f"--{name}: of a COLMAP project; {args.project} has {unposed.found}; leave it out"
-            )
+    args.refuse(("images", "model"), f"of a COLMAP project; {args.project} has {unposed.found}")
 
 
 def _is_of(project: Path, source: Path) -> bool:

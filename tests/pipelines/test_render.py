@@ -28,6 +28,7 @@ from gvtools.memory.ply import export_memory_ply
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.runs.layout import file_stems
 from gvtools.runs.poses import RunPoses
+from gvtools.runs.run import load_memory
 from gvtools.scenes.project import open_project
 from pipelines.bench.procedural_cloud import inside_camera, photograph
 from pipelines.cli import main
@@ -51,6 +52,11 @@ def run(*words: object) -> None:
     run_command("render", *words, quiet=True)
 
 
+def of_box(box: Path, *words: object) -> None:
+    """The box's run in cameras of its project."""
+    run(box / "run", "--cameras", box / "project", *words)
+
+
 def rendered(folder, stem):
     rgb = np.asarray(Image.open(folder / f"{stem}.rgb.png"))
     depth = np.load(folder / f"{stem}.depth.npz")["depth"]
@@ -60,7 +66,7 @@ def rendered(folder, stem):
 
 
 def test_the_files_hold_the_projection(box, tmp_path):
-    run(box / "run", "--cameras", box / "project", "--views", "every:2+1", "--out", tmp_path)
+    of_box(box, "--views", "every:2+1", "--out", tmp_path)
     assert len(list(tmp_path.iterdir())) == 3 * 4
     rgb, depth, valid, confidence = rendered(tmp_path, "view_3")
     camera = inside_camera(SIZE, turn=0.36, width=WIDTH, height=HEIGHT)
@@ -81,10 +87,8 @@ def test_the_files_hold_the_projection(box, tmp_path):
 
 def test_figures_against_pictures_are_skimages(box, tmp_path):
     file = tmp_path / "figures.json"
-    run(
-        box / "run" / "memory.npz", "--cameras", box / "project", "--views", "view_1.png",
-        "--against-images", "--out", tmp_path / "out", "--json", file,
-    )  # fmt: skip
+    words = ("--views", "view_1.png", "--against-images", "--json", file)
+    run(box / "run" / "memory.npz", "--cameras", box / "project", *words)
     data = json.loads(file.read_text())
     camera = inside_camera(SIZE, turn=0.12, width=WIDTH, height=HEIGHT)
     guidance = SpatialMemory.load(box / "run" / "memory.npz").project(camera)
@@ -109,47 +113,38 @@ def test_generated_pixels_have_their_own_figures(box, tmp_path):
     scene = write_box(tmp_path / "project", views=14)
     memory = fused(scene, [0, 12], generated=(12,))
     memory.save(tmp_path / "memory.npz")
-    run(
-        tmp_path / "memory.npz", "--cameras", tmp_path / "project", "--views", "view_12.png",
-        "--against-images", "--out", tmp_path / "out", "--json", tmp_path / "figures.json",
-    )  # fmt: skip
-    data = json.loads((tmp_path / "figures.json").read_text())
+    file = tmp_path / "figures.json"
+    words = ("--views", "view_12.png", "--against-images", "--json", file)
+    run(tmp_path / "memory.npz", "--cameras", tmp_path / "project", *words)
+    data = json.loads(file.read_text())
     # The view's own pixels, averaged in voxels of about two of them.
     assert data["psnr_generated"] > 20
     assert data["depth_rel_generated"] < 0.01
 
 
-def test_pictures_that_are_renumbered_or_mirrored_are_warned_of(box, tmp_path, capsys):
+def test_pictures_that_are_others_are_warned_of(box, tmp_path, capsys):
     files = sorted((box / "project").rglob("view_*.png"))
-    for said in ("", "renumbered: what is shown is nearer to the picture after", "mirrored"):
+    renumbered = "renumbered: what is shown is nearer to the picture after"
+    for said in ("", renumbered, "mirrored", "of another scene"):
         project = shutil.copytree(box / "project", tmp_path / (said[:4] or "own"))
         for file, after in pairwise(files):
             there = project / file.relative_to(box / "project")
-            if said.startswith("renumbered"):
+            picture = np.asarray(Image.open(file))
+            if said == renumbered:
                 shutil.copy(file, there.with_name(after.name))
             elif said:
-                Image.fromarray(np.asarray(Image.open(file))[:, ::-1]).save(there)
-        run(box / "run", "--cameras", project, "--against-images")
+                changed = picture[:, ::-1] if said == "mirrored" else 255 - picture
+                Image.fromarray(changed).save(there)
+        few = ("--views", "first:2") if said == "of another scene" else ()
+        run(box / "run", "--cameras", project, "--against-images", *few)
         warned = capsys.readouterr().err
         assert said in warned and bool(said) == ("seem to be" in warned)
 
 
-def test_pictures_of_another_scene_are_warned_of(box, tmp_path, capsys):
-    for negative in (False, True):
-        project = shutil.copytree(box / "project", tmp_path / f"{negative}")
-        for file in project.rglob("view_*.png"):
-            picture = np.asarray(Image.open(file))
-            Image.fromarray(255 - picture if negative else picture).save(file)
-        run(box / "run", "--cameras", project, "--views", "first:2", "--against-images")
-        assert ("of another scene" in capsys.readouterr().err) == negative
-
-
 def test_without_comparing_the_figures_are_null_with_a_reason(box, tmp_path):
-    run(
-        box / "run", "--cameras", box / "project", "--views", "first:2", "--out", tmp_path / "out",
-        "--json", tmp_path / "figures.json",
-    )  # fmt: skip
-    data = json.loads((tmp_path / "figures.json").read_text())
+    file = tmp_path / "figures.json"
+    of_box(box, "--views", "first:2", "--out", tmp_path / "out", "--json", file)
+    data = json.loads(file.read_text())
     assert data["psnr"] is None and "--against-images" in data["notes"]["psnr"]
     assert data["coverage"] > 0.5
 
@@ -159,15 +154,13 @@ def test_a_trajectory_gives_cameras(box, tmp_path):
         [inside_camera(SIZE, turn=t, width=WIDTH, height=HEIGHT) for t in (0.1, 0.3)]
     )
     write_tum(tmp_path / "path.txt", cameras)
-    run(box / "run", "--cameras", tmp_path / "path.txt", "--out", tmp_path / "out")
+    words = (box / "run", "--cameras", tmp_path / "path.txt", "--out", tmp_path / "out")
+    run(*words)
     first = rendered(tmp_path / "out", "0")
     guidance = SpatialMemory.load(box / "run" / "memory.npz").project(cameras[0])
     np.testing.assert_allclose(first[1], guidance.depth[0], atol=1e-5)
     with pytest.raises(OptionError, match="without pictures"):
-        run(
-            box / "run", "--cameras", tmp_path / "path.txt", "--out", tmp_path / "out",
-            "--against-images",
-        )  # fmt: skip
+        run(*words, "--against-images")
 
 
 @pytest.mark.parametrize("name", ["../x.png", "/x.png", "a/../../x.png"])
@@ -212,18 +205,19 @@ def test_sub_folders_are_made(tmp_path):
 
 
 def test_settings_of_the_projection(box, tmp_path):
-    arguments = (box / "run", "--cameras", box / "project", "--views", "first:1")
-    run(*arguments, "--out", tmp_path / "a")
-    run(*arguments, "--out", tmp_path / "b", "--set", "splat.max_splat_px=0.1", "--set",
-        "splat.support=2")  # fmt: skip
+    words = ("--views", "first:1", "--out")
+    of_box(box, *words, tmp_path / "a")
+    changed = ("--set", "splat.max_splat_px=0.1", "--set", "splat.support=2")
+    of_box(box, *words, tmp_path / "b", *changed)
     covered = [rendered(tmp_path / name, "view_0")[2].mean() for name in "ab"]
     assert covered[1] < covered[0]
-    with pytest.raises(OptionError, match=r"takes splat\.KEY=VALUE"):
-        run(*arguments, "--out", tmp_path / "c", "--set", "seed=2")
-    with pytest.raises(OptionError, match="did you mean"):
-        run(*arguments, "--out", tmp_path / "c", "--set", "splat.bnd=2")
-    with pytest.raises(OptionError, match="backend 'gpu'"):
-        run(*arguments, "--out", tmp_path / "c", "--backend", "gpu")
+    for option, value, said in (
+        ("--set", "seed=2", r"takes splat\.KEY=VALUE"),
+        ("--set", "splat.bnd=2", "did you mean"),
+        ("--backend", "gpu", "backend 'gpu'"),
+    ):
+        with pytest.raises(OptionError, match=said):
+            of_box(box, *words, tmp_path / "c", option, value)
 
 
 def test_a_ply_has_no_camera_for_a_trajectory(box, tmp_path):
@@ -259,19 +253,16 @@ def test_an_unfinished_run_gives_its_last_round(box, tmp_path):
 
 def test_figures_alone_need_no_folder(box, tmp_path):
     file = tmp_path / "figures.json"
-    words = (box / "run", "--cameras", box / "project", "--views", "view_1.png")
-    run(*words, "--against-images", "--json", file)
+    of_box(box, "--views", "view_1.png", "--against-images", "--json", file)
     assert json.loads(file.read_text())["psnr"] > 0
     assert [path.name for path in tmp_path.iterdir()] == ["figures.json"]
     with pytest.raises(OptionError, match="--against-images"):
-        run(*words)
+        of_box(box, "--views", "view_1.png")
 
 
 def test_a_panorama_is_a_picture_that_viewers_know(box, tmp_path):
-    run_command(
-        "render", box / "run", "--cameras", box / "project", "--views", "first:1",
-        "--lens", "equirectangular", "--width", 258, "--out", tmp_path, quiet=True,
-    )  # fmt: skip
+    lens = ("--lens", "equirectangular", "--width", 258)
+    of_box(box, "--views", "first:1", *lens, "--out", tmp_path)
     for name in ("view_0.rgb.png", "view_0.jpg"):
         with Image.open(tmp_path / name) as image:
             assert image.size == (256, 128)
@@ -290,10 +281,9 @@ def test_a_panorama_is_a_picture_that_viewers_know(box, tmp_path):
 
 
 def test_a_completed_panorama_has_no_holes_and_keeps_what_is_known(box, tmp_path):
-    words = ("render", box / "run", "--cameras", box / "project", "--views", "first:1",
-             "--lens", "equirectangular", "--width", 128, "--out")  # fmt: skip
-    run_command(*words, tmp_path / "known", quiet=True)
-    run_command(*words, tmp_path / "whole", "--complete", quiet=True)
+    words = ("--views", "first:1", "--lens", "equirectangular", "--width", 128, "--out")
+    of_box(box, *words, tmp_path / "known")
+    of_box(box, *words, tmp_path / "whole", "--complete")
     known, whole = (
         {kind: np.asarray(Image.open(tmp_path / name / f"view_0.{kind}.png")).astype(int)
          for kind in ("rgb", "valid")} for name in ("known", "whole")
@@ -306,10 +296,8 @@ def test_a_completed_panorama_has_no_holes_and_keeps_what_is_known(box, tmp_path
 
 
 def test_a_fisheye_is_black_outside_of_its_circle(box, tmp_path):
-    run_command(
-        "render", box / "run", "--cameras", box / "project", "--views", "first:1",
-        "--lens", "fisheye", "--field-of-view", 60, "--width", 64, "--out", tmp_path,
-    )  # fmt: skip
+    lens = ("--lens", "fisheye", "--field-of-view", 60, "--width", 64)
+    of_box(box, "--views", "first:1", *lens, "--out", tmp_path)
     rgb = np.asarray(Image.open(tmp_path / "view_0.rgb.png"))
     y, x = np.mgrid[:64, :64] - 31.5
     assert rgb.shape == (64, 64, 3)
@@ -319,9 +307,8 @@ def test_a_fisheye_is_black_outside_of_its_circle(box, tmp_path):
 
 
 def test_a_width_resizes_pictures_of_the_cameras_own_lens(box, tmp_path):
-    words = ("render", box / "run", "--cameras", box / "project", "--views", "first:1", "--out")
-    run_command(*words, tmp_path / "own", quiet=True)
-    run_command(*words, tmp_path / "half", "--width", WIDTH // 2, quiet=True)
+    of_box(box, "--views", "first:1", "--out", tmp_path / "own")
+    of_box(box, "--views", "first:1", "--out", tmp_path / "half", "--width", WIDTH // 2)
     own, half = (Image.open(tmp_path / name / "view_0.rgb.png") for name in ("own", "half"))
     assert half.size == (WIDTH // 2, HEIGHT // 2)
     apart = np.asarray(own.resize(half.size, Image.Resampling.BOX)).astype(int) - np.asarray(half)
@@ -436,12 +423,11 @@ def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of two rounds over a tiny recording."""
     folder = tmp_path_factory.mktemp("film")
     scan = write_scan(folder / "scan")
-    status = main(
-        ["reconstruct", str(scan), "--context", "every:2", "--targets", "interpolate:4",
-         "--set", "views_per_round=4", "--refine", "0", "--set", "refine.poses=false",
-         "--out", str(folder / "run"), "--quiet"]
+    run_command(
+        "reconstruct", scan, "--context", "every:2", "--targets", "interpolate:4",
+        "--set", "views_per_round=4", "--refine", "0", "--set", "refine.poses=false",
+        "--out", folder / "run", quiet=True,
     )  # fmt: skip
-    assert status == 0
     return folder / "run"
 
 
@@ -459,7 +445,7 @@ def test_a_path_becomes_a_film_of_the_memorys_pictures(filmed, tmp_path, suffix)
     out = tmp_path / f"film.{suffix}"
     assert main(["film", str(filmed), "--path", "interpolate:5", "--out", str(out)]) == 0
     frames = frames_of(out)
-    renderer = FilmRenderer(filmed, film_cameras(_memory(filmed), "interpolate:5"))
+    renderer = FilmRenderer(filmed, film_cameras(load_memory(filmed), "interpolate:5"))
     assert len(frames) == 5
     for index in (0, 4):
         drawn = renderer.frame(index, ("memory",))
@@ -478,7 +464,7 @@ def test_panels_stand_side_by_side_and_completed_has_no_holes(filmed: Path, tmp_
     arguments = ["--path", str(path), "--compare", "observed,completed", "--out", str(out)]
     assert main(["film", str(filmed), *arguments, "--width", "64"]) == 0
     assert frames_of(out)[0].shape == (48, 128, 3)
-    cameras = film_cameras(_memory(filmed), str(path), width=64)
+    cameras = film_cameras(load_memory(filmed), str(path), width=64)
     renderer = FilmRenderer(filmed, cameras, up_to=0)
     observed, completed = (renderer.frame(1, (panel,)) for panel in ("observed", "completed"))
     holes = (observed == 255).all(-1)
@@ -488,7 +474,7 @@ def test_panels_stand_side_by_side_and_completed_has_no_holes(filmed: Path, tmp_
 
 
 def test_depth_is_red_where_it_is_near(filmed: Path) -> None:
-    cameras = film_cameras(_memory(filmed), "cameras")
+    cameras = film_cameras(load_memory(filmed), "cameras")
     frame = FilmRenderer(filmed, cameras).frame(len(cameras) // 2, ("depth",))
     middle, wall = frame[36, 48].astype(int), frame[5, 5].astype(int)
     assert middle[0] > middle[2]  # the square, in front
@@ -497,10 +483,8 @@ def test_depth_is_red_where_it_is_near(filmed: Path) -> None:
 
 def test_growth_draws_the_path_once_for_each_round(filmed: Path, tmp_path: Path) -> None:
     out = tmp_path / "growth.webp"
-    assert (
-        main(["film", str(filmed), "--path", "interpolate:2", "--growth", "--out", str(out)]) == 0
-    )
-    assert len(frames_of(out)) == 2 * len(_memory(filmed).rounds) > 2
+    run_command("film", filmed, "--path", "interpolate:2", "--growth", "--out", out)
+    assert len(frames_of(out)) == 2 * len(load_memory(filmed).rounds) > 2
 
 
 @pytest.mark.parametrize(
@@ -521,12 +505,6 @@ def test_wrong_options_are_refused_and_nothing_is_written(
     monkeypatch.chdir(tmp_path)
     assert said in refused(capsys, "film", filmed, *arguments)
     assert not list(tmp_path.iterdir())
-
-
-def _memory(filmed: Path):
-    from gvtools.runs.run import load_memory
-
-    return load_memory(filmed)
 
 
 @pytest.mark.parametrize("width", [640, 1280])
