@@ -35,7 +35,7 @@ from gvtools.memory.splat.api import SplatOptions
 from gvtools.optional import require
 from gvtools.runs.run import at_run_poses, load_appearance, load_memory, said_of_path
 from gvtools.runs.target_files import to_bytes, write_png
-from gvtools.scenes.depth_contradictions import frame_there
+from gvtools.scenes.pixel_contradictions import frame_there
 from gvtools.scenes.scene import Frame, Scene
 from gvtools.scenes.transforms import read_camera_path
 from gvtools.trajectories import PATHS, named_path

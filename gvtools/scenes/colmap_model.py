@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -37,6 +38,8 @@ RIGGED = ("rigs", "frames")
 PLACES = ("sparse", ".", "colmap/sparse", "sparse_txt")
 # Bytes of the smallest record of each binary file.
 LEAST_BYTES = {"cameras": 24, "images": 73, "points3D": 51, "rigs": 8, "frames": 68}
+# Where in a record the number of elements stands, its form, theirs, and which column is the image.
+ELEMENTS = {"points3D": (43, "<Q", "<II", 0), "frames": (64, "<I", "<iIQ", 2)}
 # In texts, which the reader refuses with NaN and infinity, this stands for them.
 LOST = 1e300
 _NUMBER = re.compile(r"[-+\d.eE]+|[-+]?nan|[-+]?inf")
@@ -103,7 +106,13 @@ def _numbered(folder: Path) -> dict[int, Path]:
 
 def checked_suffix(folder: Path) -> str:
     """Of the files of the model in ``folder``: complete, and with counts that they can hold."""
-    suffix = _suffix(folder)
+    forms = (s for s in (".bin", ".txt") if all((folder / f"{n}{s}").is_file() for n in REQUIRED))
+    if (suffix := next(forms, None)) is None:
+        found = sorted(path.name for path in folder.iterdir() if path.suffix in (".bin", ".txt"))
+        raise ProjectError(
+            f"{folder}: an incomplete model, with {', '.join(found)}; expected cameras, images and "
+            "points3D, all .bin or all .txt; copy the whole model again"
+        )
     rigged = [stem for stem in RIGGED if (folder / f"{stem}{suffix}").is_file()]
     if len(rigged) == 1:
         missing = next(stem for stem in RIGGED if stem not in rigged)
@@ -117,40 +126,40 @@ def checked_suffix(folder: Path) -> str:
             size, count = path.stat().st_size, _count(path)
             if size < 8 or count * LEAST_BYTES[stem] + 8 > size:
                 raise _damaged(path, f"{count} records that its head names cannot be in it")
-        for stem in (*REQUIRED, *rigged):
-            if stem != "cameras":
-                _check_records(folder / f"{stem}.bin")
+        for stem in (*REQUIRED[1:], *rigged):
+            path = folder / f"{stem}.bin"
+            data = read_bytes(path)
+            try:
+                end = max(_places(data, stem))
+            except (struct.error, ValueError):
+                end = -1
+            if end != len(data):
+                raise _damaged(path, "its records take another number")
     else:
         _check_points(folder / "points3D.txt")
     return suffix
 
 
-def _check_records(path: Path) -> None:
-    """Walk a file by the counts in each record."""
-    data = read_bytes(path)
-    offset, record_end = 8, _RECORD_ENDS[path.stem]
-    try:
-        for _ in range(_count(path)):
-            offset = record_end(data, offset)
-            if offset > len(data):
-                break
-    except (struct.error, ValueError):
-        offset = -1
-    if offset != len(data):
-        raise _damaged(path, "its records take another number")
+def _places(data: bytes, stem: str) -> Iterator[int]:
+    """Where each record of a file begins by the counts in those before it, and where all end."""
+    at = 8
+    yield at
+    for _ in range(int(struct.unpack_from("<Q", data)[0])):
+        if at > len(data):
+            break
+        at = _record_end(data, at, stem)
+        yield at
 
 
-def _image_end(data: bytes, at: int) -> int:
-    name_end = data.index(b"\0", at + 64)
-    return name_end + 9 + 24 * int(struct.unpack_from("<Q", data, name_end + 1)[0])
-
-
-def _point_end(data: bytes, at: int) -> int:
-    return at + 51 + 8 * int(struct.unpack_from("<Q", data, at + 43)[0])
-
-
-def _rig_end(data: bytes, at: int) -> int:
-    """Its id, and its sensors: the first is the reference, the others may have a pose to it."""
+def _record_end(data: bytes, at: int, stem: str) -> int:
+    if stem == "images":
+        name_end = data.index(b"\0", at + 64)
+        return name_end + 9 + 24 * int(struct.unpack_from("<Q", data, name_end + 1)[0])
+    if stem in ELEMENTS:
+        place, form, element, _ = ELEMENTS[stem]
+        count = int(struct.unpack_from(form, data, at + place)[0])
+        return at + place + struct.calcsize(form) + struct.calcsize(element) * count
+    # A rig's id, and its sensors: the first is the reference, the others may have a pose to it.
     sensors = int(struct.unpack_from("<I", data, at + 4)[0])
     at += 8 + (8 if sensors else 0)
     for _ in range(sensors - 1):
@@ -158,18 +167,6 @@ def _rig_end(data: bytes, at: int) -> int:
             break
         at += 9 + (56 if struct.unpack_from("<B", data, at + 8)[0] else 0)
     return at
-
-
-def _frame_end(data: bytes, at: int) -> int:
-    return at + 68 + 16 * int(struct.unpack_from("<I", data, at + 64)[0])
-
-
-_RECORD_ENDS: dict[str, Callable[[bytes, int], int]] = {
-    "images": _image_end,
-    "points3D": _point_end,
-    "rigs": _rig_end,
-    "frames": _frame_end,
-}
 
 
 def _check_points(path: Path) -> None:
@@ -187,17 +184,6 @@ def _damaged(path: Path, reason: str) -> ProjectError:
     return ProjectError(
         f"{path}: {path.stat().st_size} bytes, and {reason}; the file is truncated or damaged; "
         "copy or export it again"
-    )
-
-
-def _suffix(folder: Path) -> str:
-    for suffix in (".bin", ".txt"):
-        if all((folder / f"{stem}{suffix}").is_file() for stem in REQUIRED):
-            return suffix
-    found = sorted(path.name for path in folder.iterdir() if path.suffix in (".bin", ".txt"))
-    raise ProjectError(
-        f"{folder}: an incomplete model, with {', '.join(found)}; expected cameras, images and "
-        "points3D, all .bin or all .txt; copy the whole model again"
     )
 
 
@@ -412,7 +398,12 @@ def _mend(folder: Path, out: Path, suffix: str) -> int | None:
     """Write a model again without what names absent images; how many elements, None: no change."""
     stems = [stem for stem in (*REQUIRED, *RIGGED) if (folder / f"{stem}{suffix}").is_file()]
     count, changed = 0, False
-    known = set(text_names(folder)) if suffix == ".txt" else _image_ids(folder / "images.bin")
+    if suffix == ".txt":
+        known = set(text_names(folder))
+    else:
+        images = read_bytes(folder / "images.bin")
+        places = [*_places(images, "images")][:-1]
+        known = {int(struct.unpack_from("<I", images, at)[0]) for at in places}
     for stem in stems:
         data = read_bytes(folder / f"{stem}{suffix}")
         if suffix == ".txt":
@@ -445,29 +436,18 @@ def _mend(folder: Path, out: Path, suffix: str) -> int | None:
     return count if changed else None
 
 
-def _image_ids(path: Path) -> set[int]:
-    data, at, found = read_bytes(path), 8, set()
-    for _ in range(_count(path)):
-        found.add(int(struct.unpack_from("<I", data, at)[0]))
-        at = _image_end(data, at)
-    return found
-
-
 def _without(data: bytes, stem: str, known: set[int]) -> tuple[bytes, int]:
     """Records of points3D or frames less elements of images that are not known, and how many."""
-    form, place, kind = ("<Q", 43, "<II") if stem == "points3D" else ("<I", 64, "<iIQ")
+    place, form, kind, column = ELEMENTS[stem]
     size, begin = struct.calcsize(kind), place + struct.calcsize(form)
-    records, at, left_out = list[bytes](), 8, 0
-    for _ in range(int(struct.unpack_from("<Q", data)[0])):
-        count = int(struct.unpack_from(form, data, at + place)[0])
-        places = range(at + begin, at + begin + count * size, size)
-        column = 0 if stem == "points3D" else 2
+    records, left_out = list[bytes](), 0
+    for at, end in pairwise(_places(data, stem)):
+        places = range(at + begin, end, size)
         kept = [i for i in places if struct.unpack_from(kind, data, i)[column] in known]
-        left_out += count - len(kept)
-        if kept or not count or stem == "points3D":
+        left_out += len(places) - len(kept)
+        if kept or not places or stem == "points3D":
             head = data[at : at + place] + struct.pack(form, len(kept))
             records.append(head + b"".join(data[i : i + size] for i in kept))
-        at += begin + count * size
     return struct.pack("<Q", len(records)) + b"".join(records), left_out
 
 

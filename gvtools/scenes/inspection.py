@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import Cameras
 from gvtools.errors import GvError
-from gvtools.scenes.depth_misfits import depth_findings
+from gvtools.scenes.depth_contradictions import depth_findings
 from gvtools.scenes.matching import named
 from gvtools.scenes.pixel_contradictions import PixelCheck
 from gvtools.scenes.pose_forms import pose_findings

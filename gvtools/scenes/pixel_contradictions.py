@@ -17,11 +17,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.scenes.depth_contradictions import climbed, frame_there, sampled
+from gvtools.errors import GvError
 from gvtools.scenes.matching import named
-from gvtools.scenes.scene import Finding, Scene, SparsePoints
+from gvtools.scenes.scene import Finding, Frame, Scene, SparsePoints
 
-Grey = NDArray[np.float32]
+Grey, Float64 = NDArray[np.float32], NDArray[np.float64]
 
 # A view with so many tracks in common with others is judged, and disagrees below this correlation.
 # On real scenes it is 0.92 and more, with noisy detections of fine texture 0.67; renumbered or
@@ -62,6 +62,8 @@ PIXELS, FEWEST, ENOUGH = 2.0, 4, 80
 # Red less blue is judged where it deviates so much, and goes the other way below this correlation
 # with the points'.
 COLORED, SWAPPED = 4.0, -0.3
+# Steps of one length at most, in a search for what fits better.
+CLIMBS = 8
 
 NO_POINTS = SparsePoints(
     np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0, np.float32),
@@ -105,12 +107,12 @@ class PixelCheck:
             self.swapped[number] = bool(np.corrcoef(reds)[0, 1] < SWAPPED)
 
     def _at_detections(
-        self, number: int, picture: NDArray[Any], xy: NDArray[np.float64] | None = None
-    ) -> NDArray[np.float64]:
+        self, number: int, picture: NDArray[Any], xy: Float64 | None = None
+    ) -> Float64:
         """(N,) numbers of a picture at the detections of a view, or at other places of them."""
         return sampled(picture, self.points.xy[self.rows[number]] if xy is None else xy)
 
-    def _places(self, number: int, move: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _places(self, number: int, move: Float64) -> Float64:
         """(N, 2) where the detections of a view are when they are moved, see MOVES."""
         height, width = self.kept[number].shape
         middle = np.array([width, height]) / 2
@@ -129,7 +131,7 @@ class PixelCheck:
         turn, still = 2.4 * self.points.point_index, np.zeros(len(MOVES))
         ways = np.stack([np.cos(turn), np.sin(turn)], axis=1)
 
-        def agreement(move: NDArray[np.float64], aside: float = 0.0) -> float:
+        def agreement(move: Float64, aside: float = 0.0) -> float:
             values = np.full(len(self.values), np.nan)
             for number in known:
                 places = self._places(number, move) + aside * ways[self.rows[number]]
@@ -151,7 +153,7 @@ class PixelCheck:
 
     def agreements(
         self,
-        values: NDArray[np.float64] | None = None,
+        values: Float64 | None = None,
         *,
         without: Sequence[int] = (),
         least: int = TRACKS,
@@ -249,3 +251,36 @@ def probed(scene: Scene, names: Sequence[str]) -> list[Finding]:
     for number in check.kept:
         check.see(number, scene.views[number].load().rgb)
     return check.findings()
+
+
+def climbed(
+    score: Callable[[Float64], float], start: Float64, steps: Sequence[float], *, gain: float = 0.0
+) -> tuple[float, Float64]:
+    """The best score and its place: ever smaller steps along an axis, each worth a gain."""
+    best, place = score(start), start
+    for step in steps:
+        for _ in range(CLIMBS):
+            tried = [place + way * step for unit in np.eye(len(place)) for way in (unit, -unit)]
+            scores = [score(other) for other in tried]
+            if max(scores) <= best + gain:
+                break
+            best, place = max(scores), tried[int(np.argmax(scores))]
+    return best, place
+
+
+def sampled(picture: NDArray[Any], xy: Float64, *of: NDArray[np.int64]) -> Float64:
+    """(N,) numbers of (..., H, W) pictures, ``of`` which, at places (N, 2); NaN outside."""
+    with np.errstate(invalid="ignore"):
+        inside = ((xy >= 0) & (xy < picture.shape[:-3:-1])).all(1)
+    x, y = np.floor(xy[inside]).astype(np.int64).T
+    found = np.full(len(xy), np.nan)
+    found[inside] = picture[(*(each[inside] for each in of), y, x)]
+    return found
+
+
+def frame_there(scene: Scene, number: int) -> Frame | None:
+    """A view's pixels; None where they cannot be read, which is said elsewhere."""
+    try:
+        return scene.views[number].load()
+    except GvError:
+        return None

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from gvtools.cameras import invert_rigid
 from gvtools.features import Features, SiftMatcher
 from gvtools.scenes.calibration import OPENCV_FROM_OPENGL
-from gvtools.scenes.depth_contradictions import climbed, frame_there
+from gvtools.scenes.pixel_contradictions import climbed, frame_there
 from gvtools.scenes.scene import Finding, Scene
 from gvtools.trajectory_files import reordered
 

@@ -11,6 +11,7 @@ import math
 import os
 import re
 import reprlib
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -176,46 +177,40 @@ def is_transforms(folder: Path) -> bool:
 
 def _listed(path: Path) -> tuple[list[_Listed], list[Finding]]:
     """The frames of a file or folder, each picture once, and what is to be said of them."""
-    if path.is_file() or (path / FILE).is_file() or not is_transforms(path):
-        path = path / FILE if path.is_dir() else path
+    single = path.is_file() or (path / FILE).is_file() or not is_transforms(path)
+    if single:
+        parts = {"": path / FILE if path.is_dir() else path}
+    else:
+        splits = ((split, path / name) for split, name in SPLITS.items())
+        parts = {split: file for split, file in splits if file.is_file()}
+    owner, found, findings = dict[Path, str](), list[_Listed](), list[Finding]()
+    for split, path in parts.items():
         data = load_frames(path)
-        files, findings = _pictures(path, data["frames"])
-        places = zip(data["frames"], files, _names(files), strict=True)
-        listed = [
-            _Listed(data, entry, file, name, f"{path}, frame {i}")
-            for i, (entry, file, name) in enumerate(places)
-        ]
+        files, met = _pictures(path, data["frames"])
+        findings += met
+        for i, (entry, file) in enumerate(zip(data["frames"], files, strict=True)):
+            if owner.setdefault(file, split) == split:
+                found.append(_Listed(data, entry, file, split, f"{path}, frame {i}"))
+    listed = [
+        item._replace(name=name if name.startswith(f"{item.name}/") else f"{item.name}/{name}")
+        if item.name
+        else item._replace(name=name)
+        for item, name in zip(found, _names([item.file for item in found]), strict=True)
+    ]
+    if single:
         cloud = data.get("ply_file_path")
-        parts = [name for name in SPLITS.values() if (path.parent / name).is_file()]
+        others = [name for name in SPLITS.values() if (path.parent / name).is_file()]
         lists = [key for key in data if key.endswith("_filenames") and data[key]]
         unused = {
             f"ply_file_path ({reprlib.repr(cloud)}) is not read: depth comes from pictures": cloud,
-            f"{named(parts)} beside {path.name}: not read; give its path to read it": parts,
+            f"{named(others)} beside {path.name}: not read; give its path to read it": others,
             f"{named(lists)}: not read; give such names by --context and --targets": lists,
         }
-        findings += [Finding("info", line) for line, there in unused.items() if there]
-        return listed, findings
-    splits, found = dict[Path, str](), list[_Listed]()
-    sizes, findings = dict.fromkeys(SPLITS, 0), list[Finding]()
-    for split, name in SPLITS.items():
-        if not (path / name).is_file():
-            continue
-        data = load_frames(path / name)
-        files, met = _pictures(path / name, data["frames"])
-        findings += met
-        for i, (entry, file) in enumerate(zip(data["frames"], files, strict=True)):
-            if splits.setdefault(file, split) == split:
-                found.append(_Listed(data, entry, file, split, f"{path / name}, frame {i}"))
-                sizes[split] += 1
-    names = _names([item.file for item in found])
-    listed = [
-        item._replace(name=name if name.startswith(f"{item.name}/") else f"{item.name}/{name}")
-        for item, name in zip(found, names, strict=True)
-    ]
-    held = [split for split, count in sizes.items() if count]
-    line = f"splits: {', '.join(f'{split} ({sizes[split]} frames)' for split in held)}"
-    if len(held) > 1:
-        line += f"; select them by name: --context {held[0]} --targets {held[1]}"
+        return listed, findings + [Finding("info", line) for line, there in unused.items() if there]
+    sizes = Counter(item.name for item in found)
+    line = f"splits: {', '.join(f'{split} ({count} frames)' for split, count in sizes.items())}"
+    if len(sizes) > 1:
+        line += "; select them by name: --context {} --targets {}".format(*sizes)
     return listed, [*findings, Finding("info", line)]
 
 

@@ -17,7 +17,7 @@ from gvtools.errors import OptionError
 from gvtools.memory.panoramas import WIDEST_FRAME, LensOptions, Rig, picture_cameras
 from gvtools.runs.digests import array_digest, fingerprint
 from gvtools.runs.poses import RunPoses, posed, with_poses
-from gvtools.scenes.depth_misfits import depth_findings
+from gvtools.scenes.depth_contradictions import depth_findings
 from gvtools.scenes.inspection import camera_findings, reprojection_errors
 from gvtools.scenes.layout import is_address
 from gvtools.scenes.matching import natural

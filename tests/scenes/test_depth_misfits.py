@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gvtools.cameras import Cameras
-from gvtools.scenes.depth_misfits import depth_findings
+from gvtools.scenes.depth_contradictions import depth_findings
 from gvtools.scenes.registration import register_depth
 from gvtools.scenes.scene import Frame, Scene, View
 

@@ -11,7 +11,7 @@ from scenes_workspace import HEIGHT, LENSES, WIDTH, ramp, save, workspace
 from gvtools.cameras import Cameras
 from gvtools.errors import GvError, ProjectError
 from gvtools.scenes.colmap import read_colmap
-from gvtools.scenes.colmap_model import _image_end
+from gvtools.scenes.colmap_model import _record_end
 from gvtools.scenes.colmap_writer import write_colmap
 from gvtools.scenes.images import read_depth, stored_depth_size, write_depth_map
 from gvtools.scenes.inspection import reprojection_errors
@@ -227,7 +227,7 @@ def test_tracks_that_name_pictures_taken_out(tmp_path, text, classic):
     else:
         data = (folder / "images.bin").read_bytes()
         count = (int.from_bytes(data[:8], "little") - 1).to_bytes(8, "little")
-        (folder / "images.bin").write_bytes(count + data[_image_end(data, 8) :])
+        (folder / "images.bin").write_bytes(count + data[_record_end(data, 8, "images") :])
     with pytest.raises(Exception, match="does not exist"):
         pycolmap.Reconstruction(folder)
     scene = read_colmap(tmp_path)
