@@ -250,6 +250,12 @@ def pinhole_lens(K: ArrayLike, size: tuple[int, int]) -> LensParameters:
     return LensParameters("PINHOLE", (fx, fy, cx, cy), (int(size[0]), int(size[1])))
 
 
+def found_lens(values: object, size: tuple[int, int] | None, *shape: int) -> LensParameters | None:
+    """As ``pinhole_lens`` has it of numbers of that shape, or four; None where they are none."""
+    K = finite_array(values, *(shape or (4,)))
+    return None if K is None or size is None else pinhole_lens(K, size)
+
+
 def renderer_lens(values: Iterable[float], size: tuple[int, int]) -> LensParameters:
     """A renderer's camera of fx, fy, cx, cy, whichever way its data set counts pixels.
 
@@ -303,6 +309,12 @@ def opencv_pose(world_from_cam: ArrayLike) -> Float64:
     pose = np.eye(4)
     pose[:3] = np.asarray(world_from_cam, np.float64)[:3]
     return pose @ OPENCV_FROM_OPENGL
+
+
+def found_pose(values: object, *shape: int) -> Float64 | None:
+    """As ``opencv_pose`` has it of numbers of that shape; None where they are none."""
+    pose = finite_array(values, *shape)
+    return None if pose is None else opencv_pose(pose)
 
 
 def sky_findings(cam_from_world: Float64, axis: int) -> list[Finding]:

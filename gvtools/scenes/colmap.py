@@ -22,7 +22,7 @@ from gvtools.scenes.colmap_model import (
 from gvtools.scenes.images import IMAGE_SUFFIXES
 from gvtools.scenes.matching import find_renamed, given_folder
 from gvtools.scenes.photographs import PosedFrame, posed_scene
-from gvtools.scenes.scene import Finding, Scene, SparsePoints
+from gvtools.scenes.scene import Finding, Scene, SparsePoints, counted
 from gvtools.scenes.undistort import LensParameters, Undistortion
 from gvtools.untrusted import is_file, named_file
 
@@ -189,14 +189,11 @@ def _sparse_points(model: ColmapModel, scene: Scene) -> tuple[SparsePoints | Non
     point = np.concatenate([track[0] for track in tracks])
     view = np.concatenate([track[1] for track in tracks])
     xy = np.concatenate([track[2] for track in tracks])
-    findings = []
     lost = model.reconstruction.compute_num_observations() - len(view)
-    if lost:
-        findings.append(Finding("info", f"{lost} track elements belong to views that are not read"))
+    findings = counted(lost, "track elements belong to views that are not read", level="info")
     sound = np.isfinite(xy).all(axis=1)
-    if not sound.all():
-        line = f"{int((~sound).sum())} detections lie where the lens has no inverse: dropped"
-        findings.append(Finding("warning", line))
+    line = "detections lie where the lens has no inverse: dropped"
+    findings += counted(int((~sound).sum()), line)
     # By point, then by view: the model's own order depends on its tables.
     rows = np.lexsort((view, point))
     rows = rows[sound[rows]]

@@ -23,7 +23,7 @@ from gvtools.errors import ProjectError
 from gvtools.scenes.faces import perspective_views
 from gvtools.scenes.matching import named, natural
 from gvtools.scenes.photographs import rotation_findings
-from gvtools.scenes.scene import Finding, natural_key
+from gvtools.scenes.scene import Finding, counted, natural_key
 from gvtools.scenes.undistort import Undistortion, undistortion
 from gvtools.untrusted import number_key, read_bytes, read_text, reading, regular
 
@@ -286,8 +286,8 @@ def load_model(folder: Path, *, faces: bool = False) -> ColmapModel:
         findings.append(Finding("warning", line, unposed))
     used = {image.camera_id for image in images}
     unused = sorted(set(reconstruction.cameras) - used)
-    if unused:
-        findings.append(Finding("info", f"{len(unused)} cameras of the model are used by no image"))
+    line = "cameras of the model are used by no image"
+    findings += counted(len(unused), line, level="info")
     views: dict[int, tuple[Undistortion, ...]] = {}
     for key in sorted(used):
         camera = reconstruction.cameras[key]
@@ -357,21 +357,18 @@ def _read(folder: Path, suffix: str) -> tuple[pycolmap.Reconstruction, list[Find
             if changed is None:
                 raise
             reconstruction = _parsed(Path(work), suffix)
-    line = f"{changed} track elements name images that the model does not hold: left out"
-    return reconstruction, [Finding("warning", line)] if changed else []
+    line = "track elements name images that the model does not hold: left out"
+    return reconstruction, counted(changed, line)
 
 
 def _without_lost(
     reconstruction: pycolmap.Reconstruction, names: Mapping[int, str]
 ) -> tuple[int, list[Finding]]:
     """Take points and poses out that hold no numbers; how many poses, and what is to be said."""
-    findings = []
     lost = [key for key, point in reconstruction.points3D.items() if not _known(point.xyz)]
     for key in lost:
         reconstruction.delete_point3D(key)
-    if lost:
-        line = f"{len(lost)} sparse points hold NaN or infinity: dropped"
-        findings.append(Finding("warning", line))
+    findings = counted(len(lost), "sparse points hold NaN or infinity: dropped")
     dropped, frames = list[str](), set[int]()
     for key, image in reconstruction.images.items():
         pose = image.cam_from_world() if image.has_pose else None

@@ -19,7 +19,7 @@ from gvtools.scenes.depth_contradictions import depth_findings
 from gvtools.scenes.matching import named
 from gvtools.scenes.pixel_contradictions import PixelCheck
 from gvtools.scenes.pose_forms import pose_findings
-from gvtools.scenes.scene import Finding, Frame, Scene
+from gvtools.scenes.scene import Finding, Frame, Scene, counted
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -202,12 +202,11 @@ def _open(
         else:
             opened.append(_Opened(*seen, frame.depth.size))
             empty.append(view.name)
-    if blank:
-        message = f"{len(blank)} of {len(numbers)} pictures show one colour alone, first {blank[0]}"
-        findings.append(Finding("warning", message))
-    if empty:
-        message = f"{len(empty)} depth maps hold no valid pixel, first {empty[0]}"
-        findings.append(Finding("warning", message))
+    for names, line in (
+        (blank, f"of {len(numbers)} pictures show one colour alone"),
+        (empty, "depth maps hold no valid pixel"),
+    ):
+        findings += counted(len(names), f"{line}, first {names[0] if names else ''}")
     return opened
 
 

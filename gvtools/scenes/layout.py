@@ -61,6 +61,17 @@ class Layout:
             lambda root, scene, **options: read(root, **options),
         )
 
+    @classmethod
+    def of_reader(
+        cls,
+        holds: str,
+        scenes: Callable[[Path], tuple[str, ...]],
+        *,
+        variants: Callable[[Path], tuple[str, ...]] = lambda _: (),
+    ) -> Callable[[Callable[..., Scene]], Layout]:
+        """The layout of the reader that it decorates, which has its name."""
+        return lambda read: cls(read.__name__.strip("_"), holds, scenes, read, variants)
+
     def matches(self, root: Path) -> bool:
         """Whether a folder or file is of this layout, at least in part."""
         return bool(self.scenes(root))

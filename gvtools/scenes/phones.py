@@ -24,14 +24,16 @@ from pydantic import BaseModel, Field
 from gvtools.errors import ProjectError
 from gvtools.optional import require
 from gvtools.scenes.calibration import (
+    FLAT,
     MILLIMETRES,
     Float64,
     csv_rows,
     finite_array,
+    found_lens,
+    found_pose,
     json_object,
     load_matrix,
     opencv_pose,
-    pinhole_lens,
     quaternion_pose,
     sky_findings,
 )
@@ -46,7 +48,7 @@ from gvtools.scenes.images import (
 from gvtools.scenes.layout import Layout
 from gvtools.scenes.matching import natural, pictures_by_stem
 from gvtools.scenes.photographs import Depth, PosedFrame, first_size, posed_scene
-from gvtools.scenes.scene import Finding, Frame, Scene
+from gvtools.scenes.scene import Finding, Frame, Scene, counted
 from gvtools.scenes.undistort import LensParameters
 from gvtools.scenes.video import frame_seconds, read_frame, video_header
 from gvtools.untrusted import read_bytes, read_json, reading
@@ -66,11 +68,10 @@ def phone_scene(
     """The scene of an app's export, metric, of world_from_cam poses in OpenCV's axes."""
     readers = [item.read_depth for item in frames if item.depth and item.depth.is_file()]
     bare = sum(getattr(reader, "keywords", {}).get("confidence") is None for reader in readers)
-    if bare:
-        line = f"{bare} of {len(readers)} depth maps have no confidence map: all of them is used"
-        findings = [*findings, Finding("info", line)]
+    line = f"of {len(readers)} depth maps have no confidence map: all of them is used"
+    findings = [*findings, *counted(bare, line, level="info")]
     scene = posed_scene(
-        root, frames, poses="world_from_cam", metric=True, kind=name, findings=tuple(findings),
+        root, frames, poses="world_from_cam", metric=True, kind=name, findings=findings,
         advice=AGAIN,
     )  # fmt: skip
     sky = sky_findings(scene.cameras.cam_from_world, WORLD_UP) if upright else []
@@ -124,28 +125,17 @@ def _read_polycam(root: Path) -> Scene:
     frames = []
     for name in names:
         camera = json_object(home / cameras / f"{name}.json")
-        pose = finite_array([camera.get(key) for key in pose_keys], 3, 4)
-        K = finite_array([camera.get(key) for key in ("fx", "fy", "cx", "cy")], 4)
         image = pictures.get(name, home / images / f"{name}.jpg")
         depth = home / "depth" / f"{name}.png"
         size = finite_array([camera.get(key) for key in ("width", "height")], 2)
         width_height = first_size([image]) if size is None else (int(size[0]), int(size[1]))
-        lens = None
-        if K is not None and width_height is not None:
-            lens = pinhole_lens(K, width_height)
+        lens = found_lens([camera.get(key) for key in FLAT], width_height)
         # A reader of its own is given where a picture is readable and of its camera's size.
         whole = lens is not None and first_size([image]) == lens.size
-        frames.append(
-            PosedFrame(
-                image.name,
-                image,
-                lens,
-                None if pose is None else opencv_pose(pose),
-                depth,
-                lidar_reader(home / "confidence" / f"{name}.png"),
-                read=_read_undistorted if corrected and whole else None,
-            )
-        )
+        pose = found_pose([camera.get(key) for key in pose_keys], 3, 4)
+        reader = lidar_reader(home / "confidence" / f"{name}.png")
+        read = _read_undistorted if corrected and whole else None
+        frames.append(PosedFrame(image.name, image, lens, pose, depth, reader, read=read))
     said = "optimised, pictures undistorted" if corrected else "as ARKit tracked them"
     findings = [Finding("info", f"poses: {said}")]
     return phone_scene(root, "Polycam", frames, findings=findings)
@@ -198,22 +188,13 @@ def _read_scanner_app(root: Path) -> Scene:
     for name in shown:
         number = name.removeprefix("frame_")
         said = json_object(root / f"{name}.json")
-        pose, K = finite_array(said.get(_POSE), 4, 4), finite_array(said.get("intrinsics"), 3, 3)
-        depth = root / f"depth_{number}.png"
-        frames.append(
-            PosedFrame(
-                f"{name}.jpg",
-                root / f"{name}.jpg",
-                None if K is None else pinhole_lens(K, size),
-                None if pose is None else opencv_pose(pose),
-                depth,
-                lidar_reader(root / f"conf_{number}.png"),
-            )
-        )
-    unseen, findings = len(poses - set(shown)), list[Finding]()
-    if unseen:
-        line = f"{unseen} of {len(poses)} frames were recorded without a picture: not used"
-        findings.append(Finding("info", line))
+        image, depth = root / f"{name}.jpg", root / f"depth_{number}.png"
+        lens = found_lens(said.get("intrinsics"), size, 3, 3)
+        pose = found_pose(said.get(_POSE), 4, 4)
+        reader = lidar_reader(root / f"conf_{number}.png")
+        frames.append(PosedFrame(image.name, image, lens, pose, depth, reader))
+    line = f"of {len(poses)} frames were recorded without a picture: not used"
+    findings = counted(len(poses - set(shown)), line, level="info")
     return phone_scene(root, "3D Scanner App", frames, findings=findings)
 
 
@@ -254,22 +235,16 @@ def _read_stray_scanner(root: Path) -> Scene:
         number = f"{int(row['frame']):06d}"
         depth = root / "depth" / f"{number}.npy"  # of early versions of the app
         depth = depth if depth.is_file() else depth.with_suffix(".png")
-        own = finite_array([row.get(key) for key in ("fx", "fy", "cx", "cy")], 4)
-        K = shared if own is None else own
+        own = found_lens([row.get(key) for key in FLAT], size)
         inside = 0 <= place < len(seconds)
         turn = finite_array([row.get(key) for key in ("qw", "qx", "qy", "qz")], 4)
         centre = finite_array([row.get(key) for key in "xyz"], 3)
-        frames.append(
-            PosedFrame(
-                number,
-                video if inside else root / f"{_VIDEO}, frame {number}",
-                None if K is None else pinhole_lens(K, size),
-                None if turn is None or centre is None else quaternion_pose(turn, centre),
-                depth,
-                lidar_reader(root / "confidence" / f"{number}.png"),
-                read=partial(read_frame, seconds=seconds[place], edits=False) if inside else None,
-            )
-        )
+        lens = own or found_lens(shared, size)
+        pose = None if turn is None or centre is None else quaternion_pose(turn, centre)
+        reader = lidar_reader(root / "confidence" / f"{number}.png")
+        image = video if inside else root / f"{_VIDEO}, frame {number}"
+        read = partial(read_frame, seconds=seconds[place], edits=False) if inside else None
+        frames.append(PosedFrame(number, image, lens, pose, depth, reader, read=read))
     findings = []
     if len(seconds) != len(rows):
         line = (
@@ -343,10 +318,9 @@ class Record3dMetadata(BaseModel):
 
     def lens(self, number: int) -> LensParameters | None:
         """Of a frame, for pictures of ``w`` x ``h``; None where it is impossible."""
-        given = self.perFrameIntrinsicCoeffs
-        own = finite_array(given[number], 4) if number < len(given) else None
-        K = finite_array([self.K[place] for place in (0, 4, 6, 7)], 4) if own is None else own
-        return None if K is None else pinhole_lens(K, (self.w, self.h))
+        given, size = self.perFrameIntrinsicCoeffs, (self.w, self.h)
+        own = found_lens(given[number], size) if number < len(given) else None
+        return own or found_lens([self.K[place] for place in (0, 4, 6, 7)], size)
 
     def pose(self, number: int) -> Float64 | None:
         """(4, 4) world_from_cam of a frame, OpenCV axes, metres; None where there is none."""

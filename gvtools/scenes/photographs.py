@@ -12,8 +12,8 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -133,6 +133,16 @@ class _Sieve:
             except (OSError, ValueError):
                 self.sizes[path] = 0
         return path if path is not None and self.sizes[path] > 0 else None
+
+    @contextmanager
+    def minding(self, reason: str) -> Iterator[None]:
+        """An error of a frame leaves it out for that reason, unless they are read strictly."""
+        try:
+            yield
+        except GvError as error:
+            if self.strict:
+                raise
+            raise _LeftOut(reason, str(error)) from None
 
     def header(self, path: Path) -> ImageHeader:
         if path not in self.headers:
@@ -290,13 +300,9 @@ def _lacks(frame: PosedFrame, sieve: _Sieve, *, unposed: str) -> tuple[str, ...]
 
 def _rigid(frame: PosedFrame, sieve: _Sieve) -> Float64:
     """(4, 4), the frame's pose as it maps in its layout."""
-    try:
+    with sieve.minding(BAD_POSE):
         assert frame.pose is not None
         rigid, defect = rigid_transform(frame.pose, what=frame.where or frame.name)
-    except GvError as error:
-        if sieve.strict:
-            raise
-        raise _LeftOut(BAD_POSE, str(error)) from None
     sieve.defects.append(defect)
     return rigid
 
@@ -308,12 +314,10 @@ def _views(frame: PosedFrame, sieve: _Sieve) -> tuple[Undistortion, ...]:
         return (frame.lens,)
     size = frame.lens.size
     if frame.read is None:
-        try:
+        # Read strictly, an unreadable picture is an error of its own.
+        with suppress(ProjectError), sieve.minding(UNREADABLE):
             header = sieve.header(frame.image)
             size = header.width, header.height
-        except ProjectError as error:
-            if not sieve.strict:  # else it is an error of its own
-                raise _LeftOut(UNREADABLE, str(error)) from None
     line = f"{size[0]}x{size[1]} for cameras of {frame.lens.size[0]}x{frame.lens.size[1]}"
     if size != frame.lens.size and not same_aspect(size, frame.lens.size):
         if not sieve.strict:
@@ -321,17 +325,13 @@ def _views(frame: PosedFrame, sieve: _Sieve) -> tuple[Undistortion, ...]:
         size = frame.lens.size
     if size != frame.lens.size:
         sieve.scaled[f"pictures of {line}: intrinsics scaled"] += 1
-    try:
+    with sieve.minding(BAD_CAMERA):
         lens = scaled_lens(frame.lens, size)
         if lens not in sieve.lenses:
             what = (frame.where or str(frame.image)) if sieve.strict else frame.name
             views = () if sieve.strict else (undistortion(*lens, what=what),)
             sieve.lenses[lens] = views or perspective_views(*lens, what=what)
-        return sieve.lenses[lens]
-    except ProjectError as error:
-        if sieve.strict:
-            raise
-        raise _LeftOut(BAD_CAMERA, str(error)) from None
+    return sieve.lenses[lens]
 
 
 def first_size(pictures: Iterable[Path]) -> tuple[int, int] | None:

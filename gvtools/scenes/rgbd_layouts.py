@@ -50,7 +50,7 @@ from gvtools.scenes.rgbd import (
     given_intrinsics,
     under,
 )
-from gvtools.scenes.scene import Finding
+from gvtools.scenes.scene import Finding, counted
 from gvtools.scenes.undistort import LensParameters
 from gvtools.trajectory_files import in_seconds, read_poses
 from gvtools.untrusted import read_json, read_text, reading
@@ -297,8 +297,7 @@ class _Redwood(_ScanNet):
             findings.append(Finding("warning", f"poses are read from {logs[0].name}, not {others}"))
         frames = self.frames(root, recording.options)
         unpaired = len(self._files(root, "depth")) - sum(item.depth is not None for item in frames)
-        if unpaired:
-            findings.append(Finding("warning", f"{unpaired} depth maps belong to no picture"))
+        findings += counted(unpaired, "depth maps belong to no picture")
         if logs[0].suffix == ".log":
             numbers, poses = read_log(logs[0])
         else:
@@ -462,8 +461,6 @@ def read_unposed(root: Path, options: RgbdOptions) -> Recording | None:
         for frame in found
         if frame.image.is_file() and frame.depth is not None and frame.depth.is_file()
     ]
-    findings = list(recording.findings)
-    if len(frames) < len(found):
-        message = f"{len(found) - len(frames)} of {len(found)} pictures have no depth map: left out"
-        findings.append(Finding("warning", message))
+    line = f"of {len(found)} pictures have no depth map: left out"
+    findings = [*recording.findings, *counted(len(found) - len(frames), line)]
     return replace(recording, frames=frames, given=given_intrinsics(options), findings=findings)

@@ -71,6 +71,11 @@ class Finding:
         object.__setattr__(self, "message", printable(self.message))
 
 
+def counted(count: int, line: str, *, level: str = "warning") -> list[Finding]:
+    """A finding of how many there are of something; none for 0."""
+    return [Finding(level, f"{count} {line}")] if count else []
+
+
 @dataclass(frozen=True)
 class Origin:
     """What opens a scene of a data set again."""

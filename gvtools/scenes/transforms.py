@@ -30,7 +30,7 @@ from gvtools.scenes.calibration import (
     OPENCV_FROM_OPENGL,
     Float64,
     finite_array,
-    opencv_pose,
+    found_pose,
     scaled_lens,
     times_as_large,
 )
@@ -112,18 +112,9 @@ def read_transforms(path: Path, *, images: Path | None = None, masks: Path | Non
         if keys.mask_path:
             mask = root / keys.mask_path
         depth, unit = keys.depth()
-        frames.append(
-            PosedFrame(
-                name,
-                file,
-                keys.lens(file, what=what),
-                _pose(keys, what),
-                root / depth if depth else None,
-                partial(read_depth, unit=unit),
-                mask,
-                where=what,
-            )
-        )
+        lens, pose = keys.lens(file, what=what), _pose(keys, what)
+        reader, there = partial(read_depth, unit=unit), root / depth if depth else None
+        frames.append(PosedFrame(name, file, lens, pose, there, reader, mask, where=what))
         lines = [*keys.doubts(file), *_unread(entry, root)]
         if mask is None and is_file(file.with_name(f"dynamic_mask_{file.stem}.png")):
             lines.append(
@@ -228,8 +219,7 @@ def transforms_frames(
             what = f"{path}, {key} {i}"
             picture = home / _file_path(entry, what).rpartition("/")[2]
             keys = frame_keys(entry, data, what=what)
-            pose = finite_array(keys.transform_matrix, 4, 4)
-            pose = None if pose is None else opencv_pose(pose)
+            pose = found_pose(keys.transform_matrix, 4, 4)
             lens = keys.lens(picture, what=what)
             frames.append(PosedFrame(picture.name, picture, lens, pose, where=what))
     return frames

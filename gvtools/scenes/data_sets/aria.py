@@ -44,25 +44,19 @@ def _scenes(root: Path) -> tuple[str, ...]:
     return tuple(name for name in found if (root / name / TRAJECTORY).is_file())
 
 
-def _read(root: Path, scene: str) -> Scene:
+@Layout.of_reader(f"SEQUENCE/{VIDEO} with {TRAJECTORY} and {DEPTH}", _scenes)
+def _aria_digital_twin(root: Path, scene: str) -> Scene:
     folder = root / scene
     version = _version(folder)
     times, world_from_device = read_trajectory(folder / TRAJECTORY, version=version)
     lens, device_from_cam = rgb_camera(folder / VIDEO)
     cam_from_world = invert_rigid(world_from_device @ device_from_cam)
-    depth = folder / DEPTH
-    pictures = [
-        PosedFrame(
-            str(time),
-            folder / VIDEO,
-            lens,
-            pose_at(time, times, cam_from_world, same=SAME, longest_gap=LONGEST_GAP),
-            depth if depth.is_file() else None,
-            partial(read_rgb_depth, time=time),
-            read=partial(read_rgb, index=i),
-        )
-        for i, time in enumerate(rgb_times(folder / VIDEO))
-    ]
+    video, depth, pictures = folder / VIDEO, folder / DEPTH, []
+    present = depth if depth.is_file() else None
+    for i, time in enumerate(rgb_times(video)):
+        pose = pose_at(time, times, cam_from_world, same=SAME, longest_gap=LONGEST_GAP)
+        reader, read = partial(read_rgb_depth, time=time), partial(read_rgb, index=i)
+        pictures.append(PosedFrame(str(time), video, lens, pose, present, reader, read=read))
     findings = [Finding("info", f"quaternions of version {version}")]
     return posed_scene(folder, pictures, poses="cam_from_world", metric=True, findings=findings)
 
@@ -194,6 +188,4 @@ def _tools() -> Any:
     return import_module("projectaria_tools.core")
 
 
-LAYOUTS = (
-    Layout("aria_digital_twin", f"SEQUENCE/{VIDEO} with {TRAJECTORY} and {DEPTH}", _scenes, _read),
-)
+LAYOUTS = (_aria_digital_twin,)

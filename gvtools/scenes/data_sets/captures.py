@@ -35,7 +35,7 @@ from gvtools.scenes.matching import natural, pictures_by_stem, pose_at, scenes_h
 from gvtools.scenes.photographs import Depth, PosedFrame, Registration, first_size, posed_scene
 from gvtools.scenes.rgbd import RgbdOptions, rgbd_scene
 from gvtools.scenes.rgbd_layouts import SCANNET, SCANNET_FOLDER, SEVENSCENES, SEVENSCENES_FOLDER
-from gvtools.scenes.scene import Finding, Frame, Scene
+from gvtools.scenes.scene import Finding, Frame, Scene, counted
 from gvtools.scenes.undistort import LensParameters
 from gvtools.untrusted import read_text, reading, regular
 
@@ -45,7 +45,11 @@ from gvtools.untrusted import read_text, reading, regular
 KINECT = [[585.0, 0.0, 320.0], [0.0, 585.0, 240.0], [0.0, 0.0, 1.0]]
 
 
-def _read_sevenscenes(root: Path, scene: str) -> Scene:
+@Layout.of_reader(
+    "SCENE/seq-NN/frame-NNNNNN.pose.txt with .color.png and .depth.png",
+    lambda root: scenes_holding(root, "*/seq-*/frame-*.pose.txt"),
+)
+def _sevenscenes(root: Path, scene: str) -> Scene:
     folder = root / scene
     if any((place / INTRINSICS).is_file() for place in (folder, folder.parent)):
         return SEVENSCENES.read(folder)
@@ -67,7 +71,10 @@ def _scannet_scenes(root: Path) -> tuple[str, ...]:
     return natural(path.relative_to(root).as_posix() for path in found)
 
 
-def _read_scannet(root: Path, scene: str) -> Scene:
+@Layout.of_reader(
+    "scans/sceneNNNN_NN with color, depth, pose, intrinsic or a .sens", _scannet_scenes
+)
+def _scannet(root: Path, scene: str) -> Scene:
     folder = root / scene
     if SCANNET.matches(folder):
         recording = SCANNET_FOLDER.record(folder, RgbdOptions(), strict=False)
@@ -76,32 +83,24 @@ def _read_scannet(root: Path, scene: str) -> Scene:
     if path is None:
         raise ProjectError(f"{folder}: neither exported folders nor a .sens file")
     sens = SensFile.open(path)
-    color, depth = (
+    color_pose, depth_pose = (
         rigid_transform(sens.matrices[i], what=f"{path}, extrinsics")[0] for i in (1, 3)
     )
     registration = Registration(
         corner_origin(sens.matrices[2], what=f"{path}, depth intrinsics"),
-        color @ np.linalg.inv(depth),
+        color_pose @ np.linalg.inv(depth_pose),
     )
     K = corner_origin(sens.matrices[0], what=f"{path}, colour intrinsics")
-    frames = [
-        PosedFrame(
-            f"{i}",
-            path,
-            pinhole_lens(K, sens.color_size),
-            frame.world_from_cam,
-            path if frame.depth_bytes else None,
-            partial(read_sens_depth, frame=frame, sens=sens),
-            registration=registration,
-            read=partial(read_sens_color, frame=frame),
-        )
-        for i, frame in enumerate(sens.frames)
-    ]
+    lens, frames = pinhole_lens(K, sens.color_size), []
+    for i, frame in enumerate(sens.frames):
+        depth = path if frame.depth_bytes else None
+        reader = partial(read_sens_depth, frame=frame, sens=sens)
+        posed = PosedFrame(f"{i}", path, lens, frame.world_from_cam, depth, reader)
+        read = partial(read_sens_color, frame=frame)
+        frames.append(replace(posed, registration=registration, read=read))
     findings = [Finding("info", f"frames are read from {path.name}")]
-    lost = sens.count - len(sens.frames)
-    if lost:
-        line = f"{lost} of {sens.count} frames are past the end of {path.name}: dropped"
-        findings.append(Finding("warning", line))
+    line = f"of {sens.count} frames are past the end of {path.name}: dropped"
+    findings += counted(sens.count - len(sens.frames), line)
     return posed_scene(folder, frames, poses="world_from_cam", metric=True, findings=findings)
 
 
@@ -229,7 +228,14 @@ def _arkit_scenes(root: Path) -> tuple[str, ...]:
     )
 
 
-def _read_arkit(root: Path, scene: str) -> Scene:
+@Layout.of_reader(
+    f"FOLD/VIDEO/{TRAJECTORY} with {LOW}, {LOW}_intrinsics and lowres_depth",
+    _arkit_scenes,
+    variants=lambda root: tuple(
+        f"{s}/{HIGH}" for s in _arkit_scenes(root) if (root / s / HIGH).is_dir()
+    ),
+)
+def _arkitscenes(root: Path, scene: str) -> Scene:
     from scipy.spatial.transform import Rotation
 
     folder, kind = root / scene, LOW
@@ -243,7 +249,7 @@ def _read_arkit(root: Path, scene: str) -> Scene:
     depths = folder / DEPTH_OF[kind]
     # Of pictures and depth maps, so that a pair with half of it missing is counted.
     names = {path.name for home in (folder / kind, depths) for path in home.glob("*.png")}
-    frames, exact = [], 0
+    frames, exact, reader = [], 0, partial(read_depth, unit=MILLIMETRES)
     for name in sorted(names):
         time = _stamp(name)
         pose = pose_at(time, times, poses, same=SAME, longest_gap=LONGEST_GAP)
@@ -251,20 +257,10 @@ def _read_arkit(root: Path, scene: str) -> Scene:
         # Of its own time, or a millisecond beside it.
         key = round(time * 1000)
         lens = next((lenses[item] for item in (key, key - 1, key + 1) if item in lenses), None)
-        frames.append(
-            PosedFrame(
-                name,
-                folder / kind / name,
-                lens,
-                pose,
-                depths / name if depths.is_dir() else None,
-                partial(read_depth, unit=MILLIMETRES),
-            )
-        )
+        depth = depths / name if depths.is_dir() else None
+        frames.append(PosedFrame(name, folder / kind / name, lens, pose, depth, reader))
     interpolated = sum(frame.pose is not None for frame in frames) - exact
-    findings = []
-    if interpolated:
-        findings.append(Finding("info", f"{interpolated} frames have an interpolated pose"))
+    findings = counted(interpolated, "frames have an interpolated pose", level="info")
     findings += sky_findings(poses, UP)
     return posed_scene(folder, frames, poses="cam_from_world", metric=True, findings=findings)
 
@@ -294,7 +290,11 @@ def _pincams(folder: Path) -> dict[int, LensParameters]:
 # are read.
 
 
-def _read_mapfree(root: Path, scene: str) -> Scene:
+@Layout.of_reader(
+    "SPLIT/SCENE/poses.txt and intrinsics.txt with seq0 and seq1",
+    lambda root: scenes_holding(root, "*/intrinsics.txt", "*/*/intrinsics.txt"),
+)
+def _mapfree(root: Path, scene: str) -> Scene:
     folder = root / scene
     lenses = _named_numbers(folder / "intrinsics.txt", 6)
     if any(not np.isfinite(values).all() for values in lenses.values()):
@@ -311,20 +311,12 @@ def _read_mapfree(root: Path, scene: str) -> Scene:
         stem = name.rpartition(".")[0]
         depth = depths.get(stem, folder / f"{stem}.npy") if depths else None
         unit = MILLIMETRES if depth is not None and depth.suffix == ".png" else 1.0
-        frames.append(
-            PosedFrame(
-                name,
-                folder / name,
-                pinhole_lens([fx, fy, cx, cy], (round(width), round(height))),
-                quaternion_pose(poses[name][:4], poses[name][4:]) if name in poses else None,
-                depth,
-                partial(read_depth, unit=unit),
-            )
-        )
-    findings = []
-    if depths:
-        line = f"{len(depths)} depth maps lie beside the pictures: estimated, not of the data set"
-        findings.append(Finding("info", line))
+        lens = pinhole_lens([fx, fy, cx, cy], (round(width), round(height)))
+        pose = quaternion_pose(poses[name][:4], poses[name][4:]) if name in poses else None
+        reader = partial(read_depth, unit=unit)
+        frames.append(PosedFrame(name, folder / name, lens, pose, depth, reader))
+    line = "depth maps lie beside the pictures: estimated, not of the data set"
+    findings = counted(len(depths), line, level="info")
     return posed_scene(folder, frames, poses="cam_from_world", metric=True, findings=findings)
 
 
@@ -389,7 +381,10 @@ def _address(path: Path) -> str:
     return parse_qs(parts.query).get("v", [parts.path.rpartition("/")[2]])[0]
 
 
-def _read_realestate(root: Path, scene: str) -> Scene:
+@Layout.of_reader(
+    "train/ID.txt and test/ID.txt, with frames/SPLIT/ID or videos", _realestate_scenes
+)
+def _realestate10k(root: Path, scene: str) -> Scene:
     split, _, name = scene.partition("/")
     path = root / split / f"{name}.txt"
     rows = number_table(path, COLUMNS, skip=1, required=True)
@@ -441,53 +436,14 @@ def _from_video(path: Path, rows: Float64, findings: list[Finding]) -> list[Pose
     within = rows[:, 0] / 1e6 <= header.seconds + header.frame_seconds
     line = f"frames are decoded from {path.name} at the nearest time stamp"
     findings.append(Finding("info", line))
-    if not within.all():
-        line = f"{int((~within).sum())} of {len(rows)} frames lie past the video's end: dropped"
-        findings.append(Finding("warning", line))
-    return [
-        PosedFrame(
-            str(int(row[0])),
-            path,
-            _row_lens(row, header.size),
-            row[7:].reshape(3, 4),
-            read=partial(read_frame, seconds=row[0] / 1e6),
-        )
-        for row in rows[within]
-    ]
+    line = f"of {len(rows)} frames lie past the video's end: dropped"
+    findings += counted(int((~within).sum()), line)
+    frames = []
+    for row in rows[within]:
+        lens, pose = _row_lens(row, header.size), row[7:].reshape(3, 4)
+        read = partial(read_frame, seconds=row[0] / 1e6)
+        frames.append(PosedFrame(str(int(row[0])), path, lens, pose, read=read))
+    return frames
 
 
-LAYOUTS = (
-    Layout(
-        "sevenscenes",
-        "SCENE/seq-NN/frame-NNNNNN.pose.txt with .color.png and .depth.png",
-        lambda root: scenes_holding(root, "*/seq-*/frame-*.pose.txt"),
-        _read_sevenscenes,
-    ),
-    Layout(
-        "scannet",
-        "scans/sceneNNNN_NN with color, depth, pose, intrinsic or a .sens",
-        _scannet_scenes,
-        _read_scannet,
-    ),
-    Layout(
-        "arkitscenes",
-        f"FOLD/VIDEO/{TRAJECTORY} with {LOW}, {LOW}_intrinsics and lowres_depth",
-        _arkit_scenes,
-        _read_arkit,
-        lambda root: tuple(
-            f"{s}/{HIGH}" for s in _arkit_scenes(root) if (root / s / HIGH).is_dir()
-        ),
-    ),
-    Layout(
-        "mapfree",
-        "SPLIT/SCENE/poses.txt and intrinsics.txt with seq0 and seq1",
-        lambda root: scenes_holding(root, "*/intrinsics.txt", "*/*/intrinsics.txt"),
-        _read_mapfree,
-    ),
-    Layout(
-        "realestate10k",
-        "train/ID.txt and test/ID.txt, with frames/SPLIT/ID or videos",
-        _realestate_scenes,
-        _read_realestate,
-    ),
-)
+LAYOUTS = (_sevenscenes, _scannet, _arkitscenes, _mapfree, _realestate10k)

@@ -57,7 +57,8 @@ def _scenes(root: Path) -> tuple[str, ...]:
     return natural(f"{path.parents[2].name}/{path.parent.name}" for path in found)
 
 
-def _read(root: Path, scene: str) -> Scene:
+@Layout.of_reader("ai_VVV_NNN/_detail/cam_XX with ai_VVV_NNN/images", _scenes)
+def _hypersim(root: Path, scene: str) -> Scene:
     name, _, camera = scene.partition("/")
     detail, images = root / name / "_detail", root / name / "images"
     parameters = _parameters(root, name)
@@ -70,23 +71,14 @@ def _read(root: Path, scene: str) -> Scene:
     numbers = detail / camera / "camera_keyframe_frame_indices.hdf5"
     indices = [int(i) for i in _hdf5(numbers)] if numbers.is_file() else range(len(positions))
     geometry = images / f"scene_{camera}_geometry_hdf5"
-    frames = []
+    frames, reader = [], partial(read_distance, camera=turned)
     for index, rotation, position in zip(indices, orientations, positions, strict=True):
         pose = opencv_pose(rigid_poses(rotation, position))
         pose[:3, :3] = pose[:3, :3] @ turned.stored_from_turned
         stem = f"frame.{index:04d}"
         color, read = _color(images, camera, stem, turned=turned)
-        frames.append(
-            PosedFrame(
-                stem,
-                color,
-                turned.lens,
-                pose,
-                geometry / f"{stem}.depth_meters.hdf5" if geometry.is_dir() else None,
-                partial(read_distance, camera=turned),
-                read=read,
-            )
-        )
+        depth = geometry / f"{stem}.depth_meters.hdf5" if geometry.is_dir() else None
+        frames.append(PosedFrame(stem, color, turned.lens, pose, depth, reader, read=read))
     place = root / scene
     return posed_scene(
         place, frames, poses="world_from_cam", metric=True, findings=findings, home=root
@@ -241,4 +233,4 @@ def _hdf5(path: Path) -> Any:
     return hdf5_array(path, "dataset")
 
 
-LAYOUTS = (Layout("hypersim", "ai_VVV_NNN/_detail/cam_XX with ai_VVV_NNN/images", _scenes, _read),)
+LAYOUTS = (_hypersim,)

@@ -19,7 +19,7 @@ from gvtools.cameras import rigid_poses
 from gvtools.errors import ProjectError
 from gvtools.scenes.calibration import MILLIMETRES, Float64, load_matrix, pinhole_lens
 from gvtools.scenes.colmap_model import find_model
-from gvtools.scenes.data_sets.reconstructed import MIPNERF360
+from gvtools.scenes.data_sets.reconstructed import mipnerf360
 from gvtools.scenes.images import read_pfm_depth
 from gvtools.scenes.layout import Layout
 from gvtools.scenes.matching import natural, pictures_by_stem
@@ -112,7 +112,11 @@ def _dtu_scenes(root: Path) -> tuple[str, ...]:
     return natural(path.relative_to(root).as_posix() for path in found)
 
 
-def _read_dtu(root: Path, scene: str) -> Scene:
+@Layout.of_reader(
+    "Rectified/scanN with Cameras, or scanN/cams with images, or scanN/cameras.npz with image",
+    _dtu_scenes,
+)
+def _dtu(root: Path, scene: str) -> Scene:
     folder = root / scene
     if scene.startswith(f"{RECTIFIED}/"):
         frames = _rectified(root, folder)
@@ -222,14 +226,18 @@ def _log_of(folder: Path) -> Path | None:
     return next(iter(sorted(folder.glob("*.log"))), None)
 
 
-def _read_tanks(root: Path, scene: str) -> Scene:
+@Layout.of_reader(
+    f"SCENE/*.log with {GIVEN}, SCENE/cams with images, or SCENE/sparse/0 with images",
+    _tanks_scenes,
+)
+def _tanks_and_temples(root: Path, scene: str) -> Scene:
     folder = root / scene
     cams, log = _cams_of(folder), _log_of(folder)
     if cams is not None:
         frames = mvsnet_frames(folder, cams, sizes=TANKS_SIZES)
         return posed_scene(folder, frames, poses="cam_from_world", metric=False)
     if find_model(folder) is not None or log is None:
-        return MIPNERF360.read(root, scene)
+        return mipnerf360.read(root, scene)
     findings = [Finding("info", f"poses: {log.name}; intrinsics: {GIVEN}")]
     frames = _official(folder, log)
     return posed_scene(folder, frames, poses="world_from_cam", metric=False, findings=findings)
@@ -260,17 +268,4 @@ def _official(folder: Path, log: Path) -> list[PosedFrame]:
     return [PosedFrame(file.name, file, lens, by_number.get(i)) for i, file in enumerate(files)]
 
 
-LAYOUTS = (
-    Layout(
-        "dtu",
-        "Rectified/scanN with Cameras, or scanN/cams with images, or scanN/cameras.npz with image",
-        _dtu_scenes,
-        _read_dtu,
-    ),
-    Layout(
-        "tanks_and_temples",
-        f"SCENE/*.log with {GIVEN}, SCENE/cams with images, or SCENE/sparse/0 with images",
-        _tanks_scenes,
-        _read_tanks,
-    ),
-)
+LAYOUTS = (_dtu, _tanks_and_temples)

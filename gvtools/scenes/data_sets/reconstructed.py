@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from gvtools.errors import ProjectError
-from gvtools.scenes.calibration import MILLIMETRES, finite_array, pinhole_lens
+from gvtools.scenes.calibration import MILLIMETRES, finite_array, found_lens, pinhole_lens
 from gvtools.scenes.colmap import colmap_frames, colmap_scene, model_in
 from gvtools.scenes.colmap_model import (
     ColmapModel,
@@ -89,7 +89,13 @@ def _mipnerf360_scenes(root: Path) -> tuple[str, ...]:
     return natural(p.name for p in folders if find_model(p) is not None and picture_folders(p))
 
 
-def _read_mipnerf360(root: Path, scene: str) -> Scene:
+@Layout.of_reader(
+    "SCENE/sparse/0 with SCENE/images or images_N",
+    _mipnerf360_scenes,
+    variants=lambda root: variants_of(root, _mipnerf360_scenes(root)),
+)
+def mipnerf360(root: Path, scene: str) -> Scene:
+    """A scene of a model beside pictures, in full or reduced."""
     folder, pictures = chosen_folder(root, scene)
     model = model_in(folder)
     by_stem = pictures_by_stem(pictures)
@@ -99,15 +105,6 @@ def _read_mipnerf360(root: Path, scene: str) -> Scene:
         return exact if is_file(exact) else by_stem.get(Path(image.name).stem, exact)
 
     return colmap_scene(folder, model, colmap_frames(model, picture_of))
-
-
-MIPNERF360 = Layout(
-    "mipnerf360",
-    "SCENE/sparse/0 with SCENE/images or images_N",
-    _mipnerf360_scenes,
-    _read_mipnerf360,
-    lambda root: variants_of(root, _mipnerf360_scenes(root)),
-)
 
 
 # --- LLFF -------------------------------------------------------------------------------------
@@ -128,7 +125,12 @@ def _llff_scenes(root: Path) -> tuple[str, ...]:
     return tuple(name for name in found if picture_folders(root / name))
 
 
-def _read_llff(root: Path, scene: str) -> Scene:
+@Layout.of_reader(
+    f"SCENE/{POSES_BOUNDS} with SCENE/images or images_N",
+    _llff_scenes,
+    variants=lambda root: variants_of(root, _llff_scenes(root)),
+)
+def _llff(root: Path, scene: str) -> Scene:
     folder, home = chosen_folder(root, scene)
     path = folder / POSES_BOUNDS
     with reading(path, "expected an array of N x 17 numbers; copy it again"):
@@ -191,7 +193,16 @@ def _dl3dv_scenes(root: Path) -> tuple[str, ...]:
     return natural(found)
 
 
-def _read_dl3dv(root: Path, scene: str) -> Scene:
+def _dl3dv_variants(root: Path) -> tuple[str, ...]:
+    scenes = _dl3dv_scenes(root)
+    inside = {scene: _inside(root / scene) for scene in scenes}
+    return tuple(n for scene in scenes for n in variants_of(root, [scene], inside=inside[scene]))
+
+
+@Layout.of_reader(
+    f"HASH/{TRANSFORMS} with HASH/images_4 or images_8", _dl3dv_scenes, variants=_dl3dv_variants
+)
+def _dl3dv(root: Path, scene: str) -> Scene:
     home = root / scene
     inside = _inside(home) or ("" if home.parent == root else _inside(home.parent))
     folder, pictures = chosen_folder(root, scene, inside=inside)
@@ -202,12 +213,6 @@ def _read_dl3dv(root: Path, scene: str) -> Scene:
     model = model_in(folder)
     frames = colmap_frames(model, lambda image: pictures / Path(image.name).name)
     return colmap_scene(folder, model, frames)
-
-
-def _dl3dv_variants(root: Path) -> tuple[str, ...]:
-    scenes = _dl3dv_scenes(root)
-    inside = {scene: _inside(root / scene) for scene in scenes}
-    return tuple(n for scene in scenes for n in variants_of(root, [scene], inside=inside[scene]))
 
 
 # --- ETH3D, high-resolution multi-view --------------------------------------------------------
@@ -225,7 +230,8 @@ def _eth3d_scenes(root: Path) -> tuple[str, ...]:
     return natural(path.parent.relative_to(root).as_posix() for path in folders)
 
 
-def _read_eth3d(root: Path, scene: str) -> Scene:
+@Layout.of_reader(f"SCENE/{UNDISTORTED} with SCENE/images", _eth3d_scenes)
+def _eth3d(root: Path, scene: str) -> Scene:
     folder = root / scene
     home, maps = folder / "images", folder / "ground_truth_depth" / "dslr_images"
     original = load_model(folder / ORIGINAL) if has_model(folder / ORIGINAL) else None
@@ -299,7 +305,10 @@ def _scannetpp_scenes(root: Path) -> tuple[str, ...]:
     return natural(path.relative_to(root).as_posix() for path in found)
 
 
-def _read_scannetpp(root: Path, scene: str) -> Scene:
+@Layout.of_reader(
+    f"SCENE/dslr/colmap or SCENE/iphone/{IPHONE_POSES} with pictures", _scannetpp_scenes
+)
+def _scannetpp(root: Path, scene: str) -> Scene:
     folder = root / scene
     return _read_dslr(folder) if folder.name == "dslr" else _read_iphone(folder)
 
@@ -340,43 +349,14 @@ def _read_iphone(folder: Path) -> Scene:
         if not all(isinstance(record, dict) for record in records.values()):
             raise ValueError("values that are no records")
     size = first_size(home / f"{name}.jpg" for name in records) or (1920, 1440)
-    frames = []
+    frames, reader = [], partial(read_depth, unit=MILLIMETRES)
     for name, record in records.items():
-        K = finite_array(record.get("intrinsic"), 3, 3)
-        frames.append(
-            PosedFrame(
-                f"{name}.jpg",
-                home / f"{name}.jpg",
-                None if K is None else pinhole_lens(K, size),
-                finite_array(record.get("aligned_pose"), 4, 4),
-                depths / f"{name}.png" if depths.is_dir() else None,
-                partial(read_depth, unit=MILLIMETRES),
-            )
-        )
+        lens = found_lens(record.get("intrinsic"), size, 3, 3)
+        pose = finite_array(record.get("aligned_pose"), 4, 4)
+        depth = depths / f"{name}.png" if depths.is_dir() else None
+        image = home / f"{name}.jpg"
+        frames.append(PosedFrame(image.name, image, lens, pose, depth, reader))
     return posed_scene(folder, frames, poses="world_from_cam", metric=True)
 
 
-LAYOUTS = (
-    MIPNERF360,
-    Layout(
-        "llff",
-        f"SCENE/{POSES_BOUNDS} with SCENE/images or images_N",
-        _llff_scenes,
-        _read_llff,
-        lambda root: variants_of(root, _llff_scenes(root)),
-    ),
-    Layout(
-        "dl3dv",
-        f"HASH/{TRANSFORMS} with HASH/images_4 or images_8",
-        _dl3dv_scenes,
-        _read_dl3dv,
-        _dl3dv_variants,
-    ),
-    Layout("eth3d", f"SCENE/{UNDISTORTED} with SCENE/images", _eth3d_scenes, _read_eth3d),
-    Layout(
-        "scannetpp",
-        f"SCENE/dslr/colmap or SCENE/iphone/{IPHONE_POSES} with pictures",
-        _scannetpp_scenes,
-        _read_scannetpp,
-    ),
-)
+LAYOUTS = (mipnerf360, _llff, _dl3dv, _eth3d, _scannetpp)

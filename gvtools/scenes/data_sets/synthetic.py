@@ -38,7 +38,7 @@ from gvtools.scenes.images import (
 from gvtools.scenes.layout import Layout
 from gvtools.scenes.matching import natural, numbers_in, scenes_holding
 from gvtools.scenes.photographs import Depth, PosedFrame, first_size, posed_scene
-from gvtools.scenes.scene import Finding, Frame, Scene
+from gvtools.scenes.scene import Finding, Frame, Scene, counted
 from gvtools.scenes.undistort import LensParameters
 from gvtools.untrusted import open_picture, read_json, reading
 
@@ -60,17 +60,12 @@ def numbered_frames(
     """Frames with a number each, given or else that in the ``names`` of pictures."""
     numbers = sorted(set(numbers) or numbers_in(images, names).union(cameras))
     size = first_size(images / names.format(i) for i in numbers) or (1, 1)
-    return [
-        PosedFrame(
-            names.format(i),
-            images / names.format(i),
-            lens_of(cameras[i][1], size) if i in cameras else None,
-            cameras[i][0] if i in cameras else None,
-            depth(i),
-            read(i),
-        )
-        for i in numbers
-    ]
+    frames = []
+    for i in numbers:
+        name, (pose, values) = names.format(i), cameras.get(i, (None, None))
+        lens = None if values is None else lens_of(values, size)
+        frames.append(PosedFrame(name, images / name, lens, pose, depth(i), read(i)))
+    return frames
 
 
 # --- TartanAir, the first and v2 --------------------------------------------------------------
@@ -195,7 +190,8 @@ def _kitti_scenes(root: Path) -> tuple[str, ...]:
     return natural(f"{scene}/{variation}/{camera}" for scene, variation, *_, camera in found)
 
 
-def _read_kitti(root: Path, scene: str) -> Scene:
+@Layout.of_reader("SceneNN/VARIATION with frames, intrinsic.txt and extrinsic.txt", _kitti_scenes)
+def _virtual_kitti(root: Path, scene: str) -> Scene:
     variation, _, camera = scene.rpartition("/")
     depths = _part(root, "depth") / variation / "frames" / "depth" / camera
     texts = _part(root, "textgt") / variation
@@ -272,7 +268,8 @@ def _spring_scenes(root: Path) -> tuple[str, ...]:
     return scenes_holding(root, *(f"{place}/{name}" for place in places for name in held))
 
 
-def _read_spring(root: Path, scene: str) -> Scene:
+@Layout.of_reader("train/NNNN with frame_left, disp1_left and cam_data", _spring_scenes)
+def _spring(root: Path, scene: str) -> Scene:
     folder = root / scene
     skies, sky_name = folder / "maps" / "skymap_left", "skymap_left_{:04d}.png"
     poses = number_table(folder / "cam_data" / "extrinsics.txt", 16).reshape(-1, 4, 4)
@@ -293,10 +290,8 @@ def _read_spring(root: Path, scene: str) -> Scene:
         read=reader,
     )
     bare = sum(not frame.read_depth.keywords["sky"] for frame in frames)  # type: ignore[attr-defined]
-    findings = []
-    if bare:
-        line = f"{bare} frames have no map of the sky: their sky is as far as its disparity says"
-        findings.append(Finding("info", line))
+    line = "frames have no map of the sky: their sky is as far as its disparity says"
+    findings = counted(bare, line, level="info")
     return posed_scene(folder, frames, poses="cam_from_world", metric=True, findings=findings)
 
 
@@ -318,7 +313,11 @@ def _synth_camera(path: Path) -> tuple[Float64, tuple[float, ...]]:
     return (pose @ MIRRORED if np.linalg.det(pose[:3, :3]) < 0 else pose), lens
 
 
-def _read_synth(root: Path, scene: str) -> Scene:
+@Layout.of_reader(
+    "NNNN or GTAV_NNN/NNNN with images, depths and poses",
+    lambda root: scenes_holding(root, "*/images", "*/poses", "*/*/images", "*/*/poses"),
+)
+def _mvs_synth(root: Path, scene: str) -> Scene:
     folder = root / scene
     names = "{:04d}.json"
     numbers, cameras, damaged = numbers_in(folder / "poses", names), {}, []
@@ -366,7 +365,10 @@ def _omniworld_scenes(root: Path) -> tuple[str, ...]:
     )
 
 
-def _read_omniworld(root: Path, scene: str) -> Scene:
+@Layout.of_reader(
+    "SCENE/camera/split_N.json with split_info.json, color and depth", _omniworld_scenes
+)
+def _omniworld(root: Path, scene: str) -> Scene:
     from scipy.spatial.transform import Rotation
 
     above, _, split = scene.rpartition("/")
@@ -416,7 +418,8 @@ def _gta_scenes(root: Path) -> tuple[str, ...]:
     return natural(file.relative_to(root).with_suffix("").as_posix() for file in files)
 
 
-def _read_gta(root: Path, scene: str) -> Scene:
+@Layout.of_reader("SEQUENCE.hdf5, also below train and test", _gta_scenes)
+def _gta_sfm(root: Path, scene: str) -> Scene:
     path = root / f"{scene}.hdf5"
     frames = []
     with hdf5_file(path) as file:
@@ -433,17 +436,9 @@ def _read_gta(root: Path, scene: str) -> Scene:
                 lens = renderer_lens(stored, size)
                 matrix = np.asarray(read_dataset(path, file[pose]), np.float64)
             # A path that is not there says that the picture or the depth is not.
-            frames.append(
-                PosedFrame(
-                    image,
-                    path if image in present else path / image,
-                    lens,
-                    matrix,
-                    path if depth in present else path / depth,
-                    partial(hdf5_depth, key=depth),
-                    read=partial(_hdf5_picture, key=image),
-                )
-            )
+            picture, map_ = (path if key in present else path / key for key in (image, depth))
+            reader, read = partial(hdf5_depth, key=depth), partial(_hdf5_picture, key=image)
+            frames.append(PosedFrame(image, picture, lens, matrix, map_, reader, read=read))
     return posed_scene(path, frames, poses="world_from_cam", metric=False)
 
 
@@ -458,32 +453,4 @@ def _encoded_size(pictures: Iterable[Any]) -> tuple[int, int]:
     return 1, 1
 
 
-LAYOUTS = (
-    TARTANAIR,
-    TARTANAIR_V2,
-    Layout(
-        "virtual_kitti",
-        "SceneNN/VARIATION with frames, intrinsic.txt and extrinsic.txt",
-        _kitti_scenes,
-        _read_kitti,
-    ),
-    Layout(
-        "spring",
-        "train/NNNN with frame_left, disp1_left and cam_data",
-        _spring_scenes,
-        _read_spring,
-    ),
-    Layout(
-        "mvs_synth",
-        "NNNN or GTAV_NNN/NNNN with images, depths and poses",
-        lambda root: scenes_holding(root, "*/images", "*/poses", "*/*/images", "*/*/poses"),
-        _read_synth,
-    ),
-    Layout(
-        "omniworld",
-        "SCENE/camera/split_N.json with split_info.json, color and depth",
-        _omniworld_scenes,
-        _read_omniworld,
-    ),
-    Layout("gta_sfm", "SEQUENCE.hdf5, also below train and test", _gta_scenes, _read_gta),
-)
+LAYOUTS = (TARTANAIR, TARTANAIR_V2, _virtual_kitti, _spring, _mvs_synth, _omniworld, _gta_sfm)

@@ -23,7 +23,7 @@ from gvtools.scenes.images import decode_picture
 from gvtools.scenes.layout import Layout
 from gvtools.scenes.matching import natural
 from gvtools.scenes.photographs import PosedFrame, posed_scene
-from gvtools.scenes.scene import Finding, Frame, Scene
+from gvtools.scenes.scene import Frame, Scene, counted
 from gvtools.scenes.undistort import LensParameters
 from gvtools.untrusted import reading, regular
 
@@ -48,7 +48,10 @@ def _scenes(root: Path) -> tuple[str, ...]:
     return natural(found)
 
 
-def _read(root: Path, scene: str) -> Scene:
+@Layout.of_reader(
+    "SPLIT/camera_image/SEGMENT.parquet with camera_calibration and vehicle_pose", _scenes
+)
+def _waymo(root: Path, scene: str) -> Scene:
     split, _, segment = scene.rpartition("/")
     home = root / split
     images = home / "camera_image" / f"{segment}.parquet"
@@ -64,19 +67,9 @@ def _read(root: Path, scene: str) -> Scene:
         lens, vehicle_from_cam = rig.get(camera, (None, None))
         if pose is not None and vehicle_from_cam is not None:
             pose = pose @ vehicle_from_cam @ WAYMO_FROM_OPENCV
-        pictures.append(
-            PosedFrame(
-                f"{CAMERAS.get(camera, str(camera))}/{time}",
-                images,
-                lens,
-                pose,
-                read=partial(read_picture, group=group, row=row),
-            )
-        )
-    findings = []
-    if stood_in:
-        line = f"{stood_in} pictures have their frame's pose, not that of their own time"
-        findings.append(Finding("warning", line))
+        name, read = CAMERAS.get(camera, camera), partial(read_picture, group=group, row=row)
+        pictures.append(PosedFrame(f"{name}/{time}", images, lens, pose, read=read))
+    findings = counted(stood_in, "pictures have their frame's pose, not that of their own time")
     return posed_scene(images, pictures, poses="world_from_cam", metric=True, findings=findings)
 
 
@@ -151,11 +144,4 @@ def _parquet() -> Any:
     return require("pyarrow.parquet", extra="data", purpose="reading Waymo's files")
 
 
-LAYOUTS = (
-    Layout(
-        "waymo",
-        "SPLIT/camera_image/SEGMENT.parquet with camera_calibration and vehicle_pose",
-        _scenes,
-        _read,
-    ),
-)
+LAYOUTS = (_waymo,)
