@@ -11,6 +11,7 @@ import atexit
 import codecs
 import csv
 import gzip
+import hashlib
 import io
 import json
 import math
@@ -126,6 +127,15 @@ def is_file(path: Path) -> bool:
 def read_bytes(path: Path) -> bytes:
     """What a file holds."""
     return regular(path).read_bytes()
+
+
+def sha256_of(path: Path) -> str:
+    """SHA-256 of a file, as hex digits."""
+    total = hashlib.sha256()
+    with regular(path).open("rb") as file:
+        while chunk := file.read(1 << 20):
+            total.update(chunk)
+    return total.hexdigest()
 
 
 def read_text(path: Path, *, errors: str = "strict") -> str:

@@ -20,7 +20,7 @@ from urllib.parse import quote
 
 from gvtools.errors import CheckpointError, OptionError, ProjectError
 from gvtools.files import check_space, flush_file, make_folder
-from gvtools.scenes.shards import sha256_of
+from gvtools.untrusted import sha256_of
 
 HUB = "https://huggingface.co/{repo}/resolve/{revision}/{path}"
 GIT = "https://raw.githubusercontent.com/{repo}/{revision}/{path}"

@@ -20,8 +20,8 @@ from gvtools.cameras import reduced_size
 from gvtools.capture.photographs import JPEG_QUALITY, CapturedPhotograph
 from gvtools.colmap import pycolmap
 from gvtools.errors import OptionError
-from gvtools.scenes.faces import FACE_DEGREES, PANORAMA, Face, face_name, panorama_faces
 from gvtools.scenes.images import read_image, read_mask
+from gvtools.scenes.undistort import FACE_DEGREES, PANORAMA, Face, face_name, panorama_faces
 
 LENSES = ("auto", "perspective", "equirectangular", "fisheye")
 # XMP of Google's photo sphere schema, near the beginning of a file.

@@ -39,9 +39,9 @@ from gvtools.features import LightGlueMatcher
 from gvtools.files import write_json
 from gvtools.poses.colmap import SEED
 from gvtools.runs.folder import folder_lock
-from gvtools.scenes.faces import face_name, picture_of
 from gvtools.scenes.matching import named
 from gvtools.scenes.scene import Finding
+from gvtools.scenes.undistort import face_name, picture_of
 from gvtools.trajectories import level_up
 
 REPORT = "capture.json"

@@ -1,8 +1,8 @@
 """Panoramas and fisheye pictures of the memory: pinhole faces that overlap, joined without seams.
 
 Everything that draws the memory, fits and completers takes pinhole cameras. A picture of another
-lens is therefore drawn as faces of a cube about its centre (see ``scenes.faces``), each wider than
-90 degrees. Where each of its pixels lies in the faces is computed once for all pictures.
+lens is therefore drawn as faces of a cube about its centre (see ``scenes.undistort``), each wider
+than 90 degrees. Where each of its pixels lies in the faces is computed once for all pictures.
 
 *Equirectangular*: all directions, longitude across and latitude down, straight ahead in the middle;
 the scene's vertical is the picture's. *Fisheye*: equidistant, a circle whose radius is half the
@@ -23,8 +23,15 @@ from pydantic import Field, model_validator
 from gvtools.cameras import Cameras, concatenate, invert_rigid
 from gvtools.errors import OptionError
 from gvtools.guidance import IMAGES, Guidance
-from gvtools.scenes.faces import FACE_DEGREES, PANORAMA, Face, face_name, panorama_faces, picture_of
-from gvtools.scenes.undistort import camera_of
+from gvtools.scenes.undistort import (
+    FACE_DEGREES,
+    PANORAMA,
+    Face,
+    camera_of,
+    face_name,
+    panorama_faces,
+    picture_of,
+)
 from gvtools.settings import Settings
 from gvtools.trajectories import level_up, look_at
 

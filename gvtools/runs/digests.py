@@ -21,7 +21,7 @@ import gvtools
 from gvtools.errors import ProjectError
 from gvtools.files import write_text
 from gvtools.runs.layout import MEMORY, RECORD
-from gvtools.untrusted import named_file, read_text, regular
+from gvtools.untrusted import named_file, read_text, sha256_of
 
 SUMS = "SHA256SUMS"
 # Of a large file, so many bytes at either end tell it from others.
@@ -52,12 +52,6 @@ def fingerprint(files: Iterable[Path]) -> str:
 def array_digest(arrays: Iterable[NDArray[Any] | None]) -> str:
     """A digest of the bytes of arrays, in order; None stands for an absent array."""
     return _sha256(b"none" if array is None else array.tobytes() for array in arrays)
-
-
-def file_digest(path: Path) -> str:
-    """A digest of a file's bytes."""
-    with regular(path).open("rb") as file:
-        return _sha256(iter(lambda: file.read(1 << 20), b""))
 
 
 def folder_digest(folder: Path, *, without: str) -> str:
@@ -94,7 +88,7 @@ def write_sums(folder: Path, names: Iterable[str] | None = None) -> None:
     if names is None:
         there = (path.name for path in folder.iterdir() if path.is_file())
         names = (name for name in there if name not in (MEMORY, SUMS))
-    lines = [f"{file_digest(folder / name)}  {name}\n" for name in sorted(names)]
+    lines = [f"{sha256_of(folder / name)}  {name}\n" for name in sorted(names)]
     write_text(folder / SUMS, "".join(lines))
 
 
@@ -113,7 +107,7 @@ def check_sums(folder: Path, names: Iterable[str] | None = None) -> None:
             continue
         file = named_file(folder, name, where=str(path))
         try:
-            whole = sums[name] == file_digest(file)
+            whole = sums[name] == sha256_of(file)
         except OSError as error:
             raise _damage(folder / name, error.strerror or str(error)) from None
         if not whole:

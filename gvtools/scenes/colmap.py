@@ -37,7 +37,7 @@ def read_colmap(
 ) -> Scene:
     """A COLMAP project with every view in an undistorted pinhole camera.
 
-    Pictures that see too much for one camera become several views, see ``faces``.
+    Pictures that see too much for one camera become several views, see ``undistort``.
 
     The model is looked for in ``sparse/N``, ``sparse``, ``root`` itself and ``sparse_txt``, the
     pictures in ``images`` beside it, those of a chunk of Hierarchical-3DGS (``chunks/NAME``) in

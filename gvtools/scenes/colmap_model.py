@@ -20,11 +20,10 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import rigid_transform
 from gvtools.errors import ProjectError
-from gvtools.scenes.faces import perspective_views
 from gvtools.scenes.matching import named, natural
 from gvtools.scenes.photographs import rotation_findings
 from gvtools.scenes.scene import Finding, counted, natural_key
-from gvtools.scenes.undistort import Undistortion, undistortion
+from gvtools.scenes.undistort import Undistortion, perspective_views, undistortion
 from gvtools.untrusted import number_key, read_bytes, read_text, reading, regular
 
 if TYPE_CHECKING:
@@ -261,7 +260,7 @@ class ColmapModel:
 
 
 def load_model(folder: Path, *, faces: bool = False) -> ColmapModel:
-    """The model in ``folder``, binary or text; with ``faces``, wide cameras become several."""
+    """The model in ``folder``, binary or text; with ``undistort``, wide cameras become several."""
     suffix, findings = checked_suffix(folder), list[Finding]()
     if others := _siblings(folder):
         listed = ", ".join(f"{name} ({count} images)" for name, count in others)

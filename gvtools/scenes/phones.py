@@ -39,18 +39,20 @@ from gvtools.scenes.calibration import (
 )
 from gvtools.scenes.images import (
     exr_depth,
+    frame_seconds,
     read_depth,
+    read_frame,
     read_image,
     read_mask,
     readings,
     resize_nearest,
+    video_header,
 )
 from gvtools.scenes.layout import Layout
 from gvtools.scenes.matching import natural, pictures_by_stem
 from gvtools.scenes.photographs import Depth, PosedFrame, first_size, posed_scene
 from gvtools.scenes.scene import Finding, Frame, Scene, counted
 from gvtools.scenes.undistort import LensParameters
-from gvtools.scenes.video import frame_seconds, read_frame, video_header
 from gvtools.untrusted import read_bytes, read_json, reading
 
 WORLD_UP = 1  # y

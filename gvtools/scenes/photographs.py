@@ -26,7 +26,6 @@ from gvtools.cameras import ROTATION_ROUNDING, Cameras, invert_rigid, rigid_tran
 from gvtools.errors import GvError, ProjectError
 from gvtools.ranges import WHOLE
 from gvtools.scenes.calibration import Float64, scaled_lens
-from gvtools.scenes.faces import perspective_views
 from gvtools.scenes.images import (
     ALPHA,
     DEPTH_SUFFIXES,
@@ -45,7 +44,7 @@ from gvtools.scenes.images import (
 )
 from gvtools.scenes.matching import named, pictures_in
 from gvtools.scenes.scene import Finding, Frame, Scene, View, natural_key
-from gvtools.scenes.undistort import LensParameters, Undistortion, undistortion
+from gvtools.scenes.undistort import LensParameters, Undistortion, perspective_views, undistortion
 from gvtools.untrusted import named_file
 
 Depth = NDArray[np.float32]

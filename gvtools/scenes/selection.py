@@ -5,8 +5,8 @@ A selection is one of ``all``, ``every:K``, ``every:K+OFFSET``, ``first:N``, ``l
 them, or ``@file`` with one name a line. Where names have commas, the longest that fits is taken.
 ``train`` names all views in the folder ``train/``, such as a split of Blender's synthetic scenes.
 
-Several views of one picture (``room@front.jpg``, ``room@left.jpg``, see ``faces``) count as one, so
-that a split never stands between them; ``room.jpg`` names all of them.
+Several views of one picture (``room@front.jpg``, ``room@left.jpg``, see ``undistort``) count as
+one, so that a split never stands between them; ``room.jpg`` names all of them.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from gvtools.errors import OptionError
-from gvtools.scenes.faces import picture_of
+from gvtools.scenes.undistort import picture_of
 from gvtools.untrusted import read_text
 
 GRAMMAR = (

@@ -32,10 +32,9 @@ from gvtools.scenes.shards import (
     encoded,
     read_index,
     read_record,
-    sha256_of,
     shard_name,
 )
-from gvtools.untrusted import read_json
+from gvtools.untrusted import read_json, sha256_of
 
 CONVERSION = "conversion.json"
 MEGABYTE = 10**6

@@ -39,13 +39,13 @@ from gvtools.untrusted import (
     read_bytes,
     reading,
     regular,
+    sha256_of,
 )
 
 AGAIN = "copy it again, or run gvtools data shards again"
 INDEX = "index.json"
 FORMAT, VERSION = "gvtools shards", 1
 KEPT_INDICES = 64  # of shards, in the memory of a process
-_CHUNK = 2**22
 
 # Number of a scene, number of a view in it: where a shard begins, and where the next one does.
 Position = tuple[int, int]
@@ -192,15 +192,6 @@ def read_record(path: Path, kind: type[R]) -> R:
     """A record from its JSON file."""
     with reading(path, "run gvtools data shards again, which writes what is damaged anew"):
         return kind.model_validate_json(read_bytes(path))
-
-
-def sha256_of(path: Path) -> str:
-    """SHA-256 of a file, as hex digits."""
-    digest = hashlib.sha256()
-    with regular(path).open("rb") as file:
-        while chunk := file.read(_CHUNK):
-            digest.update(chunk)
-    return digest.hexdigest()
 
 
 # --- a view as files, and back ----------------------------------------------------------------

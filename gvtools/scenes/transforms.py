@@ -34,14 +34,13 @@ from gvtools.scenes.calibration import (
     scaled_lens,
     times_as_large,
 )
-from gvtools.scenes.faces import PANORAMA, perspective_views
 from gvtools.scenes.images import read_depth, read_header
 from gvtools.scenes.layout import holds_views
 from gvtools.scenes.matching import find_renamed, given_folder, named
 from gvtools.scenes.photographs import PosedFrame, posed_scene
 from gvtools.scenes.scene import Finding, Scene, natural_key
 from gvtools.scenes.selection import select
-from gvtools.scenes.undistort import LensParameters, Undistortion
+from gvtools.scenes.undistort import PANORAMA, LensParameters, Undistortion, perspective_views
 from gvtools.trajectory_files import read_trajectory
 from gvtools.untrusted import is_file, read_json, reading
 
@@ -87,7 +86,7 @@ def read_transforms(path: Path, *, images: Path | None = None, masks: Path | Non
     """The project of a ``transforms.json``.
 
     Intrinsics may be shared or stand in each frame, as ``fl_x`` or as fields of view.
-    Distorted cameras become pinhole cameras, panoramas and wide fisheyes several (``faces``);
+    Distorted cameras become pinhole cameras, panoramas and wide fisheyes several (``undistort``);
     depth (``depth_file_path``, times ``depth_unit_scale_factor``, 1e-3 when absent; ``depth_path``,
     times ``integer_depth_scale``) and masks (``mask_path``, black = ignore) go through the same
     mapping. Views are named by their path below the deepest folder they share; those of splits

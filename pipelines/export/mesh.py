@@ -27,7 +27,7 @@ from gvtools.optional import require
 from gvtools.ply import up_comment, write_ply
 from gvtools.runs.layout import RECORD
 from gvtools.runs.run import load_run
-from gvtools.scenes.faces import DIRECTIONS, face_rotation
+from gvtools.scenes.undistort import DIRECTIONS, face_rotation
 from pipelines.export.formats import ExportOptions
 from pipelines.export.points import UNLIT, axes_of, linear, save_glb, unlit
 from pipelines.export.source import ExportSource

@@ -21,7 +21,7 @@ from gvtools.completers.base import Completer, available, completer_type
 from gvtools.completers.geoverse import from_pretrained
 from gvtools.completers.geoverse.weights import WHOLE_FILE, save_pretrained
 from gvtools.networks.config_json import to_json
-from gvtools.scenes.shards import sha256_of
+from gvtools.untrusted import sha256_of
 from pipelines.cli import main
 from pipelines.published import MODELS, Published
 

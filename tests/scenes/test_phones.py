@@ -15,11 +15,11 @@ from phone_exports import polycam, record3d, record3d_export, scanner_app, stray
 from PIL import Image
 
 from gvtools.errors import OptionError, ProjectError
+from gvtools.scenes.images import frame_seconds, read_frame
 from gvtools.scenes.inspection import inspect
 from gvtools.scenes.project import is_project, open_project
 from gvtools.scenes.rgbd import RgbdOptions
 from gvtools.scenes.scene import Scene
-from gvtools.scenes.video import frame_seconds, read_frame
 
 Write = Callable[[Path], Expected]
 EXPORTS: dict[str, tuple[str, Write, str]] = {

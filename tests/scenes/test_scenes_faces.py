@@ -14,12 +14,17 @@ from scenes_workspace import HEIGHT, LENSES, WIDTH, ramp
 
 from gvtools.cameras import Cameras, rigid_poses
 from gvtools.errors import OptionError, ProjectError
-from gvtools.scenes.faces import DIRECTIONS, face_rotation, perspective_views, picture_of
 from gvtools.scenes.project import open_project
 from gvtools.scenes.resized import reduced, resized, seen_by
 from gvtools.scenes.scene import Frame, Scene, SparsePoints, View
 from gvtools.scenes.selection import check_disjoint, select
-from gvtools.scenes.undistort import undistortion
+from gvtools.scenes.undistort import (
+    DIRECTIONS,
+    face_rotation,
+    perspective_views,
+    picture_of,
+    undistortion,
+)
 
 # mypy: no-check-untyped-defs
 

@@ -430,7 +430,7 @@ def _from_pictures(folder: Path, rows: Float64) -> list[PosedFrame]:
 
 def _from_video(path: Path, rows: Float64, findings: list[Finding]) -> list[PosedFrame]:
     """Frames at the nearest time stamps; ``findings`` is added to."""
-    from gvtools.scenes.video import read_frame, video_header
+    from gvtools.scenes.images import read_frame, video_header
 
     header = video_header(path)
     within = rows[:, 0] / 1e6 <= header.seconds + header.frame_seconds

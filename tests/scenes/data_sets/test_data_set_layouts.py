@@ -32,8 +32,8 @@ from gvtools.scenes.data_sets.catalogue import (
     spec_names,
 )
 from gvtools.scenes.data_sets.hypersim import read_color, turned_pinhole
+from gvtools.scenes.images import read_frame
 from gvtools.scenes.scene import Scene, natural_key
-from gvtools.scenes.video import read_frame
 
 ALL = miniatures()
 PARTIAL = [miniature for miniature in ALL if miniature.pictures]
