@@ -7,12 +7,12 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from pydantic import BaseModel, Field, ValidationError, model_validator
+from pydantic import BaseModel, ValidationError, model_validator
 
-from gvtools.cameras import Cameras, rigid_transform
+from gvtools.cameras import Cameras, check_usable, rigid_transform
 from gvtools.errors import MemoryFileError, OptionError, ProjectError, ShapeError
 from gvtools.memory.files import INDEX
 from gvtools.notebook import html_table, png_tag
@@ -272,10 +272,6 @@ def _same_camera(view: View, target: TargetFiles) -> bool:
     )
 
 
-Row3 = Annotated[list[float], Field(min_length=3, max_length=3)]
-Row4 = Annotated[list[float], Field(min_length=4, max_length=4)]
-
-
 class _Record(BaseModel):
     """What readers of run.json stand on."""
 
@@ -300,31 +296,23 @@ class _Settings(BaseModel):
     max_side: int | None = None
 
 
-class _Camera(BaseModel):
-    K: Annotated[list[Row3], Field(min_length=3, max_length=3)]
-    cam_from_world: Annotated[list[Row4], Field(min_length=4, max_length=4)]
-    width: Annotated[int, Field(gt=0, lt=2**31)]
-    height: Annotated[int, Field(gt=0, lt=2**31)]
-
-    @model_validator(mode="after")
-    def _usable(self) -> _Camera:
-        finite = np.isfinite(self.K).all() and self.K[0][0] > 0 and self.K[1][1] > 0
-        if not finite:
-            raise ValueError("impossible intrinsics")
-        try:
-            rigid_transform(self.cam_from_world, what="cam_from_world")
-        except ShapeError as error:
-            raise ValueError(str(error)) from None
-        return self
-
-
 class _View(BaseModel):
     name: str
     stem: str
     coverage: float
     coverage_after: float
-    camera: _Camera
+    camera: dict[str, Any]
     scale: dict[str, Any]
+
+    @model_validator(mode="after")
+    def _usable(self) -> _View:
+        try:
+            camera = entry_camera({"name": self.name, "camera": self.camera})
+            check_usable(camera)
+            rigid_transform(camera.cam_from_world[0], what=self.name)
+        except (ShapeError, KeyError, TypeError, OverflowError) as error:
+            raise ValueError(str(error)) from None
+        return self
 
 
 class _Report(BaseModel):

@@ -214,18 +214,12 @@ class _Views:
             self.position = (number, place + 1)
             view = scene.views[place]
             try:
-                files, unit = encoded(view, view.load(), {"scene": name, "metric": scene.metric})
+                files, camera = encoded(view, view.load(), {"scene": name, "metric": scene.metric})
             except GvError as error:
                 self.skipped.append(Skipped(scene=name, view=view.name, reason=str(error)))
                 continue
             about = SceneRecord(number=number, name=name, kind=scene.kind, metric=scene.metric)
-            K, pose = view.camera.K[0].tolist(), view.camera.cam_from_world[0].tolist()
-            record = ViewRecord(
-                scene=number, view=place, name=view.name, width=int(view.camera.width[0]),
-                height=int(view.camera.height[0]), K=K, cam_from_world=pose, depth_unit=unit,
-                members={},
-            )  # fmt: skip
-            return about, record, files
+            return about, ViewRecord(scene=number, view=place, members={}, **camera), files
         return None
 
     def _scene(self, number: int, name: str) -> Scene | None:

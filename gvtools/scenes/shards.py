@@ -207,8 +207,8 @@ UNITS = (0.001, 0.0002)
 
 def encoded(
     view: View, frame: Frame, about: Mapping[str, Any]
-) -> tuple[dict[str, bytes], float | None]:
-    """A view's files by the end of their names, and scene units of a stored step of depth."""
+) -> tuple[dict[str, bytes], dict[str, Any]]:
+    """A view's files by the end of their names, and its camera as records have it."""
     lossy = any(path.suffix.lower() in LOSSY for path in view.files[:1])
     picture = Image.fromarray(frame.rgb)
     members = {"jpg": _saved(picture, "JPEG", **JPEG)} if lossy else {"png": _saved(picture)}
@@ -229,10 +229,9 @@ def encoded(
         "K": view.camera.K[0].tolist(),
         "cam_from_world": view.camera.cam_from_world[0].tolist(),
         "depth_unit": unit,
-        **about,
     }
-    members[CAMERA] = json.dumps(camera).encode()
-    return members, unit
+    members[CAMERA] = json.dumps({**camera, **about}).encode()
+    return members, camera
 
 
 def decoded(members: Mapping[str, bytes], *, depth_unit: float | None, where: str) -> Frame:
