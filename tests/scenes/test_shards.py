@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import pickle
+import shutil
 import signal
 import subprocess
 import sys
@@ -33,13 +34,6 @@ def whole(tmp_path_factory) -> Path:
 
 def contents(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
-
-
-def copied(folder: Path, to: Path) -> Path:
-    to.mkdir()
-    for name, content in contents(folder).items():
-        (to / name).write_bytes(content)
-    return to
 
 
 def test_every_view_comes_back_bit_by_bit(whole):
@@ -128,7 +122,7 @@ def test_a_killed_conversion_ends_with_the_same_bytes(whole, tmp_path):
 
 
 def test_damage_is_found_named_and_mended(whole, tmp_path):
-    out = copied(whole, tmp_path / "shards")
+    out = Path(shutil.copytree(whole, tmp_path / "shards"))
     assert verify(out) == []
     tar = out / "shard-000001.tar"
     content = bytearray(tar.read_bytes())
@@ -166,7 +160,7 @@ def test_what_cannot_be_read_is_left_out_and_listed(tmp_path):
 
 
 def test_another_conversion_and_foreign_files_are_refused(whole, tmp_path):
-    out = copied(whole, tmp_path / "shards")
+    out = Path(shutil.copytree(whole, tmp_path / "shards"))
     with pytest.raises(OptionError, match=r"other max_side lies there: None then, 64 now"):
         write_shards(small_collection(), out, options=ShardOptions(megabytes=0.08, max_side=64))
     with pytest.raises(OptionError, match="other title"):
@@ -183,29 +177,15 @@ wds = pytest.importorskip("webdataset")
 torch = pytest.importorskip("torch")
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory) -> Path:
-    out = tmp_path_factory.mktemp("shards")
-    write_shards(small_collection(), out, options=ShardOptions(megabytes=0.08))
-    return out
-
-
-def tars(folder: Path) -> list[str]:
-    return [str(folder / shard.file) for shard in read_index(folder).shards]
-
-
-def place(sample: dict[str, bytes]) -> tuple[str, str]:
-    camera = json.loads(sample["json"])
-    return camera["scene"], camera["name"]
-
-
-def test_pixels_and_cameras_are_those_of_the_scenes(folder):
+def test_pixels_and_cameras_are_those_of_the_scenes(whole):
     collection = small_collection()
     seen = []
-    for sample in wds.WebDataset(tars(folder), shardshuffle=False):
-        scene, name = place(sample)
+    tars = [str(whole / shard.file) for shard in read_index(whole).shards]
+    for sample in wds.WebDataset(tars, shardshuffle=False):
+        camera = json.loads(sample["json"])
+        scene, name = camera["scene"], camera["name"]
         view = collection.read(scene)[name]
-        frame, camera = view.load(), json.loads(sample["json"])
+        frame = view.load()
         assert np.array_equal(np.array(Image.open(io.BytesIO(sample["png"]))), frame.rgb)
         if "depth.png" in sample:
             depth = np.asarray(Image.open(io.BytesIO(sample["depth.png"]))).astype(np.float32)

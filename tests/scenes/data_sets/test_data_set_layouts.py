@@ -272,7 +272,7 @@ def test_tanks_trajectory_without_intrinsics_is_refused(tmp_path: Path) -> None:
 
 
 def test_eth3d_depth_needs_the_original_calibration(tmp_path: Path) -> None:
-    expected = mini_reconstructed.write_eth3d_undistorted(tmp_path)
+    expected = mini_reconstructed.UNDISTORTED(tmp_path)
     shutil.rmtree(tmp_path / expected.scene / "dslr_calibration_jpg")
     scene = read("eth3d", tmp_path, expected.scene)
     assert not any(view.has_depth for view in scene)
@@ -433,7 +433,9 @@ def test_scannetpp_masks_follow_the_undistortion(tmp_path: Path) -> None:
     expected = mini_reconstructed.write_fisheye(tmp_path)
     mask = read("scannetpp", tmp_path, expected.scene).views[0].load().mask
     assert mask is not None
-    lens = mini_reconstructed.fisheye_scannetpp()
+    lens = mini_reconstructed.fisheye(
+        mini_reconstructed.SCANNETPP_FISHEYE, mini_reconstructed.PARAMS
+    )
     # The middle of the masked part of the fisheye picture, in the pinhole's pixels.
     ray = np.append(np.asarray(lens.cam_from_img(np.array([[34.5, 25.0]])))[0], 1)
     x, y, _ = expected.cameras.K[0] @ ray

@@ -15,23 +15,11 @@ from data_sets.room_frames import rendered_frames
 from PIL import Image
 
 from gvtools.errors import ProjectError
-from gvtools.scenes.data_sets.synthetic import (
-    CAMERAS,
-    buffer_depth,
-    halved,
-)
+from gvtools.scenes.data_sets.synthetic import CAMERAS, buffer_depth, halved
 from gvtools.scenes.images import exr_depth, hdf5_array
 from gvtools.scenes.scene import Scene
 
-WRITERS = {
-    "gta_sfm": mini_synthetic.write_gta_sfm,
-    "mvs_synth": mini_synthetic.write_mvs_synth,
-    "omniworld": mini_synthetic.write_omniworld,
-    "spring": mini_synthetic.write_spring,
-    "tartanair": mini_synthetic.write_first,
-    "tartanair_v2": mini_synthetic.write_second,
-    "virtual_kitti": mini_synthetic.write_virtual_kitti,
-}
+WRITERS = {item.layout: item.write for item in mini_synthetic.MINIATURES if not item.variant}
 
 
 @dataclass(frozen=True)
