@@ -13,13 +13,13 @@ import pytest
 from data_sets.miniature import Expected, compare
 from phone_exports import polycam, record3d, record3d_export, scanner_app, stray_scanner
 from PIL import Image
+from scenes_workspace import messages
 
 from gvtools.errors import OptionError, ProjectError
 from gvtools.scenes.images import frame_seconds, read_frame
 from gvtools.scenes.inspection import inspect
 from gvtools.scenes.project import is_project, open_project
 from gvtools.scenes.rgbd import RgbdOptions
-from gvtools.scenes.scene import Scene
 
 Write = Callable[[Path], Expected]
 EXPORTS: dict[str, tuple[str, Write, str]] = {
@@ -34,11 +34,6 @@ EXPORTS: dict[str, tuple[str, Write, str]] = {
 }
 
 
-def told(scene: Scene) -> str:
-    """All findings of a scene."""
-    return " | ".join(finding.message for finding in scene.findings)
-
-
 @pytest.mark.parametrize("export", EXPORTS)
 def test_an_export_is_recognised_and_read_back(export: str, tmp_path: Path) -> None:
     kind, write, place = EXPORTS[export]
@@ -51,7 +46,7 @@ def test_an_export_is_recognised_and_read_back(export: str, tmp_path: Path) -> N
     assert report.kind == kind
     assert report.ok, report.findings
     assert all(file.is_file() for view in scene for file in view.files)
-    assert "sky" not in told(scene)
+    assert "sky" not in messages(scene)
     for options in ({"images": tmp_path}, {"masks": tmp_path}, {"rgbd": RgbdOptions()}):
         with pytest.raises(OptionError, match=f"export of {kind} says how it is read"):
             open_project(tmp_path / place, **options)  # type: ignore[arg-type]
@@ -74,8 +69,8 @@ def test_frames_whose_picture_is_absent_or_damaged_are_left_out(export, pattern,
     pictures[2].write_bytes(b"")
     scene = open_project(tmp_path / place)
     assert len(scene) == 2
-    assert "1 of 4 frames have a damaged picture: dropped" in told(scene)
-    assert "1 of 4 frames have no picture: dropped" in told(scene)
+    assert "1 of 4 frames have a damaged picture: dropped" in messages(scene)
+    assert "1 of 4 frames have no picture: dropped" in messages(scene)
     for view in scene:
         view.load()
 
@@ -115,9 +110,9 @@ def test_stray_gaps_and_a_cut_off_last_row(tmp_path: Path) -> None:
     bare = scene["000003"].load().depth
     assert bare is not None
     assert (bare > 0).all()
-    assert "1 of 7 frames have no pose: dropped (000007)" in told(scene)
-    assert "1 of 6 depth maps have no confidence map" in told(scene)
-    assert "rgb.mp4 has 8 frames for 7 poses" in told(scene)
+    assert "1 of 7 frames have no pose: dropped (000007)" in messages(scene)
+    assert "1 of 6 depth maps have no confidence map" in messages(scene)
+    assert "rgb.mp4 has 8 frames for 7 poses" in messages(scene)
 
 
 def test_stray_without_rows_or_a_video(tmp_path: Path) -> None:
@@ -141,9 +136,9 @@ def test_scanner_app_records_more_frames_than_pictures(tmp_path: Path) -> None:
     (tmp_path / "conf_00004.png").unlink()
     scene = open_project(tmp_path)
     assert scene.names == ("frame_00000.jpg", "frame_00004.jpg", "frame_00006.jpg")
-    assert "4 of 7 frames were recorded without a picture: not used" in told(scene)
-    assert "1 of 4 frames have no pose: dropped (frame_00002.jpg)" in told(scene)
-    assert "1 of 4 depth maps have no confidence map" in told(scene)
+    assert "4 of 7 frames were recorded without a picture: not used" in messages(scene)
+    assert "1 of 4 frames have no pose: dropped (frame_00002.jpg)" in messages(scene)
+    assert "1 of 4 depth maps have no confidence map" in messages(scene)
 
 
 def test_frames_of_another_program_are_none_of_scanner_app(tmp_path: Path) -> None:
@@ -192,8 +187,8 @@ def test_polycam_never_mixes_corrected_and_recorded_poses(tmp_path: Path) -> Non
     np.testing.assert_allclose(
         scene.cameras.cam_from_world, expected.cameras.cam_from_world[[0, 2, 3]], atol=1e-9
     )
-    assert "poses: optimised" in told(scene)
-    assert "1 of 4 frames have no pose" in told(scene)
+    assert "poses: optimised" in messages(scene)
+    assert "1 of 4 frames have no pose" in messages(scene)
 
 
 # --- Record3D ---------------------------------------------------------------------------------
@@ -210,7 +205,7 @@ def test_record3d_archive_and_folder_are_the_same(tmp_path: Path) -> None:
     scene = open_project(tmp_path / "scan")
     assert scene.names == ("0.jpg", "2.jpg", "3.jpg")
     assert [view.has_depth for view in scene] == [True, True, False]
-    assert "1 of 3 depth maps have no confidence map" in told(scene)
+    assert "1 of 3 depth maps have no confidence map" in messages(scene)
 
 
 def rewritten(path: Path, *, without: str = "", **metadata: Any) -> Path:

@@ -38,6 +38,15 @@ def said(scene):
     return [f.message for f in inspect(scene).findings if "do not show" in f.message]
 
 
+def showing(room, pictures):
+    """The room with other pictures."""
+    views = [
+        replace(view, load=partial(Frame, np.ascontiguousarray(rgb)))
+        for view, rgb in zip(room.views, pictures, strict=True)
+    ]
+    return replace(room, views=tuple(views))
+
+
 def shifted(pictures):
     return [*pictures[1:], pictures[0]]
 
@@ -56,11 +65,7 @@ def test_right_pictures_are_believed(room):
 
 def seen_as(room, pictures, **points):
     """What is said of the room with other pictures, and points that differ."""
-    views = [
-        replace(view, load=partial(Frame, np.ascontiguousarray(rgb)))
-        for view, rgb in zip(room.views, pictures, strict=True)
-    ]
-    scene = replace(room, views=tuple(views), points=replace(room.points, **points))
+    scene = replace(showing(room, pictures), points=replace(room.points, **points))
     found = [f.message for f in inspect(scene).findings if f.level == "warning"]
     assert len(probed(scene, scene.names)) == len(found)
     return found
@@ -68,16 +73,15 @@ def seen_as(room, pictures, **points):
 
 def test_pictures_that_are_all_a_little_off_are_said(room):
     pictures = [view.load().rgb for view in room]
-    right = [np.roll(p, 5, axis=1) for p in pictures]
-    (line,) = seen_as(room, right)
-    assert "shifted right by +3" in line
-    (line,) = seen_as(room, [cv2.resize(p[3:-3, 4:-4], (160, 120)) for p in pictures])
-    assert "scaled by +" in line
-    (line,) = seen_as(room, [cv2.resize(p[:, 5:-5], (160, 120)) for p in pictures])
-    assert "wider by +" in line
     turn = cv2.getRotationMatrix2D((79.5, 59.5), 3, 1)
-    (line,) = seen_as(room, [cv2.warpAffine(p, turn, (160, 120)) for p in pictures])
-    assert "turned by -0." in line
+    for change, told in (
+        (lambda p: np.roll(p, 5, axis=1), "shifted right by +3"),
+        (lambda p: cv2.resize(p[3:-3, 4:-4], (160, 120)), "scaled by +"),
+        (lambda p: cv2.resize(p[:, 5:-5], (160, 120)), "wider by +"),
+        (lambda p: cv2.warpAffine(p, turn, (160, 120)), "turned by -0."),
+    ):
+        (line,) = seen_as(room, list(map(change, pictures)))
+        assert told in line
 
 
 @pytest.mark.parametrize("rows", [4, 8, 12])
@@ -144,11 +148,7 @@ def test_depth_of_views_far_apart_whose_poses_drift_tells_nothing(room, wall_wal
 def test_two_swapped_pictures_are_named_alone(room):
     rgb = [view.load().rgb for view in room]
     rgb[0], rgb[7] = rgb[7], rgb[0]
-    views = [
-        replace(view, load=partial(Frame, picture))
-        for view, picture in zip(room.views, rgb, strict=True)
-    ]
-    assert "2 of 8 photographs" in said(replace(room, views=tuple(views)))[0]
+    assert "2 of 8 photographs" in said(showing(room, rgb))[0]
 
 
 @pytest.mark.parametrize(
@@ -162,12 +162,7 @@ def test_two_swapped_pictures_are_named_alone(room):
     ],
 )
 def test_wrong_pictures_are_said_with_their_reason(room, change, reason):
-    pictures = change([view.load().rgb for view in room])
-    views = [
-        replace(view, load=partial(Frame, np.ascontiguousarray(rgb)))
-        for view, rgb in zip(room.views, pictures, strict=True)
-    ]
-    scene = replace(room, views=tuple(views))
+    scene = showing(room, change([view.load().rgb for view in room]))
     (message,) = said(scene)
     assert reason in message
     wrong = 1 if "upside" in reason else 8

@@ -31,6 +31,35 @@ def room(wall_walk, tmp_path_factory):
     return write_project(tmp_path_factory.mktemp("room") / "room", wall_walk[:6])
 
 
+def said(file, change=lambda frames: None, **shared):
+    """What is said of a project, its frames changed."""
+    data = json.loads(file.read_text()) | shared
+    change(data["frames"])
+    changed = file.with_name("changed.json")
+    changed.write_text(json.dumps(data))
+    return [item.message for item in pose_findings(open_project(changed))]
+
+
+def posed(change):
+    """Frames with other matrices."""
+
+    def changed(frames):
+        for frame in frames:
+            frame["transform_matrix"] = change(np.array(frame["transform_matrix"])).tolist()
+
+    return changed
+
+
+def zoomed(times, rows=slice(None)):
+    """Frames of which some have other focal lengths."""
+
+    def changed(frames):
+        for frame in frames[rows]:
+            frame |= {key: times * frame[key] for key in ("fl_x", "fl_y")}
+
+    return changed
+
+
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
@@ -43,69 +72,53 @@ def room(wall_walk, tmp_path_factory):
     ],
 )
 def test_the_form_of_poses_is_told_by_the_photographs(room, change, reason):
-    data = json.loads(room.read_text())
-    for frame in data["frames"]:
-        frame["transform_matrix"] = change(np.array(frame["transform_matrix"])).tolist()
-    file = room.with_name("changed.json")
-    file.write_text(json.dumps(data))
-    found = [item.message for item in pose_findings(open_project(file))]
+    found = said(room, posed(change))
     assert len(found) == (reason is not None)
     assert all("do not fit the photographs" in line and reason in line for line in found)
 
 
-def test_pictures_that_are_renumbered(room):
-    data = json.loads(room.read_text())
-    paths = [frame["file_path"] for frame in data["frames"]]
-    for frame, path in zip(data["frames"], [*paths[1:], paths[0]], strict=True):
+def renumbered(frames):
+    paths = [frame["file_path"] for frame in frames]
+    for frame, path in zip(frames, [*paths[1:], paths[0]], strict=True):
         frame["file_path"] = path
-    file = room.with_name("changed.json")
-    file.write_text(json.dumps(data))
-    (found,) = pose_findings(open_project(file))
-    assert "each fits the pose of the next one" in found.message
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (renumbered, "each fits the pose of the next one"),
+        (zoomed(1.2, slice(1, None, 2)), "focal lengths of "),
+        (zoomed(0.85, slice(1, None, 3)), "focal lengths of "),
+    ],
+)
+def test_pictures_and_focal_lengths_of_other_frames(room, change, reason):
+    (found,) = said(room, change)
+    assert reason in found
+
+
+def project(folder, places, *, scale=1.0):
+    """Views of the room from three places, of which nothing is said."""
+    textures = [blotches(np.random.default_rng(3 + wall)) for wall in range(3)]
+    cameras = [camera_at(a, turn=t, scale=scale, name=f"{a[0]:.1f}.png") for a, t in places]
+    file = write_project(folder / "room", [photograph(each, textures) for each in cameras])
+    assert said(file) == []
+    return file
 
 
 def test_axes_of_cameras_that_go_sideways(tmp_path):
     # Epipolar lines are nearly those of the other axes; what is seen lies behind these cameras.
-    textures = [blotches(np.random.default_rng(3 + wall)) for wall in range(3)]
-    places = [((0.5 * i - 0.5, 0, 0), (0, 6 - 6 * i, 0)) for i in range(3)]
-    cameras = [camera_at(at, turn=turn, name=f"{at[0]:.1f}.png") for at, turn in places]
-    file = write_project(tmp_path / "room", [photograph(each, textures) for each in cameras])
-    assert pose_findings(open_project(file)) == []
-    data = json.loads(file.read_text())
-    for frame in data["frames"]:
-        frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ FLIP).tolist()
-    file.write_text(json.dumps(data))
-    (found,) = pose_findings(open_project(file))
-    assert "taken for each other" in found.message
+    file = project(tmp_path, [((0.5 * i - 0.5, 0, 0), (0, 6 - 6 * i, 0)) for i in range(3)])
+    (found,) = said(file, posed(lambda pose: pose @ FLIP))
+    assert "taken for each other" in found
 
 
 def test_focal_lengths_of_pictures_that_were_cropped(tmp_path):
-    textures = [blotches(np.random.default_rng(3 + wall)) for wall in range(3)]
     places = [
         ((0.5 * i - 1.2, -0.2 * i, 0.35 * i), (5 * i - 5, 25 - 22 * i, 8 * i)) for i in range(3)
     ]
-    cameras = [camera_at(at, turn=turn, scale=1.6, name=f"{at[0]:.1f}.png") for at, turn in places]
-    file = write_project(tmp_path / "room", [photograph(each, textures) for each in cameras])
-    assert pose_findings(open_project(file)) == []
-    data = json.loads(file.read_text())
-    (file.parent / "bent.json").write_text(json.dumps({**data, "k1": 0.3}))
-    for frame in data["frames"]:
-        frame |= {key: 0.8 * frame[key] for key in ("fl_x", "fl_y")}
-    file.write_text(json.dumps(data))
-    for path, said in ((file, "focal lengths +2"), (file.parent / "bent.json", "k1 +0.")):
-        (found,) = pose_findings(open_project(path))
-        assert "another lens fits" in found.message and said in found.message
-
-
-@pytest.mark.parametrize(("every", "times"), [(2, 1.2), (3, 0.85)])
-def test_focal_lengths_that_are_wrong_in_part_of_the_frames(room, every, times):
-    data = json.loads(room.read_text())
-    for frame in data["frames"][1::every]:
-        frame |= {key: times * frame[key] for key in ("fl_x", "fl_y")}
-    file = room.with_name("changed.json")
-    file.write_text(json.dumps(data))
-    (found,) = pose_findings(open_project(file))
-    assert "focal lengths of " in found.message
+    file = project(tmp_path, places, scale=1.6)
+    for found, told in ((said(file, zoomed(0.8)), "lengths +2"), (said(file, k1=0.3), "k1 +0.")):
+        assert "another lens fits" in found[0] and told in found[0]
 
 
 DEPTH_K = np.array([[100.0, 0, 64.5], [0, 100, 48.5], [0, 0, 1]])

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from scenes_workspace import ramp, save, workspace
+from scenes_workspace import messages, ramp, save, workspace
 
 from gvtools.errors import ProjectError
 from gvtools.scenes.images import (
@@ -180,10 +180,6 @@ def test_orientation_tags_of_odd_types(tmp_path, told):
 MASK = np.repeat(np.array([[0] * 48 + [255] * 48], np.uint8), 72, 0)
 
 
-def told(scene):
-    return " | ".join(finding.message for finding in scene.findings)
-
-
 @pytest.mark.parametrize(
     ("listed", "there"),
     [
@@ -237,11 +233,11 @@ def test_models_pictures_and_masks(tmp_path, suffix):
         image.name = f"images\\{image.name}"
     model.write_binary(tmp_path / "sparse" / "0")
     scene = open_project(tmp_path)
-    assert len(scene) == 4 and "4 of 4 pictures registered" in told(scene)
+    assert len(scene) == 4 and "4 of 4 pictures registered" in messages(scene)
     for line in (
         "4 pictures are named otherwise",
         "4 masks are named otherwise",
         "4 masks of 48x36",
     ):
-        assert told(scene).count(line) == 1
+        assert messages(scene).count(line) == 1
     assert not scene.views[0].load().mask[:, :40].any()

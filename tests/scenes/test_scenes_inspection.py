@@ -15,13 +15,18 @@ from gvtools.scenes.inspection import inspect, reprojection_errors
 from gvtools.scenes.rgbd_layouts import SEVENSCENES
 
 
-def test_report_of_a_model(tmp_path):
-    reconstruction = workspace(tmp_path)
-    for image in reconstruction.images.values():
+def move_detections(reconstruction, root, images, *, by):
+    """Write the model with the detections of some images moved."""
+    for image in list(reconstruction.images.values())[:images]:
         for index, point in enumerate(image.points2D):
             if point.has_point3D():
-                image.points2D[index].xy = point.xy + np.array([0.3, 0.4])
-    reconstruction.write_binary(tmp_path / "sparse/0")
+                image.points2D[index].xy = point.xy + np.array(by, float)
+    reconstruction.write_binary(root / "sparse/0")
+
+
+def test_report_of_a_model(tmp_path):
+    reconstruction = workspace(tmp_path)
+    move_detections(reconstruction, tmp_path, 4, by=(0.3, 0.4))
     scene = read_colmap(tmp_path)
     report = inspect(scene)
     assert report.ok
@@ -97,11 +102,7 @@ def test_intrinsics_that_no_camera_has_and_poses_that_points_contradict_are_warn
     tmp_path, wrong
 ):
     reconstruction = workspace(tmp_path)
-    for image in list(reconstruction.images.values())[:wrong]:
-        for index, point in enumerate(image.points2D):
-            if point.has_point3D():
-                image.points2D[index].xy = point.xy + np.array([30.0, 40.0])
-    reconstruction.write_binary(tmp_path / "sparse/0")
+    move_detections(reconstruction, tmp_path, wrong, by=(30, 40))
     messages = [finding.message for finding in inspect(read_colmap(tmp_path)).findings]
     assert any(f"on average in {wrong} of 4 views" in message for message in messages)
     assert not any("no camera has" in message for message in messages)

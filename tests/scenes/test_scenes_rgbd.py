@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from rgbd_folders import redwood, scannet, tum
-from scenes_workspace import HEIGHT, WIDTH, pose_matrix, ramp, save, sevenscenes
+from scenes_workspace import HEIGHT, WIDTH, messages, pose_matrix, ramp, save, sevenscenes
 from scipy.spatial.transform import Rotation
 
 from gvtools.cameras import rigid_poses
@@ -17,11 +17,6 @@ from gvtools.scenes.images import read_depth
 from gvtools.scenes.project import open_project
 from gvtools.scenes.rgbd import RgbdOptions
 from gvtools.scenes.rgbd_layouts import PUBLISHED, REDWOOD, SCANNET, SEVENSCENES, TUM
-
-
-def messages(scene):
-    return " | ".join(finding.message for finding in scene.findings)
-
 
 # --- 7-Scenes ---------------------------------------------------------------------------------
 

@@ -13,6 +13,7 @@ from scenes_workspace import (
     PINHOLE,
     WIDTH,
     frame,
+    messages,
     pose_matrix,
     ramp,
     save,
@@ -25,10 +26,6 @@ from gvtools.scenes.project import open_project
 from gvtools.scenes.selection import select
 from gvtools.scenes.transforms import read_transforms, read_transforms_cameras, write_transforms
 from pipelines.cli import main
-
-
-def messages(scene):
-    return " | ".join(finding.message for finding in scene.findings)
 
 
 def test_opengl_axes_names_and_order(tmp_path):

@@ -22,6 +22,7 @@ from data_sets.miniature import Expected, Miniature, compare, layout_named, mini
 from data_sets.miniature import read_miniature as read
 from data_sets.room_frames import room_frames
 from PIL import Image
+from scenes_workspace import messages
 
 from gvtools.errors import OptionError, ProjectError
 from gvtools.scenes.data_sets.aria import aria_lens
@@ -33,7 +34,7 @@ from gvtools.scenes.data_sets.catalogue import (
 )
 from gvtools.scenes.data_sets.hypersim import read_color, turned_pinhole
 from gvtools.scenes.images import read_frame
-from gvtools.scenes.scene import Scene, natural_key
+from gvtools.scenes.scene import natural_key
 
 ALL = miniatures()
 PARTIAL = [miniature for miniature in ALL if miniature.pictures]
@@ -154,10 +155,6 @@ def test_a_wrong_spec_is_named() -> None:
 def test_an_unknown_name_has_a_hint() -> None:
     with pytest.raises(OptionError, match="did you mean 'scannetppv2'"):
         load_spec("ScanNet++")
-
-
-def messages(scene: Scene) -> str:
-    return "\n".join(finding.message for finding in scene.findings)
 
 
 # --- RealEstate10K ----------------------------------------------------------------------------
