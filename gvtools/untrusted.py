@@ -83,6 +83,12 @@ def reading(
         raise ProjectError(f"{where}: {_reason(error, str(where))}; {advice}") from None
 
 
+def expect(holds: object, found: str) -> None:
+    """Within ``reading``: what does not hold makes the content unreadable, in these words."""
+    if not holds:
+        raise ValueError(found)
+
+
 def _reason(error: Exception, where: str) -> str:
     if isinstance(error, FileNotFoundError):
         return "no such file"

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -31,7 +32,7 @@ from gvtools.files import replaced_when_written
 from gvtools.runs.layout import context_depth, target_stems
 from gvtools.runs.target_files import write_png
 from gvtools.scenes.scene import Frame, Scene, View
-from gvtools.untrusted import load_arrays
+from gvtools.untrusted import expect, load_arrays
 
 # Errors of a damaged file.
 UNREADABLE = (OSError, EOFError, ValueError, KeyError, BadZipFile, zlib.error)
@@ -50,13 +51,11 @@ def read_context_depth(path: Path, size: tuple[int, ...]) -> tuple[DepthMap, str
     stored = load_arrays(path, "depth", "confidence", "source", "failed")
     for name in ("depth", "confidence"):
         array = stored[name]
-        if array.dtype != np.float32 or not np.isfinite(array).all() or (array < 0).any():
-            raise ValueError(f"{name} of type {array.dtype}, or not finite, or negative")
+        sound = array.dtype == np.float32 and np.isfinite(array).all() and not (array < 0).any()
+        expect(sound, f"{name} of type {array.dtype}, or not finite, or negative")
     depth_map = DepthMap(stored["depth"], stored["confidence"], str(stored["source"]))
-    failed = str(stored["failed"])
-    if depth_map.depth.shape != size:
-        raise ValueError(f"depth of {depth_map.depth.shape}, picture of {size}")
-    return depth_map, failed
+    expect(depth_map.depth.shape == size, f"depth of {depth_map.depth.shape}, picture of {size}")
+    return depth_map, str(stored["failed"])
 
 
 def write_context_depth(
@@ -157,23 +156,12 @@ class DepthCache:
 def depth_report(scene: Scene, name: str, depth_map: DepthMap) -> dict[str, Any]:
     """What a view's depth covers, and whether it has the scale of the sparse points."""
     fit = scale_to_points(scene, name, depth_map.depth)
-    report: dict[str, Any] = {
+    return {
         "view": name,
         "source": depth_map.source,
         "known": float((depth_map.depth > 0).mean()),
-        "scale": None,
+        "scale": None if fit is None else {**asdict(fit), "disagrees": disagrees(fit)},
     }
-    if fit is not None:
-        report["scale"] = {
-            "status": fit.status,
-            "scale": fit.scale,
-            "inliers": fit.inliers,
-            "inlier_share": fit.inlier_share,
-            "residual": fit.residual,
-            "support": fit.support,
-            "disagrees": disagrees(fit),
-        }
-    return report
 
 
 def colored(depth: NDArray[np.float32]) -> NDArray[np.uint8]:

@@ -15,7 +15,7 @@ from gvtools.cameras import Cameras, rigid_transform
 from gvtools.errors import MemoryFileError, ShapeError
 from gvtools.runs.layout import APPEARANCE, POSES, round_folder
 from gvtools.scenes.scene import Scene
-from gvtools.untrusted import load_arrays
+from gvtools.untrusted import expect, load_arrays
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,8 +66,8 @@ class RunPoses:
 
 def _rigid(poses: NDArray[Any], name: str) -> NDArray[np.float64]:
     """(N, 4, 4) finite poses, as they are."""
-    if poses.ndim != 3 or poses.shape[1:] != (4, 4) or poses.dtype != np.float64:
-        raise ValueError(f"{name} of shape {poses.shape} and type {poses.dtype}")
+    stacked = poses.ndim == 3 and poses.shape[1:] == (4, 4) and poses.dtype == np.float64
+    expect(stacked, f"{name} of shape {poses.shape} and type {poses.dtype}")
     for pose in poses:
         rigid_transform(pose, what=name)
     return poses

@@ -343,18 +343,15 @@ def read_record(path: Path) -> dict[str, Any]:
         record: dict[str, Any] = read_json(file)
         _Record.model_validate(record)
         _Settings.model_validate(resolved_settings(record))
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise _version_error(file, f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise _version_error(file, repr(error)) from None
+        reason = repr(error)
+        if isinstance(error, ValidationError):
+            first = error.errors()[0]
+            reason = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+        raise ProjectError(
+            f"{file}: no record of a run of this version ({reason}); run reconstruct again"
+        ) from None
     return record
-
-
-def _version_error(file: Path, reason: str) -> ProjectError:
-    return ProjectError(
-        f"{file}: no record of a run of this version ({reason}); run reconstruct again"
-    )
 
 
 def resolved_settings(record: Mapping[str, Any]) -> dict[str, Any]:

@@ -28,7 +28,7 @@ from gvtools.runs.layout import (
     target_stems,
 )
 from gvtools.scenes.images import UNREADABLE
-from gvtools.untrusted import load_arrays, open_picture, read_json
+from gvtools.untrusted import expect, load_arrays, open_picture, read_json
 
 if TYPE_CHECKING:
     from gvtools.completers.base import Completion
@@ -102,11 +102,12 @@ def read_target(folder: Path, entry: Mapping[str, Any]) -> TargetFiles:
         scale = np.float32(1 if scale is None or scale != scale else scale)
         maps = [depth] if confidence is None else [depth, confidence]
         shapes = {support.shape, picture.shape[:2], *(array.shape for array in maps)}
-        if shapes != {(int(camera.height[0]), int(camera.width[0]))} or picture.shape[2:] != (3,):
-            raise ValueError(f"pictures and depth of shapes {sorted(shapes)}")
+        alike = shapes == {(int(camera.height[0]), int(camera.width[0]))}
+        colored = picture.shape[2:] == (3,)
+        expect(alike and colored, f"pictures and depth of shapes {sorted(shapes)}")
         sound = all(array.dtype.kind == "f" and np.isfinite(array).all() for array in maps)
-        if not sound or depth.dtype != np.float32 or (depth < 0).any() or not 0 < scale < np.inf:
-            raise ValueError(f"depth or confidence not finite, depth negative, or scale {scale}")
+        sound &= depth.dtype == np.float32 and not (depth < 0).any() and 0 < scale < np.inf
+        expect(sound, f"depth or confidence not finite, depth negative, or scale {scale}")
     except (*UNREADABLE, ShapeError) as error:
         raise ProjectError(
             f"{folder}: the target {entry.get('name', '?')} cannot be read ({error!r}); expected a "

@@ -15,7 +15,7 @@ from gvtools.cameras import rigid_poses
 from gvtools.errors import ProjectError
 from gvtools.scenes.scene import Finding
 from gvtools.scenes.undistort import LensParameters, camera_of
-from gvtools.untrusted import load_array, parse_yaml, read_json, read_text, reading
+from gvtools.untrusted import expect, load_array, parse_yaml, read_json, read_text, reading
 
 Float64 = NDArray[np.float64]
 
@@ -41,10 +41,8 @@ def number_table(path: Path, columns: int, *, skip: int = 0, required: bool = Fa
     with reading(path, f"expected {columns} numbers in each row; download it again"):
         rows = [line.split() for line in read_text(path).splitlines()[skip:] if line.strip()]
         for number, row in enumerate(rows, start=1):
-            if len(row) != columns:
-                raise ValueError(f"row {number} of {len(rows)} has {len(row)} numbers")
-        if required and not rows:
-            raise ValueError("no rows")
+            expect(len(row) == columns, f"row {number} of {len(rows)} has {len(row)} numbers")
+        expect(rows or not required, "no rows")
         return np.array(rows, np.float64).reshape(-1, columns)
 
 
@@ -58,8 +56,7 @@ def load_matrix(path: Path, *shapes: tuple[int, int]) -> Float64:
         by_size = {rows * columns: (rows, columns) for rows, columns in shapes}
         if max(matrix.shape, default=0) == matrix.size in by_size:
             matrix = matrix.reshape(by_size[matrix.size])
-        if matrix.shape not in shapes:
-            raise ValueError(f"{'x'.join(str(length) for length in matrix.shape)} numbers")
+        expect(matrix.shape in shapes, f"{'x'.join(map(str, matrix.shape))} numbers")
         return matrix.astype(np.float64)
 
 

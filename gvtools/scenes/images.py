@@ -28,6 +28,7 @@ from gvtools.untrusted import (
     DAMAGED,
     UNPACKED_BYTES,
     UNPACKED_RATIO,
+    expect,
     load_array,
     load_arrays,
     open_picture,
@@ -288,8 +289,8 @@ def _colmap_head(path: Path) -> tuple[int, int, int]:
             raise ValueError("no COLMAP depth map")
         width, height, channels = (int(group) for group in head.groups())
         size, expected = path.stat().st_size, head.end() + 4 * width * height * channels
-        if channels != 1 or size != expected:
-            raise ValueError(f"{width}x{height}x{channels} in {size} bytes, not {expected}")
+        told = f"{width}x{height}x{channels} in {size} bytes, not {expected}"
+        expect(channels == 1 and size == expected, told)
         return width, height, head.end()
 
 
@@ -498,8 +499,7 @@ def read_pfm_depth(path: Path, *, unit: float = 1.0) -> Depth:
             kind = file.readline().split()
             width, height = (int(word) for word in file.readline().split())
             dtype = np.dtype("<f4" if float(file.readline()) < 0 else ">f4")
-            if kind != [b"Pf"]:
-                raise ValueError(f"it begins with {kind}, not with Pf")
+            expect(kind == [b"Pf"], f"it begins with {kind}, not with Pf")
             values = np.frombuffer(file.read(width * height * 4), dtype).reshape(height, width)
         return readings(values[::-1], unit=unit)
 

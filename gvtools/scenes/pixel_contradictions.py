@@ -21,7 +21,8 @@ from gvtools.errors import GvError
 from gvtools.scenes.matching import named
 from gvtools.scenes.scene import Finding, Frame, Scene, SparsePoints
 
-Grey, Float64 = NDArray[np.float32], NDArray[np.float64]
+Grey = NDArray[np.float32]
+Float64 = NDArray[np.float64]
 
 # A view with so many tracks in common with others is judged, and disagrees below this correlation.
 # On real scenes it is 0.92 and more, with noisy detections of fine texture 0.67; renumbered or

@@ -53,7 +53,7 @@ from gvtools.scenes.rgbd import (
 from gvtools.scenes.scene import Finding, counted
 from gvtools.scenes.undistort import LensParameters
 from gvtools.trajectory_files import in_seconds, read_poses
-from gvtools.untrusted import read_json, read_text, reading
+from gvtools.untrusted import expect, read_json, read_text, reading
 
 
 class _SevenScenes(RgbdFolder):
@@ -421,8 +421,7 @@ def read_log(path: Path) -> tuple[list[int], list[Float64]]:
     """The first integers and (4, 4) matrices of a ``.log`` trajectory's blocks, as read."""
     with reading(path, "expected blocks of three integers and four lines of four numbers"):
         words = read_text(path).split()
-        if len(words) % 19:
-            raise ValueError(f"{len(words)} numbers, not 19 a block")
+        expect(len(words) % 19 == 0, f"{len(words)} numbers, not 19 a block")
         blocks = np.array(words, np.float64).reshape(-1, 19)
         return [int(word) for word in words[::19]], list(blocks[:, 3:].reshape(-1, 4, 4))
 

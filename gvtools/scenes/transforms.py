@@ -42,7 +42,7 @@ from gvtools.scenes.scene import Finding, Scene, natural_key
 from gvtools.scenes.selection import select
 from gvtools.scenes.undistort import PANORAMA, LensParameters, Undistortion, perspective_views
 from gvtools.trajectory_files import read_trajectory
-from gvtools.untrusted import is_file, read_json, reading
+from gvtools.untrusted import expect, is_file, read_json, reading
 
 FILE = "transforms.json"
 # The files of Blender's synthetic scenes, one a split; a picture of several belongs to the first.
@@ -315,8 +315,8 @@ def load_frames(path: Path) -> dict[str, Any]:
     with reading(path, "expected a transforms.json"):
         data = read_json(path)
         frames = data.get("frames") if isinstance(data, dict) else None
-        if not (isinstance(frames, list) and frames and all(isinstance(f, dict) for f in frames)):
-            raise ValueError("no list of frames")
+        listed = isinstance(frames, list) and frames and all(isinstance(f, dict) for f in frames)
+        expect(listed, "no list of frames")
         return data
 
 
@@ -350,8 +350,7 @@ def _names(files: Sequence[Path]) -> list[str]:
 def _pose(keys: FrameKeys, what: str) -> Float64:
     """world_from_cam with OpenCV axes, of any shape and as the file has it otherwise."""
     with reading(what, "expected a transform_matrix of 4x4 numbers"):
-        if keys.transform_matrix is None:
-            raise ValueError("no transform_matrix")
+        expect(keys.transform_matrix is not None, "no transform_matrix")
         pose = np.array(keys.transform_matrix, np.float64)
     pose = pose.reshape(4, 4) if pose.shape == (16,) else pose
     return pose * np.diag(OPENCV_FROM_OPENGL) if pose.shape[-1:] == (4,) else pose

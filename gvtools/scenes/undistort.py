@@ -28,7 +28,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from gvtools.cameras import rigid_poses
 from gvtools.errors import ProjectError
-from gvtools.untrusted import reading
+from gvtools.untrusted import expect, reading
 
 if TYPE_CHECKING:
     import pycolmap
@@ -218,8 +218,8 @@ def undistortion(
         return Undistortion(camera, target, True)
     with reading(f"{what}: {model} {list(params)}", "expected a lens that can be undistorted"):
         target = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
-        if _impossible(target):
-            raise ValueError(f"what results {_impossible(target)}; solve or export it again")
+        wrong = _impossible(target)
+        expect(not wrong, f"what results {wrong}; solve or export it again")
     return Undistortion(camera, target, False)
 
 

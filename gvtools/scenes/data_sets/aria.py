@@ -31,7 +31,7 @@ from gvtools.scenes.matching import pose_at, scenes_holding
 from gvtools.scenes.photographs import Depth, PosedFrame, posed_scene
 from gvtools.scenes.scene import Finding, Frame, Scene
 from gvtools.scenes.undistort import Undistortion, camera_of
-from gvtools.untrusted import read_json, read_text, reading
+from gvtools.untrusted import expect, read_json, read_text, reading
 
 VIDEO, TRAJECTORY, DEPTH = "video.vrs", "aria_trajectory.csv", "depth_images.vrs"
 METADATA = ("metadata.json", "gt-metadata.json")
@@ -78,8 +78,7 @@ def read_trajectory(path: Path, *, version: str) -> tuple[Float64, Float64]:
     with reading(path, "expected a head, 20 columns and a pose in each row; copy it again"):
         rows = list(csv.reader(read_text(path).splitlines()))[1:]
         values = np.array([[row[1], *row[3:10]] for row in rows if row], np.float64)
-        if not len(values):
-            raise ValueError("no pose")
+        expect(len(values), "no pose")
     values = values[np.argsort(values[:, 0], kind="stable")]
     quaternions = values[:, 4:]
     if version != FIRST_VERSION:
@@ -177,8 +176,7 @@ def _provider(path: Path) -> Any:
     """What reads a VRS file; opening one reads its whole index."""
     with reading(path, "expected a VRS file; copy it again"):
         provider = _tools().data_provider.create_vrs_data_provider(str(path))
-        if provider is None:
-            raise ValueError("no recording")
+        expect(provider is not None, "no recording")
     return provider
 
 

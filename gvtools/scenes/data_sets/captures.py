@@ -37,7 +37,7 @@ from gvtools.scenes.rgbd import RgbdOptions, rgbd_scene
 from gvtools.scenes.rgbd_layouts import SCANNET, SCANNET_FOLDER, SEVENSCENES, SEVENSCENES_FOLDER
 from gvtools.scenes.scene import Finding, Frame, Scene, counted
 from gvtools.scenes.undistort import LensParameters
-from gvtools.untrusted import read_text, reading, regular
+from gvtools.untrusted import expect, read_text, reading, regular
 
 # --- 7-Scenes as published: ``SCENE/seq-NN/frame-NNNNNN.{color.png, depth.png, pose.txt}`` ------
 
@@ -139,8 +139,7 @@ class SensFile:
         with reading(path, "expected a .sens file; copy it again"):
             with regular(path).open("rb") as file:
                 (version,) = _unpack(file, "<I")
-                if version != VERSION:
-                    raise ValueError(f"version {version}, not {VERSION}")
+                expect(version == VERSION, f"version {version}, not {VERSION}")
                 (length,) = _unpack(file, "<Q")
                 file.seek(length, io.SEEK_CUR)
                 matrices = np.array(_unpack(file, "<64f")).reshape(4, 4, 4)
@@ -148,11 +147,11 @@ class SensFile:
                 shift, count = _unpack(file, "<fQ")
                 frames = _sens_index(file, count, path.stat().st_size)
             known = color_code in (PNG, JPEG) and depth_code in (ZLIB_USHORT, RAW_USHORT)
-            if not (known and shift > 0):
-                raise ValueError(
-                    f"colour and depth of compression {color_code} and {depth_code}, {shift:g} "
-                    "steps a metre; expected PNG or JPEG, zlib or none, more than 0"
-                )
+            expect(
+                known and shift > 0,
+                f"colour and depth of compression {color_code} and {depth_code}, {shift:g} "
+                "steps a metre; expected PNG or JPEG, zlib or none, more than 0",
+            )
         color_size, depth_size = (sizes[0], sizes[1]), (sizes[2], sizes[3])
         return SensFile(
             matrices, color_size, depth_size, depth_code, 1.0 / shift, count, tuple(frames)
@@ -329,8 +328,7 @@ def _named_numbers(path: Path, columns: int) -> dict[str, Float64]:
             if not words or line.startswith("#"):
                 continue
             values = np.array(words[1:], np.float64)
-            if len(values) != columns:
-                raise ValueError(f"{words[0]} has {len(values)} numbers")
+            expect(len(values) == columns, f"{words[0]} has {len(values)} numbers")
             rows[words[0].replace("\\", "/")] = values
     return rows
 

@@ -9,9 +9,10 @@ picture's corner.
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -33,12 +34,11 @@ SUFFIX = "_cam.txt"
 CENTRED = 0.2
 
 
-@dataclass(frozen=True, eq=False)
-class MvsCamera:
-    """A camera as stored: pixels, and the stored unit."""
+class MvsCamera(NamedTuple):
+    """A camera as stored: (3, 3) K, pixels, and (4, 4) cam_from_world in the stored unit."""
 
-    K: Float64  # (3, 3)
-    cam_from_world: Float64  # (4, 4)
+    K: Float64
+    cam_from_world: Float64
 
     def frame(
         self, image: Path, *, sizes: tuple[tuple[int, int], ...], unit: float = 1.0

@@ -33,7 +33,7 @@ from gvtools.scenes.scene import Finding, Scene
 from gvtools.scenes.transforms import FILE as TRANSFORMS
 from gvtools.scenes.transforms import transforms_frames
 from gvtools.scenes.undistort import Undistortion
-from gvtools.untrusted import is_file, load_array, read_json, reading, regular
+from gvtools.untrusted import expect, is_file, load_array, read_json, reading, regular
 
 FULL = "images"
 
@@ -135,11 +135,10 @@ def _llff(root: Path, scene: str) -> Scene:
     path = folder / POSES_BOUNDS
     with reading(path, "expected an array of N x 17 numbers; copy it again"):
         rows = load_array(path).astype(np.float64)
-        if rows.ndim != 2 or rows.shape[1] != 17:
-            raise ValueError(f"shape {rows.shape}")
+        expect(rows.ndim == 2 and rows.shape[1] == 17, f"shape {rows.shape}")
         rows = rows[:, :15].reshape(-1, 3, 5)
-        if not np.isfinite(rows[..., 4]).all():
-            raise ValueError("a picture's size or focal length is not finite")
+        sound = np.isfinite(rows[..., 4]).all()
+        expect(sound, "a picture's size or focal length is not finite")
     frames = []
     for row, file in zip(rows, _llff_files(folder, home, len(rows)), strict=True):
         height, width, focal = (float(value) for value in row[:, 4])
@@ -280,8 +279,7 @@ def read_raw_depth(path: Path, *, size: tuple[int, int], lens: Undistortion | No
     width, height = size
     with reading(path, f"expected floats of the original camera's size in {ORIGINAL}; copy again"):
         values = np.fromfile(regular(path), "<f4")
-        if values.size != width * height:
-            raise ValueError(f"{values.size} floats, not {width} x {height}")
+        expect(values.size == width * height, f"{values.size} floats, not {width} x {height}")
     depth = readings(values.reshape(height, width))
     return depth if lens is None else np.ascontiguousarray(lens.nearest(depth))
 
@@ -346,8 +344,8 @@ def _read_iphone(folder: Path) -> Scene:
         )
     with reading(folder / IPHONE_POSES, "expected a record for each frame; copy it again"):
         records = read_json(folder / IPHONE_POSES)
-        if not all(isinstance(record, dict) for record in records.values()):
-            raise ValueError("values that are no records")
+        sound = all(isinstance(record, dict) for record in records.values())
+        expect(sound, "values that are no records")
     size = first_size(home / f"{name}.jpg" for name in records) or (1920, 1440)
     frames, reader = [], partial(read_depth, unit=MILLIMETRES)
     for name, record in records.items():
