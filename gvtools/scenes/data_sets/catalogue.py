@@ -217,12 +217,8 @@ def open_scenes(address: str, root: Path | None) -> SceneCollection:
     if scene is not None:
         opened = open_data_set(key, scene, folder)
         return replace(of_scenes([opened], title=f"{spec.name} {scene}".strip()), data_set=key)
-    names, read = scenes_of(key, folder), partial(_read_named, key, root=folder)
+    names, read = scenes_of(key, folder), partial(read_scene, spec, root=folder)
     return SceneCollection(spec.name, names, read, None, digest(list(names)), key)
-
-
-def _read_named(data_set: str, scene: str, *, root: Path) -> Scene:
-    return read_scene(load_spec(data_set), scene, root)
 
 
 def chosen_scenes(name: str, root: Path, scenes: Sequence[str] = ()) -> tuple[str, ...]:
