@@ -43,7 +43,7 @@ from gvtools.scenes.images import (
     white_of_pictures,
 )
 from gvtools.scenes.matching import named, pictures_in
-from gvtools.scenes.scene import Finding, Frame, Scene, View, natural_key
+from gvtools.scenes.scene import Finding, Frame, Scene, View, counted, natural_key
 from gvtools.scenes.undistort import LensParameters, Undistortion, perspective_views, undistortion
 from gvtools.untrusted import named_file
 
@@ -211,9 +211,8 @@ def posed_scene(
     unmasked = [frame.name for frame in read if frame.mask and not sieve.present(frame.mask)]
     without = [frame.name for frame in read if measured and not sieve.present(frame.depth)]
     for noun, missing in (("mask", unmasked), ("depth map", without)):
-        if missing:
-            line = f"{len(missing)} of {len(read)} frames have no {noun} ({named(missing)})"
-            report.append(Finding("warning", line))
+        line = f"of {len(read)} frames have no {noun} ({named(missing)})"
+        report += counted(len(missing), line)
     photographs.sort(key=lambda item: natural_key(item.name))
     report += lens_findings([item.lens for item in photographs])
     report += mask_findings([item.frame for item in photographs])

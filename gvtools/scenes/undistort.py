@@ -18,9 +18,9 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -209,13 +209,8 @@ def undistortion(
             "perspective model; give the panoramas as a COLMAP or transforms.json project"
         )
     if camera.is_perspective_pinhole() and camera.is_undistorted():
-        target = pycolmap.Camera(
-            model="PINHOLE",
-            width=camera.width,
-            height=camera.height,
-            params=camera.calibration_matrix()[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(),
-        )
-        return Undistortion(camera, target, True)
+        K = camera.calibration_matrix()[[0, 1, 0, 1], [0, 1, 2, 2]]
+        return Undistortion(camera, pinhole_camera(K, (camera.width, camera.height)), True)
     with reading(f"{what}: {model} {list(params)}", "expected a lens that can be undistorted"):
         target = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
         wrong = _impossible(target)
@@ -437,8 +432,8 @@ def perspective_views(
     of the faces that they show, cut to the part that they show. All others stay one view.
     Parameters are COLMAP's; ``what`` says where the camera was read.
     """
+    camera = camera_of(model, params, size, what=what)
     if model == PANORAMA:
-        camera = camera_of(model, params, size, what=what)
         if size[0] != 2 * size[1]:
             raise ProjectError(
                 f"{what}: a panorama of {size[0]}x{size[1]}; expected twice as wide as high, all "
@@ -446,7 +441,6 @@ def perspective_views(
             )
         return panorama_faces(camera)
     if model in WIDE:
-        camera = camera_of(model, params, size, what=what)
         across, limit = field_of_view(camera)
         if across > WIDEST:
             return _fisheye_faces(camera, limit)
@@ -457,7 +451,8 @@ def panorama_faces(camera: pycolmap.Camera, *, degrees: float = 90.0) -> tuple[F
     """The six faces of an equirectangular camera, as fine in the middle as its equator."""
     across = math.tan(math.radians(degrees / 2))
     half = max(1, round(camera.width / (2 * math.pi) * across))
-    target = _pinhole(half / across, (2 * half, 2 * half), (half, half))
+    focal = half / across
+    target = pinhole_camera((focal, focal, half, half), (2 * half, 2 * half))
     return tuple(Face(camera, target, False, face=face, rotation=face_rotation(face))
                  for face in DIRECTIONS)  # fmt: skip
 
@@ -465,31 +460,27 @@ def panorama_faces(camera: pycolmap.Camera, *, degrees: float = 90.0) -> tuple[F
 def _fisheye_faces(camera: pycolmap.Camera, limit: float) -> tuple[Face, ...]:
     """Faces of 90 degrees of a fisheye camera, each cut to what the picture shows of it."""
     half = max(1, round(_focal(camera)))
-    whole = _pinhole(float(half), (2 * half, 2 * half), (half, half))
+    whole = pinhole_camera((half, half, half, half), (2 * half, 2 * half))
     faces = []
     for name in DIRECTIONS:
-        face = Face(camera, whole, False, face=name, limit=limit, rotation=face_rotation(name))
-        seen = face._source_pixel >= 0
+        turned = partial(Face, face=name, limit=limit, rotation=face_rotation(name))
+        seen = turned(camera, whole, False)._source_pixel >= 0
         if seen.mean() < LEAST_SEEN:
             continue
         rows, columns = np.flatnonzero(seen.any(1)), np.flatnonzero(seen.any(0))
         top, left = int(rows[0]), int(columns[0])
         cut = int(columns[-1]) + 1 - left, int(rows[-1]) + 1 - top
-        target = _pinhole(float(half), cut, (half - left, half - top))
-        faces.append(
-            Face(camera, target, False, face=name, limit=limit, rotation=face_rotation(name))
-        )
+        target = pinhole_camera((half, half, half - left, half - top), cut)
+        faces.append(turned(camera, target, False))
     return tuple(faces)
 
 
-def _pinhole(
-    focal: float, size: tuple[int, int], principal: tuple[float, float]
-) -> pycolmap.Camera:
+def pinhole_camera(params: Iterable[float], size: tuple[int, int]) -> pycolmap.Camera:
+    """A camera of fx, fy, cx, cy, pixels."""
     from gvtools.colmap import pycolmap
 
-    return pycolmap.Camera(
-        model="PINHOLE", width=size[0], height=size[1], params=[focal, focal, *principal]
-    )
+    values = [float(value) for value in params]
+    return pycolmap.Camera(model="PINHOLE", width=size[0], height=size[1], params=values)
 
 
 def _focal(camera: pycolmap.Camera) -> float:

@@ -30,7 +30,7 @@ from gvtools.scenes.layout import Layout
 from gvtools.scenes.matching import pose_at, scenes_holding
 from gvtools.scenes.photographs import Depth, PosedFrame, posed_scene
 from gvtools.scenes.scene import Finding, Frame, Scene
-from gvtools.scenes.undistort import Undistortion, camera_of
+from gvtools.scenes.undistort import Undistortion, camera_of, pinhole_camera
 from gvtools.untrusted import expect, read_json, read_text, reading
 
 VIDEO, TRAJECTORY, DEPTH = "video.vrs", "aria_trajectory.csv", "depth_images.vrs"
@@ -112,12 +112,9 @@ class AriaLens(Undistortion):
 
 def aria_lens(params: Sequence[float], size: tuple[int, int], radius: float) -> AriaLens:
     """The lens of Aria's FISHEYE624 parameters, pixels, whose first pixel's centre is (0, 0)."""
-    from gvtools.colmap import pycolmap
-
     focal, cx, cy, *distortion = params
     fisheye = (focal, focal, cx + 0.5, cy + 0.5, *distortion)
-    pinhole = [focal, focal, size[0] / 2, size[1] / 2]
-    target = pycolmap.Camera(model="PINHOLE", width=size[0], height=size[1], params=pinhole)
+    target = pinhole_camera((focal, focal, size[0] / 2, size[1] / 2), size)
     source = camera_of(FISHEYE, fisheye, size, what="Aria's colour camera")
     return AriaLens(source, target, False, radius)
 
@@ -152,15 +149,11 @@ def read_rgb(path: Path, *, index: int) -> Frame:
 
 def read_rgb_depth(path: Path, *, time: int) -> Depth:
     """The depth map of a picture of the colour camera: the nearest in time, nanoseconds."""
-    tools, provider = _tools(), _provider(path)
+    sensors, provider = _tools().sensor_data, _provider(path)
     for stream in provider.get_all_streams():
         if provider.get_image_configuration(stream).description == RGB_STREAM:
-            data, _ = provider.get_image_data_by_time_ns(
-                stream,
-                time,
-                tools.sensor_data.TimeDomain.DEVICE_TIME,
-                tools.sensor_data.TimeQueryOptions.CLOSEST,
-            )
+            clock, nearest = sensors.TimeDomain.DEVICE_TIME, sensors.TimeQueryOptions.CLOSEST
+            data, _ = provider.get_image_data_by_time_ns(stream, time, clock, nearest)
             return readings(_array(data, path), unit=MILLIMETRES)
     raise ProjectError(f"{path}: no stream of {RGB_STREAM}; copy it again")
 
