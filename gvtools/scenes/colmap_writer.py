@@ -14,6 +14,7 @@ from gvtools.cameras import Cameras
 from gvtools.errors import ProjectError
 from gvtools.files import full_disk
 from gvtools.scenes.colmap_model import CAMERAS, checked_suffix
+from gvtools.scenes.undistort import pinhole_camera
 
 if TYPE_CHECKING:
     import pycolmap
@@ -81,12 +82,8 @@ def build_reconstruction(
     keypoint = np.empty(len(order), np.int64)
     keypoint[order] = np.arange(len(order)) - start[view_index[order]]
     for i, name in enumerate(cameras.names):
-        image = pycolmap.Image(
-            name=name,
-            keypoints=xy[order[start[i] : start[i + 1]]],
-            camera_id=camera_ids[i],
-            image_id=i + 1,
-        )
+        seen = xy[order[start[i] : start[i + 1]]]
+        image = pycolmap.Image(name=name, keypoints=seen, camera_id=camera_ids[i], image_id=i + 1)
         model.add_image_with_trivial_frame(
             image, pycolmap.Rigid3d(np.ascontiguousarray(cameras.cam_from_world[i, :3]))
         )
@@ -103,22 +100,14 @@ def build_reconstruction(
 
 
 def _add_cameras(model: pycolmap.Reconstruction, cameras: Cameras) -> list[int]:
-    from gvtools.colmap import pycolmap
-
     known: dict[tuple[float, ...], int] = {}
     ids = []
     for K, width, height in zip(cameras.K, cameras.width, cameras.height, strict=True):
         key = (K[0, 0], K[1, 1], K[0, 2], K[1, 2], int(width), int(height))
         if key not in known:
             known[key] = len(known) + 1
-            model.add_camera_with_trivial_rig(
-                pycolmap.Camera(
-                    model="PINHOLE",
-                    width=int(width),
-                    height=int(height),
-                    params=[float(value) for value in key[:4]],
-                    camera_id=known[key],
-                )
-            )
+            camera = pinhole_camera(key[:4], (int(width), int(height)))
+            camera.camera_id = known[key]
+            model.add_camera_with_trivial_rig(camera)
         ids.append(known[key])
     return ids

@@ -266,13 +266,9 @@ def _depth(scene: Scene, opened: list[_Opened]) -> DepthSummary | None:
     ranges = np.array([item.range for item in opened if item.valid]).reshape(-1, 3)
     if not len(ranges):
         return DepthSummary(views, 0.0 if pixels else None, None, None, None)
-    return DepthSummary(
-        views,
-        sum(item.valid for item in opened) / pixels,
-        float(ranges[:, 0].min()),
-        float(np.median(ranges[:, 1])),
-        float(ranges[:, 2].max()),
-    )
+    low, median, high = ranges[:, 0].min(), np.median(ranges[:, 1]), ranges[:, 2].max()
+    coverage = sum(item.valid for item in opened) / pixels
+    return DepthSummary(views, coverage, float(low), float(median), float(high))
 
 
 # --- poses that contradict each other -------------------------------------------------------------

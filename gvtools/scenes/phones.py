@@ -391,12 +391,8 @@ def _lzfse_depth(path: Path, *, confidence: Path | None, shape: tuple[int, int])
 
 
 def _unpacked(path: Path, dtype: str, *, shape: tuple[int, int]) -> NDArray[Any]:
-    lzfse = require(
-        "lzfse",
-        extra="phones",
-        purpose=f"{path}: depth compressed by LZFSE",
-        instead="or export EXR and JPG",
-    )
+    purpose = f"{path}: depth compressed by LZFSE"
+    lzfse = require("lzfse", extra="phones", purpose=purpose, instead="or export EXR and JPG")
     expected = f"expected {shape[0]}x{shape[1]} values by LZFSE; {AGAIN}"
     with reading(path, expected, also=(lzfse.error,)):
         return np.frombuffer(lzfse.decompress(read_bytes(path)), dtype).reshape(shape)

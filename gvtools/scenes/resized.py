@@ -127,11 +127,6 @@ def _with_tracks(points: SparsePoints, keep: NDArray[np.bool_], *, least: int) -
     known = counts >= least
     keep = keep & known[points.point_index]
     number = np.cumsum(known) - 1
-    return SparsePoints(
-        points.positions[known],
-        points.colors[known],
-        points.errors[known],
-        number[points.point_index[keep]].astype(np.int32),
-        points.view_index[keep],
-        points.xy[keep],
-    )
+    index = number[points.point_index[keep]].astype(np.int32)
+    kept = points.positions[known], points.colors[known], points.errors[known]
+    return SparsePoints(*kept, index, points.view_index[keep], points.xy[keep])

@@ -59,6 +59,7 @@ FISHEYE = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE
 OF_A_FRAME = ("transform_matrix", "mask_path", "depth_file_path", "depth_path")
 # What tells the focal length along an axis: pixels, or a field of view in radians or degrees.
 FOCAL = {axis: (f"fl_{axis}", f"camera_angle_{axis}", f"{axis}_fov") for axis in "xy"}
+LENS = ("fl_x", "fl_y", "cx", "cy")
 DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 # Of models that are not read.
 FURTHER = ("k5", "k6", "p3", "p4", "b1", "b2")
@@ -279,10 +280,7 @@ def write_transforms(
         K, pose = cameras.K[i], cameras.world_from_cam[i] @ OPENCV_FROM_OPENGL
         frame: dict[str, Any] = {
             "file_path": _relative(image, path.parent),
-            "fl_x": K[0, 0],
-            "fl_y": K[1, 1],
-            "cx": K[0, 2],
-            "cy": K[1, 2],
+            **dict(zip(LENS, K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(), strict=True)),
             "w": int(cameras.width[i]),
             "h": int(cameras.height[i]),
             "transform_matrix": pose.tolist(),
