@@ -105,9 +105,11 @@ def read_target(folder: Path, entry: Mapping[str, Any]) -> TargetFiles:
         alike = shapes == {(int(camera.height[0]), int(camera.width[0]))}
         colored = picture.shape[2:] == (3,)
         expect(alike and colored, f"pictures and depth of shapes {sorted(shapes)}")
-        sound = all(array.dtype.kind == "f" and np.isfinite(array).all() for array in maps)
-        sound &= depth.dtype == np.float32 and not (depth < 0).any() and 0 < scale < np.inf
-        expect(sound, f"depth or confidence not finite, depth negative, or scale {scale}")
+        finite = all(array.dtype.kind == "f" and np.isfinite(array).all() for array in maps)
+        sound = depth.dtype == np.float32 and not (depth < 0).any() and 0 < scale < np.inf
+        expect(
+            finite and sound, f"depth or confidence not finite, depth negative, or scale {scale}"
+        )
     except (*UNREADABLE, ShapeError) as error:
         raise ProjectError(
             f"{folder}: the target {entry.get('name', '?')} cannot be read ({error!r}); expected a "

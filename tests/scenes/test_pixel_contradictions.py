@@ -9,11 +9,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from scenes_workspace import sparse_points
 
 from gvtools.cameras import concatenate
 from gvtools.scenes.inspection import inspect
 from gvtools.scenes.pixel_contradictions import probed
-from gvtools.scenes.scene import Frame, Scene, SparsePoints, View
+from gvtools.scenes.scene import Frame, Scene, View
 
 
 @pytest.fixture(scope="module")
@@ -26,10 +27,7 @@ def room(wall_walk):
     points = local @ pose[:3, :3].T + pose[:3, 3]
     xy, z = concatenate([view.camera for view in wall_walk[:8]]).project(points)
     view, point = np.nonzero((z > 0) & (xy > 1).all(axis=2) & (xy < (159, 119)).all(axis=2))
-    sparse = SparsePoints(
-        points, np.zeros((len(points), 3), np.uint8), np.zeros(len(points), np.float32),
-        point.astype(np.int32), view.astype(np.int32), xy[view, point],
-    )  # fmt: skip
+    sparse = sparse_points(points, point, view, xy[view, point])
     views = tuple(View(each.name, each.camera, partial(Frame, each.rgb)) for each in wall_walk[:8])
     return Scene(Path("walls"), "colmap", views, sparse)
 

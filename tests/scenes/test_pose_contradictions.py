@@ -9,14 +9,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import skimage.data
+from scenes_workspace import sparse_points
+from tiny_scan import without_depth
 
 from gvtools.cameras import Cameras
-from gvtools.scenes.inspection import (
-    contradiction_findings,
-    contradictions,
-    inspect,
-    thumbnail,
-)
+from gvtools.scenes.inspection import contradiction_findings, contradictions, inspect, thumbnail
 from gvtools.scenes.scene import Frame, Scene, SparsePoints, View
 
 WIDTH, HEIGHT, FOCAL = 96, 72, 80.0
@@ -75,11 +72,6 @@ def contradiction_messages(scene: Scene) -> list[str]:
     return [item.message for item in contradiction_findings(scene, thumbnails, depths)]
 
 
-def without_depth(scene: Scene) -> Scene:
-    views = [replace(view, has_depth=False, load=partial(Frame, view.load().rgb)) for view in scene]
-    return replace(scene, views=tuple(views))
-
-
 def test_exposure_and_small_turns_are_no_contradiction() -> None:
     scene = walk()
     assert contradiction_messages(scene) == []
@@ -121,11 +113,7 @@ def points_of(scene: Scene, *, shared: bool) -> SparsePoints:
     point_index = np.tile(np.arange(count), len(scene)) if shared else np.arange(sets * count)
     xy = np.array([scene.cameras[int(v)].project(positions[[p]])[0][0, 0]
                    for v, p in zip(view_index, point_index, strict=True)])  # fmt: skip
-    zeros = np.zeros((len(positions), 3), np.uint8)
-    errors = np.zeros(len(positions), np.float32)
-    return SparsePoints(
-        positions, zeros, errors, point_index.astype(np.int32), view_index.astype(np.int32), xy
-    )
+    return sparse_points(positions, point_index, view_index, xy)
 
 
 def test_near_views_that_share_no_sparse_point_are_told() -> None:
