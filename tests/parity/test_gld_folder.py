@@ -19,8 +19,9 @@ from tiny_scan import write_scan
 
 from gvtools.completers.geoverse.conditioning import ViewBatch
 from gvtools.completers.geoverse.weights import check_folder, config_of, from_pretrained
+from gvtools.untrusted import sha256_of
 from pipelines.cli import main
-from pipelines.published import MODELS, sha256_of
+from pipelines.published import MODELS
 
 ORACLE = shared_folder() / "oracle"
 SIZE = (56, 70)
