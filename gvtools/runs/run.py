@@ -32,7 +32,7 @@ from gvtools.runs.layout import (
 from gvtools.runs.poses import RunPoses, refined_poses_of, with_poses
 from gvtools.runs.target_files import TargetFiles, entry_camera, read_target
 from gvtools.splat_files import READERS
-from gvtools.untrusted import read_json
+from gvtools.untrusted import expect, read_json
 
 if TYPE_CHECKING:
     from gvtools.appearance.appearance import Appearance
@@ -310,6 +310,8 @@ class _View(BaseModel):
             camera = entry_camera({"name": self.name, "camera": self.camera})
             check_usable(camera)
             rigid_transform(camera.cam_from_world[0], what=self.name)
+            size = [self.camera[side] for side in ("width", "height")]
+            expect([*camera.width, *camera.height] == size, f"a picture of {size} pixels")
         except (ShapeError, KeyError, TypeError, OverflowError) as error:
             raise ValueError(str(error)) from None
         return self
