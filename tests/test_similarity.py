@@ -20,16 +20,30 @@ from gvtools.similarity import (
 )
 from gvtools.view_selection import covisible_views, evenly_spread, in_view, nearest_views
 
+pytestmark = pytest.mark.filterwarnings("error")
+SPACE = (1.0, 0.7, 0.4)
+PLANE = (1.0, 0.7, 0.0)
+LINE = (1.0, 0.0, 0.0)
+CUBE = np.array(list(product((-1, 1), repeat=3)), np.float64)
+# Every coordinate is a product of two of the cube's: as far apart, and uncorrelated with it.
+UNRELATED = CUBE * np.roll(CUBE, 1, axis=1)
 
-def _points(seed: int, count: int = 12) -> np.ndarray:
-    return np.random.default_rng(seed).standard_normal((count, 3)) * (3, 2, 1)
+
+def spread(count: int, axes: tuple[float, float, float], *, seed: int = 0) -> np.ndarray:
+    """Points about the origin, in an arbitrary orientation, with the spread along three axes."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-1, 1, (count, 3)) * axes
+    return (points - points.mean(0)) @ Rotation.random(rng=rng).as_matrix().T
 
 
-@pytest.mark.parametrize("planar", [False, True])
-def test_a_rigid_fit_agrees_with_scipy_and_keeps_the_scale(planar):
-    rng = np.random.default_rng(4)
-    source = _points(4) * (1, 1, 0 if planar else 1)
-    target = source @ Rotation.random(rng=rng).as_matrix().T + 0.1 * rng.standard_normal((12, 3))
+def turn(seed: int = 1) -> np.ndarray:
+    return Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
+
+
+@pytest.mark.parametrize("axes", [SPACE, PLANE])
+def test_a_rigid_fit_agrees_with_scipy_and_keeps_the_scale(axes):
+    source = 3 * spread(12, axes)
+    target = source @ turn().T + 0.1 * np.random.default_rng(4).standard_normal((12, 3))
     fit = fit_similarity(source, target, with_scale=False)
     other, _ = Rotation.align_vectors(target - target.mean(axis=0), source - source.mean(axis=0))
     assert fit.scale == 1
@@ -37,11 +51,8 @@ def test_a_rigid_fit_agrees_with_scipy_and_keeps_the_scale(planar):
 
 
 def test_large_offsets_keep_millimetres():
-    rng = np.random.default_rng(7)
-    source = rng.standard_normal((20, 3)) * 20
-    rotation = Rotation.random(rng=rng).as_matrix()
-    utm = np.array([6.9e5, 5.3e6, 400.0])
-    target = 0.37 * source @ rotation.T + utm
+    source = np.random.default_rng(7).standard_normal((20, 3)) * 20
+    target = 0.37 * source @ turn().T + [6.9e5, 5.3e6, 400.0]
     fit = fit_similarity(source, target)
     assert np.abs(fit.apply(source) - target).max() < 1e-8
     back = fit_similarity(target, source)
@@ -51,7 +62,7 @@ def test_large_offsets_keep_millimetres():
 
 
 def test_shapes_and_values_are_checked():
-    points = _points(0)
+    points = spread(12, SPACE)
     with pytest.raises(ShapeError, match=r"both \(N, 3\)"):
         fit_similarity(points, points[:-1])
     points[3, 1] = np.nan
@@ -113,33 +124,10 @@ def test_too_little_overlap_and_too_much_spread_are_refused():
 
 
 def test_poses_are_aligned_by_the_motion_of_their_world():
-    rng = np.random.default_rng(0)
-    poses = np.tile(np.eye(4), (6, 1, 1))
-    poses[:, :3, :3] = Rotation.random(6, random_state=0).as_matrix()
-    poses[:, :3, 3] = rng.normal(size=(6, 3))
+    turns = Rotation.random(6, random_state=0).as_matrix()
+    poses = rigid_poses(turns, np.random.default_rng(0).normal(size=(6, 3)))
     motion = rigid_poses(Rotation.from_rotvec([0.3, -1.1, 0.4]).as_matrix(), [3, -20, 5])
     np.testing.assert_allclose(align_poses(poses, poses @ motion), motion, atol=1e-12)
-
-
-pytestmark = pytest.mark.filterwarnings("error")
-
-SPACE = (1.0, 0.7, 0.4)
-PLANE = (1.0, 0.7, 0.0)
-LINE = (1.0, 0.0, 0.0)
-CUBE = np.array(list(product((-1, 1), repeat=3)), np.float64)
-# Every coordinate is a product of two of the cube's: as far apart, and uncorrelated with it.
-UNRELATED = CUBE * np.roll(CUBE, 1, axis=1)
-
-
-def spread(count: int, axes: tuple[float, float, float], *, seed: int = 0) -> np.ndarray:
-    """Points about the origin, in an arbitrary orientation, with the spread along three axes."""
-    rng = np.random.default_rng(seed)
-    points = rng.uniform(-1, 1, (count, 3)) * axes
-    return (points - points.mean(0)) @ Rotation.random(rng=rng).as_matrix().T
-
-
-def turn(seed: int = 1) -> np.ndarray:
-    return Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
 
 
 def is_degenerate(fit: SimilarityFit, reason: str) -> bool:

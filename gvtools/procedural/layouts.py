@@ -253,14 +253,9 @@ def add_openings(
 
 
 def add_side_room(
-    build: SceneBuilder,
-    low: Float64,  # (3,) lowest corner of the room
-    high: Float64,  # (3,) highest corner
-    skin: Sequence[int],
-    wall: int,
-    size: Float64,  # (3,) of the side room
+    build: SceneBuilder, low: Float64, high: Float64, skin: Sequence[int], wall: int, size: Float64
 ) -> tuple[Float64, Float64]:
-    """A room behind a wall and the door that leads to it; returns the side room's corners."""
+    """A room of a size (3,) behind a wall, and the door that leads to it; returns its corners."""
     rng = build.rng
     across = 1 - wall // 2
     length = high[across] - low[across]

@@ -24,6 +24,7 @@ from gvtools.procedural.sample_workspace import (
     write_sample,
 )
 from gvtools.trajectories import look_at
+from gvtools.view_selection import in_view
 
 Float32 = NDArray[np.float32]
 
@@ -171,14 +172,10 @@ def _tracks(
     A view sees a point when the pixel that it falls in shows something at the point's depth.
     """
     xy, z = cameras.project(points)
-    height, width = depth.shape[1:]
-    seen = np.zeros(z.shape, bool)
-    for view in range(len(cameras)):
-        with np.errstate(invalid="ignore"):
-            inside = (xy[view] >= 0).all(-1) & (xy[view] < [width, height]).all(-1)
-        rows = np.flatnonzero(inside)
-        x, y = np.floor(xy[view, rows]).astype(int).T
-        seen[view, rows] = np.abs(depth[view, y, x] / z[view, rows] - 1) < SAME_SURFACE
+    seen = in_view(cameras, points)
+    view, row = np.nonzero(seen)
+    x, y = np.floor(xy[view, row]).astype(int).T
+    seen[view, row] = np.abs(depth[view, y, x] / z[view, row] - 1) < SAME_SURFACE
     seen[:, seen.sum(0) < 2] = False
     point_index, view_index = np.nonzero(seen.T)
     return point_index, view_index, xy[view_index, point_index]

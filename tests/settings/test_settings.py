@@ -10,9 +10,7 @@ from gvtools.depth.options import StereoOptions
 from gvtools.errors import OptionError
 from gvtools.settings import changes, listing, markdown, with_file, with_texts, with_values
 from gvtools.settings.base import keys
-from gvtools.training.options import (
-    TrainingSettings,
-)
+from gvtools.training.options import TrainingSettings
 from pipelines.cli import main
 from pipelines.reconstruction.settings import RunSettings
 
@@ -127,12 +125,10 @@ def test_later_texts_stand_over_earlier_ones_and_all_over_a_profile():
     for texts in (["max_side=100", "profile=fast"], ["profile=fast", "max_side=100"]):
         config = with_texts(RUN, texts)
         assert (config.max_side, config.views_per_round) == (100, 12)
-
-
-@pytest.mark.parametrize("order", [1, -1])
-def test_settings_that_depend_on_each_other_may_come_in_any_order(order):
-    config = with_texts(RUN, ["stereo.sources=8", "stereo.views=8"][::order])
-    assert (config.stereo.sources, config.stereo.views) == (8, 8)
+    # Those that depend on each other may come in any order.
+    for order in (1, -1):
+        config = with_texts(RUN, ["stereo.sources=8", "stereo.views=8"][::order])
+        assert (config.stereo.sources, config.stereo.views) == (8, 8)
 
 
 @pytest.mark.parametrize("settings", [RUN, TrainingSettings()])
@@ -141,10 +137,8 @@ def test_every_setting_is_documented(settings):
     for key in keys(type(settings)):
         assert f"  {key}=" in text and f"| `{key}` | `" in table
     assert all(row.count(" |") == 5 for row in table.splitlines() if row.startswith("| `"))
-    for line in text.splitlines():
-        assert len(line) <= 100
-    wanting = [row for row in table.splitlines() if row.startswith("| `") and row.endswith("|  |")]
-    assert not wanting
+    assert all(len(line) <= 100 for line in text.splitlines())
+    assert not [row for row in table.splitlines() if row.startswith("| `") and row[-4:] == "|  |"]
 
 
 def test_help_settings_ends_the_program(capsys):
