@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pycolmap
 import pytest
@@ -38,14 +36,9 @@ def _difference(scene: Scene, *, dx: float = 0, dy: float = 0) -> float:
     x, y = scene.cameras.project(points)[0][1].T - 0.5
     inside = (x >= 4) & (x <= right.rgb.shape[1] - 5)
     at = [y[inside] + dy, x[inside] + dx]
-    colors = np.stack(
-        [
-            map_coordinates(right.rgb[..., c].astype(float), at, order=1, mode="nearest")
-            for c in range(3)
-        ],
-        -1,
-    )
-    return float(np.abs(colors - left.rgb[rows, columns][inside]).mean())
+    channels = np.moveaxis(right.rgb.astype(float), -1, 0)
+    colors = [map_coordinates(each, at, order=1, mode="nearest") for each in channels]
+    return float(np.abs(np.transpose(colors) - left.rgb[rows, columns][inside]).mean())
 
 
 def test_calibration_is_right_to_a_fraction_of_a_pixel(scene: Scene) -> None:
@@ -69,8 +62,7 @@ def test_projection_gives_back_the_published_disparity() -> None:
     np.testing.assert_allclose(z[0], z[1])
     assert np.isfinite(disparity).sum() == len(rows)
 
-
-def test_depth_without_measurement_is_zero() -> None:
+    # None where nothing is measured.
     disparity = np.array([[np.nan, np.inf, -np.inf, 30.0, -31.1]])
     depth = depth_from_disparity(disparity)
     assert (depth[0, [0, 1, 2, 4]] == 0).all()
@@ -79,7 +71,7 @@ def test_depth_without_measurement_is_zero() -> None:
     assert depth[0, 3] == pytest.approx(millimetres / 1000, rel=1e-5)
 
 
-def test_workspace_reads_back(sample: WrittenSample, scene: Scene) -> None:
+def test_workspace_reads_back_and_is_kept(sample: WrittenSample, scene: Scene) -> None:
     assert scene.names == sample.context + sample.targets
     assert [view.has_depth for view in scene] == [True, False]
     left, right, _ = skimage.data.stereo_motorcycle()
@@ -90,6 +82,10 @@ def test_workspace_reads_back(sample: WrittenSample, scene: Scene) -> None:
     assert depth is not None
     assert 0.9 < (depth > 0).mean() < 0.95
     assert depth[depth > 0].min() > 1.5 and depth.max() < 6
+    picture = sample.folder / "images" / "left.png"
+    before = picture.stat().st_mtime_ns
+    assert write_motorcycle(sample.folder) == sample
+    assert picture.stat().st_mtime_ns == before
 
 
 def test_sparse_points_lie_on_the_measured_surface(sample: WrittenSample, scene: Scene) -> None:
@@ -109,10 +105,3 @@ def test_sparse_points_lie_on_the_measured_surface(sample: WrittenSample, scene:
         differences.append(np.abs(right[int(y), int(x)].astype(int) - point.color).mean())
     assert max(errors) < 1e-5
     assert np.median(differences) < 20
-
-
-def test_written_sample_is_kept(sample: WrittenSample) -> None:
-    picture = sample.folder / "images" / "left.png"
-    before = picture.stat().st_mtime_ns
-    assert write_motorcycle(Path(sample.folder)) == sample
-    assert picture.stat().st_mtime_ns == before
