@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from gvtools.evaluation.lpips_distance import Lpips
+    from gvtools.evaluation.images import Lpips
     from gvtools.runs.run import Run
 
 

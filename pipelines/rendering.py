@@ -24,9 +24,7 @@ from gvtools.appearance.appearance import Appearance, recolor
 from gvtools.cameras import Cameras, concatenate
 from gvtools.completers.base import create, run_completer
 from gvtools.errors import OptionError
-from gvtools.evaluation.images import FIGURES, view_figures
-from gvtools.evaluation.lpips_distance import Lpips
-from gvtools.evaluation.picture_readings import better_reading
+from gvtools.evaluation.images import FIGURES, Lpips, better_reading, view_figures
 from gvtools.files import replaced_when_written
 from gvtools.guidance import Guidance
 from gvtools.memory.panoramas import Rig
@@ -35,6 +33,7 @@ from gvtools.memory.splat.api import SplatOptions
 from gvtools.optional import require
 from gvtools.runs.run import at_run_poses, load_appearance, load_memory, said_of_path
 from gvtools.runs.target_files import to_bytes, write_png
+from gvtools.scenes.inspection import spread
 from gvtools.scenes.pixel_contradictions import frame_there
 from gvtools.scenes.scene import Frame, Scene
 from gvtools.scenes.transforms import read_camera_path
@@ -42,7 +41,6 @@ from gvtools.trajectories import PATHS, named_path
 from pipelines.options import check_ending
 from pipelines.reconstruction.rounds import CachedProjection, Clock, complete_targets
 from pipelines.reconstruction.settings import RunSettings
-from pipelines.scoring.measurement import evenly
 from pipelines.spherical_metadata import mark_mp4, write_panorama
 from viz.viewer.render import picture_of
 
@@ -397,8 +395,8 @@ class FilmRenderer:
     def _spread_cameras(self, most: int) -> list[Cameras]:
         """At most so many of the cameras, evenly along the path; of a rig twice so many faces."""
         most = most if self.rig is None else max(1, 2 * most // len(self.rig.faces))
-        spread = self.cameras[evenly(len(self.cameras), most)]
-        return list(spread) if self.rig is None else self.rig.faces_of(spread)
+        chosen = self.cameras[spread(len(self.cameras), most)]
+        return list(chosen) if self.rig is None else self.rig.faces_of(chosen)
 
 
 def captioned(picture: Picture, text: str) -> Picture:

@@ -1,24 +1,41 @@
 """Image and depth metrics of one view: PSNR, SSIM, LPIPS and relative depth error, by region.
 
+Beside them stands under which other reading pictures would fit what they stand for far better.
+
 Colours are compared in [0, 1] and in float64; the data range is 1. SSIM is that of Z. Wang et al.,
 "Image quality assessment: from error visibility to structural similarity", IEEE TIP 13(4), 2004: a
 Gaussian window of sigma 1.5 (11 x 11 pixels), population covariances, constants 0.01 and 0.03. A
 figure without a pixel to compare is None, never a number.
+
+LPIPS is that of R. Zhang et al., CVPR 2018, with weights from disk alone. The package ``lpips``
+holds the calibrated last layers; no code of it is run, as it needs torchvision, whose compiled
+operators often do not fit the installed torch. The network below them is published by torchvision's
+authors and has to be on disk: in a folder that is named, or in torch's own cache. Without it there
+is no LPIPS, and no other network's distance is given under that name. The layers, and with them the
+names in a state dict, are those of torchvision's models: K. Simonyan, A. Zisserman, "Very deep
+convolutional networks" (VGG-16), and A. Krizhevsky, "One weird trick for parallelizing
+convolutional neural networks" (AlexNet).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import hashlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gvtools.errors import ShapeError
+from gvtools.errors import CheckpointError, OptionError, ShapeError
 from gvtools.evaluation.statistics import mean_of, median_of
+from gvtools.glb import srgb_bytes
+from gvtools.optional import package_folder
 
 if TYPE_CHECKING:
-    from gvtools.evaluation.lpips_distance import Lpips
+    from torch import Tensor, nn
+
     from gvtools.scenes.scene import Frame
 
 SIGMA, SIDE = 1.5, 11
@@ -200,3 +217,225 @@ def _unit(image: ArrayLike) -> NDArray[np.float64]:
     if not (low >= LOWEST and high <= HIGHEST):
         raise ShapeError(f"an image of values from {low:g} to {high:g}; expected floats in [0, 1]")
     return array.astype(np.float64)
+
+
+# Mean and spread of the colours, in [-1, 1], that the networks were trained with.
+SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
+# Channels of VGG-16's convolutions, 0 for a halving of the resolution.
+_VGG16 = (64, 64, 0, 128, 128, 0, 256, 256, 256, 0, 512, 512, 512, 0, 512, 512, 512)
+
+
+@dataclass(frozen=True)
+class LpipsBackbone:
+    """One network that LPIPS is defined on."""
+
+    # Channels, kernel, stride and padding of its convolutions; of a pooling its kernel alone.
+    stages: tuple[tuple[int, int, int, int] | int, ...]
+    compared: tuple[int, ...]  # numbers of the layers whose output is compared
+    file: str  # the published weights; the name ends with the first digits of the file's SHA-256
+
+    @property
+    def url(self) -> str:
+        """Where the weights are published."""
+        return f"https://download.pytorch.org/models/{self.file}"
+
+    def build(self) -> nn.Sequential:
+        """Its convolutional layers."""
+        from torch import nn
+
+        layers: list[nn.Module] = []
+        channels = 3
+        for stage in self.stages:
+            if isinstance(stage, int):
+                layers.append(nn.MaxPool2d(stage, 2))
+            else:
+                layers += [nn.Conv2d(channels, *stage), nn.ReLU(inplace=True)]
+                channels = stage[0]
+        return nn.Sequential(*layers)
+
+
+BACKBONES = {
+    "vgg": LpipsBackbone(
+        tuple((width, 3, 1, 1) if width else 2 for width in _VGG16),
+        (3, 8, 15, 22, 29),
+        "vgg16-397923af.pth",
+    ),
+    "alex": LpipsBackbone(
+        ((64, 11, 4, 2), 3, (192, 5, 1, 2), 3, *((width, 3, 1, 1) for width in (384, 256, 256))),
+        (1, 4, 7, 9, 11),
+        "alexnet-owt-7be5be79.pth",
+    ),
+}
+
+
+class Lpips:
+    """The distance of one network; about 0 for equal pictures, up to about 1.
+
+    The network is "vgg", as view synthesis usually reports, or "alex"; its weights are in
+    ``folder``, or else in torch's cache (``torch.hub.get_dir()``).
+    """
+
+    def __init__(self, net: str = "vgg", *, folder: Path | None = None) -> None:
+        import torch
+
+        if net not in BACKBONES:
+            raise OptionError(f"LPIPS network {net!r}; expected one of {', '.join(BACKBONES)}")
+        backbone = BACKBONES[net]
+        place = Path(folder) if folder is not None else Path(torch.hub.get_dir()) / "checkpoints"
+        file = place / backbone.file
+        if not file.is_file():
+            raise CheckpointError(
+                f"LPIPS ({net}): {file} is absent; download {backbone.url} there"
+                + ("" if folder is not None else ", or name its folder with --lpips-weights")
+            )
+        found = hashlib.sha256(file.read_bytes()).hexdigest()
+        expected = backbone.file.rsplit("-", 1)[1].split(".")[0]
+        if not found.startswith(expected):
+            raise CheckpointError(
+                f"{file}: its SHA-256 begins with {found[:8]}, the published file's with "
+                f"{expected}; download {backbone.url} again"
+            )
+        self.net, self._compared = net, backbone.compared
+        self.layers = backbone.build().requires_grad_(False).eval()
+        stored = torch.load(file, map_location="cpu", weights_only=True).items()
+        prefix = "features."
+        own = {key.removeprefix(prefix): v for key, v in stored if key.startswith(prefix)}
+        self.layers.load_state_dict(own)
+        package = package_folder("lpips", extra="lpips", purpose="LPIPS", error=CheckpointError)
+        calibrated = package / "weights" / "v0.1" / f"{net}.pth"
+        heads = torch.load(calibrated, map_location="cpu", weights_only=True)
+        # (1, C, 1, 1) for each compared layer, what its channels weigh.
+        self._heads = [heads[f"lin{i}.model.1.weight"] for i in range(len(backbone.compared))]
+
+    def distance(
+        self, image: NDArray[np.uint8], truth: NDArray[np.uint8]
+    ) -> tuple[float, NDArray[np.float32]]:
+        """The distance of two pictures, and where it comes from.
+
+        Args:
+            image: (H, W, 3) uint8, at least 32 x 32 pixels.
+            truth: likewise.
+
+        Returns:
+            The package's distance, and its map (H, W) float32: the layers' maps, upsampled. The
+            map's mean differs from the distance by what upsampling changes at the border.
+        """
+        import torch
+        from torch.nn.functional import conv2d, interpolate
+
+        with torch.inference_mode():
+            features = zip(self._heads, self._features(image), self._features(truth), strict=True)
+            maps = [conv2d((first - second) ** 2, head) for head, first, second in features]
+            total = sum(float(layer.mean()) for layer in maps)
+            size = image.shape[:2]
+            spread = [interpolate(layer, size=size, mode="bilinear")[0, 0] for layer in maps]
+        return total, np.sum([layer.numpy() for layer in spread], axis=0)
+
+    def _features(self, picture: NDArray[np.uint8]) -> Iterator[Tensor]:
+        """(1, C, h, w) of each compared layer, of length 1 at every pixel."""
+        import torch
+
+        x = torch.from_numpy(picture.copy()).permute(2, 0, 1)[None].float() / 127.5 - 1
+        x = (x - torch.tensor(SHIFT)[:, None, None]) / torch.tensor(SCALE)[:, None, None]
+        for number, layer in enumerate(self.layers):
+            x = layer(x)
+            if number in self._compared:
+                yield x / ((x**2).sum(dim=1, keepdim=True).sqrt() + 1e-10)
+
+
+Picture = NDArray[np.float32]  # (H, W, 3), 0 to 255
+Reading = Callable[[Picture], Picture]
+
+# A reading explains pictures where it leaves at most this share of their squared errors (3 dB).
+EXPLAINED = 0.5
+# Channels of grey pictures differ by less on average, of 255.
+GREY = 2
+# Motion is fitted to pictures of this width, in at most so many steps or up to this change.
+MOTION_WIDTH, STEPS, CHANGE = 400, 60, 1e-5
+
+
+def better_reading(pictures: Sequence[NDArray[np.uint8]], truths: Sequence[Frame]) -> str:
+    """How pictures seem to be, other than they should be, all in one way; "" if nothing explains.
+
+    Tried are mirrored and turned pictures, exchanged channels, negatives, linear light, one factor
+    and offset of brightness, and one motion (shift, size, turn) in the picture.
+
+    >>> truth = np.random.default_rng(0).integers(0, 255, (32, 32, 3), np.uint8)
+    >>> better_reading([truth[::-1]], [Frame(truth)])[:48]
+    'upside down: otherwise PSNR would be 98.1 dB ins'
+    """
+    pairs = [
+        (picture.astype(np.float32), frame.rgb.astype(np.float32), frame.mask)
+        for picture, frame in zip(pictures, truths, strict=True)
+        if frame.mask is None or frame.mask.any()
+    ]
+
+    def errors(change: Reading) -> NDArray[np.float64]:
+        changed = ((change(one).clip(0, 255) - other, mask) for one, other, mask in pairs)
+        return np.array([np.square(x if m is None else x[m]).mean() for x, m in changed]) + 1e-5
+
+    readings = dict(FIXED)
+    moments = [[x.mean(), x.std(), y.mean(), y.std()] for x, y, _ in pairs]
+    dark, narrow, mean, spread = np.median(moments, axis=0) if pairs else np.zeros(4)
+    if narrow > 0:
+        factor, offset = spread / narrow, mean - spread / narrow * dark
+        name = f"of another brightness (fitting times {factor:.3g} {offset:+.3g} of 255)"
+        readings[name] = lambda picture: factor * picture + offset
+        readings |= _motion(pairs)
+    elif pairs:
+        return "of one colour alone"
+    given = errors(lambda picture: picture)
+    left = {name: np.median(errors(change) / given) for name, change in readings.items() if pairs}
+    best = min(left, key=left.__getitem__, default="")
+    # Of pictures that do not show their truths at all, none.
+    if not best or left[best] > EXPLAINED or left[best] * np.median(given) > EXPLAINED * spread**2:
+        vivid = [[np.ptp(x, axis=2).mean() for x in pair[:2]] for pair in pairs]
+        grey = pairs and 5 * max(own for own, _ in vivid) < 5 * GREY < np.median(vivid, axis=0)[1]
+        return "grey, where their views have colour" if grey else ""
+    before, after = (-10 * np.log10(np.median(e) / 255**2) for e in (given, errors(readings[best])))
+    return f"{best}: otherwise PSNR would be {min(after, 100):.1f} dB instead of {before:.1f}"
+
+
+FIXED: dict[str, Reading] = {
+    "mirrored left to right": lambda picture: picture[:, ::-1],
+    "upside down": lambda picture: picture[::-1],
+    "turned by 180 degrees": lambda picture: picture[::-1, ::-1],
+    "of red and blue exchanged": lambda picture: picture[..., ::-1],
+    "negatives": lambda picture: 255 - picture,
+    "in linear light, without the curve of sRGB": lambda picture: srgb_bytes(picture / 255).astype(
+        np.float32
+    ),
+}
+
+
+def _motion(pairs: Sequence[tuple[Picture, Picture, object]]) -> dict[str, Reading]:
+    """What undoes the motion that pictures have in common against their truths, by its name."""
+    import cv2
+
+    height, width = pairs[0][0].shape[:2]
+    scale, found = min(1.0, MOTION_WIDTH / width), []
+    stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, STEPS, CHANGE)
+    for one, other, _ in pairs:
+        small = [cv2.resize(x, None, None, scale, scale, cv2.INTER_AREA) for x in (other, one)]
+        first, second = (cv2.cvtColor(x, cv2.COLOR_RGB2GRAY) for x in small)
+        start = np.eye(2, 3, dtype=np.float32)
+        try:
+            found.append(cv2.findTransformECC(first, second, start, cv2.MOTION_AFFINE, stop)[1])
+        except cv2.error:  # the two have nothing in common
+            continue
+    if not found:
+        return {}
+    # Of pixels whose first centre is (0, 0), from the small pictures to the whole ones.
+    motion = np.median(found, axis=0)
+    motion[:, 2] = (motion[:, 2] + 0.5 - motion[:, :2].sum(axis=1) / 2) / scale
+    motion[:, 2] += motion[:, :2].sum(axis=1) / 2 - 0.5
+    middle = np.array([width - 1, height - 1]) / 2
+    right, down = motion[:, :2] @ middle + motion[:, 2] - middle
+    larger = np.sqrt(abs(np.linalg.det(motion[:, :2])))
+
+    def undone(picture: Picture) -> Picture:
+        flags, border = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, cv2.BORDER_REPLICATE
+        moved = cv2.warpAffine(picture, motion, (width, height), None, flags, border)
+        return np.asarray(moved, np.float32)
+
+    return {f"shifted ({right:.2g} right, {down:.2g} down) and {larger:.3g} times as large": undone}

@@ -41,9 +41,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.errors import OptionError, ProjectError
-from gvtools.scenes.images import IMAGE_SUFFIXES, read_depth
+from gvtools.scenes.images import (
+    IMAGE_SUFFIXES,
+    UNREADABLE,
+    read_depth,
+    read_header,
+    read_image,
+)
 from gvtools.scenes.scene import Frame, natural_key
-from gvtools.untrusted import open_picture, unpacked
+from gvtools.untrusted import open_picture, reading, unpacked
 
 SPLITS = ("test", "val", "train")
 _CANVAS = re.compile(r"(\d{6})-img\.(jpg|png)", re.IGNORECASE)
@@ -300,17 +306,10 @@ def in_natural_order(paths: Iterable[Path], folder: Path) -> list[Path]:
 
 def read_picture(source: Path) -> Frame:
     """What is transparent lies before black, and is no part of the mask; as stored, not turned."""
-    from gvtools.scenes.images import UNREADABLE, read_header, read_image
-
     if not read_header(source).has_alpha:
         return read_image(source)
-    try:
-        with open_picture(source) as image:
-            rgba: NDArray[Any] = np.asarray(image.convert("RGBA")).astype(np.float64)
-    except UNREADABLE as error:
-        raise ProjectError(
-            f"{source}: no readable picture ({error}); expected PNG or JPEG"
-        ) from None
+    with reading(source, "expected PNG or JPEG", also=UNREADABLE), open_picture(source) as image:
+        rgba: NDArray[Any] = np.asarray(image.convert("RGBA")).astype(np.float64)
     rgb = np.rint(rgba[..., :3] * (rgba[..., 3:] / 255)).astype(np.uint8)
     return Frame(rgb, mask=rgba[..., 3] == 255)
 
@@ -331,11 +330,15 @@ def _half(file: Path, side: int) -> NDArray[np.uint8]:
     return np.ascontiguousarray(canvas[:, side * width // 2 :][:, : width // 2])
 
 
-def _beside_truth(file: Path, folder: Path, truths: Path) -> MethodPicture:
-    """A picture named by its path below ``folder``, whose truth lies at the same path elsewhere."""
-    name = file.relative_to(folder)
-    truth = (lambda: read_picture(truths / name).rgb) if (truths / name).is_file() else None
-    return MethodPicture(name.as_posix(), partial(read_picture, file), truth)
+def _beside_truths(folder: Path, truths: Path) -> tuple[MethodPicture, ...]:
+    """The pictures below ``folder``, whose truths lie at the same paths elsewhere."""
+
+    def picture(file: Path) -> MethodPicture:
+        name = file.relative_to(folder)
+        truth = (lambda: read_picture(truths / name).rgb) if (truths / name).is_file() else None
+        return MethodPicture(name.as_posix(), partial(read_picture, file), truth)
+
+    return tuple(map(picture, image_files(folder)))
 
 
 def nerfstudio_dataset(path: Path) -> PictureSet | None:
@@ -347,8 +350,7 @@ def nerfstudio_dataset(path: Path) -> PictureSet | None:
     notes = []
     if len(splits) > 1:
         notes.append(f"split {folder.name} taken; also there: {', '.join(list(splits)[1:])}")
-    files = image_files(folder / "rgb")
-    pictures = tuple(_beside_truth(file, folder / "rgb", folder / "gt-rgb") for file in files)
+    pictures = _beside_truths(folder / "rgb", folder / "gt-rgb")
     return PictureSet(path, "nerfstudio, ns-render dataset", pictures, notes=tuple(notes))
 
 
@@ -393,36 +395,29 @@ def splatting_renders(path: Path) -> PictureSet | None:
         return None
     last = max(found, key=lambda folder: natural_key(folder.name))
     notes = [f"{last.relative_to(path)} taken"] if last != path else []
-    files = in_natural_order(image_files(last / "renders"), last)
-    pictures = tuple(_beside_truth(file, last / "renders", last / "gt") for file in files)
+    pictures = _beside_truths(last / "renders", last / "gt")
     return PictureSet(path, "3DGS", pictures, alphabetical=True, notes=tuple(notes))
 
 
 def nerfbaselines_predictions(path: Path) -> PictureSet | None:
     """The pictures of a folder or archive of predictions, or a training's last archive; or None."""
-    if path.name.endswith(".tar.gz"):
-        return _archive(path, path)
-    if (path / "info.json").is_file() and (path / COLOR).is_dir():
-        files = image_files(path / COLOR)
-        pictures = (_beside_truth(file, path / COLOR, path / TRUTH) for file in files)
-        return PictureSet(path, LAYOUT, tuple(pictures))
-    archives = {int(m[1]): file for file in path.iterdir() if (m := _ARCHIVE.fullmatch(file.name))}
-    if not archives:
-        return None
-    last = max(archives)
-    return _archive(archives[last], path, others=len(archives) - 1)
-
-
-def _archive(file: Path, path: Path, *, others: int = 0) -> PictureSet:
-    home = unpacked(file, whole=True)
-    files = image_files(home / COLOR)
-    if not files:
-        raise ProjectError(
-            f"{file}: no pictures under {COLOR}; expected predictions of NerfBaselines"
-        )
-    notes = (f"{file.name} taken, the last of {others + 1}",) if others else ()
-    pictures = (_beside_truth(picture, home / COLOR, home / TRUTH) for picture in files)
-    return PictureSet(path, LAYOUT, tuple(pictures), notes=notes)
+    home, notes = path, list[str]()
+    if not (path / "info.json").is_file() or not (path / COLOR).is_dir():
+        archives = {0: path}
+        if not path.name.endswith(".tar.gz"):
+            found = map(_ARCHIVE.fullmatch, (file.name for file in path.iterdir()))
+            archives = {int(match[1]): path / match[0] for match in found if match}
+        if not archives:
+            return None
+        last = archives[max(archives)]
+        if last != path and len(archives) > 1:
+            notes.append(f"{last.name} taken, the last of {len(archives)}")
+        home = unpacked(last, whole=True)
+        if not image_files(home / COLOR):
+            raise ProjectError(
+                f"{last}: no pictures under {COLOR}; expected predictions of NerfBaselines"
+            )
+    return PictureSet(path, LAYOUT, _beside_truths(home / COLOR, home / TRUTH), notes=tuple(notes))
 
 
 # Recognised in this order, by what no other layout has.

@@ -11,7 +11,6 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from gvtools.cameras import Cameras, Float64, concatenate
 from gvtools.errors import DegenerateError
@@ -19,7 +18,7 @@ from gvtools.evaluation.posed_picture import PosedPicture
 from gvtools.evaluation.statistics import ErrorStatistics, share
 from gvtools.evaluation.trajectories import AUC_THRESHOLDS, area_under_recall, center_extent
 from gvtools.features import FeatureMatcher, Features, SiftMatcher, mutual_nearest
-from gvtools.settings import Settings
+from gvtools.scenes.inspection import spread
 
 LEAST = 4  # matches: three leave up to four poses
 # Matches within this many times the error of a pose are near to it: their own pose is no rival.
@@ -32,6 +31,16 @@ RIVALS = 3  # looked at: near ones may come first
 # Cells along the longer side of a picture, in which the spread of the inliers is counted.
 CELLS = 16
 LOCATED = "located"
+VIEWS = 10  # context views to match; all are when there are no more
+PROMINENT = 500  # keypoints of a picture by which those views are chosen
+EDGE = 0.05  # a keypoint is lifted where the depths around it spread over less than this share
+# Fewer inliers, or inliers in fewer cells, do not locate a picture; nor does a pose while another,
+# which contradicts it, has the share MAX_RIVAL of its inliers. They were set on a real room of 5 to
+# 50 context views at 640x480. Photographs of other places, noise and negatives reach 7 inliers in 5
+# cells; mirrored photographs of the room, where things are symmetric, 20; photographs cut into 8x8
+# pieces and shuffled, 66 in 8 cells, which are those of one piece. Held-out photographs have 51 and
+# more, in 27 cells and more. COLMAP's mapper asks for 30.
+MIN_INLIERS, MIN_CELLS, MAX_RIVAL = 25, 10, 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -271,35 +280,6 @@ def summarise(found: Sequence[Located]) -> PoseSummary:
     )
 
 
-class PoseProbeOptions(Settings):
-    """How a picture is located, and when it counts as located.
-
-    The thresholds on inliers and cells were set on a real room of 5 to 50 context views at 640x480.
-    Photographs of other places, noise and negatives reach 7 inliers in 5 cells; mirrored
-    photographs of the room, where things are symmetric, 20; photographs cut into 8x8 pieces and
-    shuffled, 66 in 8 cells, which are those of one piece. Held-out photographs have 51 and more, in
-    27 cells and more. COLMAP's mapper asks for 30.
-    """
-
-    section = "pose_probe"
-
-    views: int = Field(10, ge=1)
-    """Context views to match; all are when there are no more."""
-    prominent: int = Field(500, ge=1)
-    """Keypoints of a picture by which those views are chosen."""
-    edge: float = Field(0.05, gt=0)
-    """A keypoint is lifted where the depths around it spread over less than this share."""
-    max_error: float | None = Field(None, gt=0)
-    """Reprojection error of an inlier; none means 1/160 of the picture's longer side (4 pixels at
-    640, 12 at 1920), at least 2. [px]"""
-    min_inliers: int = Field(25, ge=4)
-    """Fewer do not locate a picture."""
-    min_cells: int = Field(10, ge=1)
-    """Nor do inliers in fewer cells of the picture; its longer side has 16."""
-    max_rival: float = Field(0.5, gt=0, le=1)
-    """Nor does a pose while another, which contradicts it, has this share of its inliers."""
-
-
 @dataclass(frozen=True, eq=False)
 class _ContextView:
     """A context view's keypoints that have a 3D point: features (N), points (N, 3)."""
@@ -321,10 +301,8 @@ class PoseProbe:
         context: Sequence[PosedPicture],
         *,
         matcher: FeatureMatcher | None = None,
-        options: PoseProbeOptions | None = None,
         seed: int = 0,
     ) -> None:
-        self.options = options or PoseProbeOptions()
         self.seed = seed
         self._matcher = matcher or SiftMatcher()
         self._context = tuple(context)
@@ -373,9 +351,7 @@ class PoseProbe:
 
         What a generated picture is off by means little below it.
         """
-        total = len(self._context)
-        chosen = np.unique(np.linspace(0, total - 1, min(count or total, total)).round())
-        pictures = [self._context[int(i)] for i in chosen]
+        pictures = [self._context[i] for i in spread(len(self._context), count)]
         return [self.locate(picture, leave_out=(picture.name,)) for picture in pictures]
 
     def _features(self, picture: PosedPicture) -> Features:
@@ -392,21 +368,17 @@ class PoseProbe:
         features = self._features(picture)
         if picture.depth is None:
             return _ContextView(picture.name, features[:0], np.zeros((0, 3)))
-        edge = self.options.edge
-        points, ok = lift_keypoints(features.xy, picture.depth, picture.camera, edge=edge)
+        points, ok = lift_keypoints(features.xy, picture.depth, picture.camera, edge=EDGE)
         return _ContextView(picture.name, features[ok], points[ok])
 
     def _promising(self, features: Features, leave_out: Collection[str]) -> list[_ContextView]:
         """The views whose most prominent keypoints match those of the picture most often."""
         views = [view for view in self._views if view.name not in leave_out and len(view.points)]
-        if len(views) <= self.options.views:
+        if len(views) <= VIEWS:
             return views
-        most = self.options.prominent
-        votes = [
-            len(mutual_nearest(features.descriptors[:most], view.features.descriptors[:most]))
-            for view in views
-        ]
-        order = np.argsort(-np.asarray(votes), kind="stable")[: self.options.views]
+        own = features.descriptors[:PROMINENT]
+        votes = [len(mutual_nearest(own, view.features.descriptors[:PROMINENT])) for view in views]
+        order = np.argsort(-np.asarray(votes), kind="stable")[:VIEWS]
         return [views[i] for i in order]
 
     def _solved(
@@ -421,7 +393,7 @@ class PoseProbe:
         places, place = np.unique(xy, axis=0, return_inverse=True)
         place = place.reshape(-1)
         side = max(features.width, features.height)
-        error = self.options.max_error or max(2.0, side / 160)
+        error = max(2.0, side / 160)
         pose = absolute_pose(xy, points, K, max_error=error, seed=self.seed)
         if pose is None:
             return None, _Counts(keypoints=len(features), matches=len(places))
@@ -432,7 +404,7 @@ class PoseProbe:
             K,
             pose=pose,
             max_error=error,
-            least_share=self.options.max_rival,
+            least_share=MAX_RIVAL,
             seed=self.seed,
         )
         return pose, _Counts(
@@ -445,18 +417,15 @@ class PoseProbe:
 
     def _reason(self, counts: _Counts) -> str:
         """Why a picture does not count as located; empty when it does."""
-        options, inliers = self.options, f"{counts.inliers} inliers"
-        least = f"at least {options.min_inliers} are needed"
-        if counts.matches < options.min_inliers:
+        inliers, least = f"{counts.inliers} inliers", f"at least {MIN_INLIERS} are needed"
+        if counts.matches < MIN_INLIERS:
             return f"{counts.matches} matches of {counts.keypoints} keypoints, {least}"
-        if counts.inliers < options.min_inliers:
+        if counts.inliers < MIN_INLIERS:
             return f"{inliers} of {counts.matches} matches, {least}"
-        if counts.cells < options.min_cells:
-            return (
-                f"{inliers} in {counts.cells} cells of the picture, at least {options.min_cells} "
-                "are needed"
-            )
-        if counts.rival >= options.max_rival * counts.inliers:
+        if counts.cells < MIN_CELLS:
+            cells = f"{counts.cells} cells of the picture"
+            return f"{inliers} in {cells}, at least {MIN_CELLS} are needed"
+        if counts.rival >= MAX_RIVAL * counts.inliers:
             return (
                 f"ambiguous, {counts.inliers} matches agree on one pose and {counts.rival} on "
                 "another that contradicts it"

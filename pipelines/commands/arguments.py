@@ -13,7 +13,7 @@ from pipelines.options import Arguments, JsonArguments
 
 if TYPE_CHECKING:
     from gvtools.cameras import Cameras
-    from gvtools.evaluation.lpips_distance import Lpips
+    from gvtools.evaluation.images import Lpips
     from gvtools.memory.panoramas import Rig
     from gvtools.memory.spatial_memory import SpatialMemory
     from gvtools.scenes.scene import Scene
@@ -141,7 +141,7 @@ class LpipsArguments(Arguments):
 
     def open_lpips(self) -> tuple[Lpips | None, str | None]:
         """The network, or None with the reason."""
-        from gvtools.evaluation.lpips_distance import Lpips
+        from gvtools.evaluation.images import Lpips
 
         try:
             return Lpips(self.lpips_net, folder=self.lpips_weights), None

@@ -227,8 +227,12 @@ class TrajectoryCommand(RootArguments, JsonArguments):
     """Give figures also where the estimate is the reference's mirror image."""
 
     def run(self, console: Console) -> None:
-        from gvtools.evaluation.conventions import wrong_conventions
-        from gvtools.evaluation.trajectories import absolute_errors, pose_auc, relative_errors
+        from gvtools.evaluation.trajectories import (
+            absolute_errors,
+            pose_auc,
+            relative_errors,
+            wrong_conventions,
+        )
         from pipelines.inputs.trajectory_source import associate, open_trajectory
         from pipelines.scoring.measurement import pose_figures
 

@@ -65,8 +65,8 @@ class RenderCommand(LensArguments, LpipsArguments, SceneArguments, JsonArguments
     def run(self, console: Console) -> None:
         from gvtools.memory.panoramas import WIDEST_STILL
         from gvtools.runs.run import load_appearance, load_memory
+        from gvtools.scenes.inspection import spread
         from pipelines import rendering
-        from pipelines.scoring.measurement import evenly
 
         if self.out is None and not self.against_images:
             raise OptionError("--out: nothing would be left; give a folder, or --against-images")
@@ -88,7 +88,7 @@ class RenderCommand(LensArguments, LpipsArguments, SceneArguments, JsonArguments
         # The first projection compiles or loads the kernels and is not timed.
         memory.project(cameras[0], options=options)
         views, shown = [], dict[str, Any]()
-        looked = [cameras.names[row] for row in evenly(len(cameras), LOOKED)]
+        looked = [cameras.names[row] for row in spread(len(cameras), LOOKED)]
         for camera in console.track(list(cameras), "rendering"):
             (name,) = camera.names
             guidance, seconds = rendering.render_view(

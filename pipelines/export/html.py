@@ -15,10 +15,10 @@ import numpy as np
 
 from gvtools.errors import GvError
 from gvtools.files import write_text
+from gvtools.scenes.inspection import spread
 from gvtools.splats import SH, Splats
 from pipelines.export.formats import ExportOptions
 from pipelines.export.source import ExportSource
-from pipelines.scoring.measurement import evenly
 from viz.page.page import PageCamera, PageGroup, SharedPage, pack_gaussians, page_html
 from viz.report.pictures import thumbnail
 from viz.viewer.run_view import RunView, cameras_of
@@ -99,7 +99,7 @@ def _groups(splats: Splats) -> Iterator[PageGroup]:
 def _cameras(source: ExportSource) -> Iterator[PageCamera]:
     """Cameras of the photographs, with their pictures where they can be read."""
     views = [view.camera for view in source.memory.views.photographed if view.camera.width[0] > 1]
-    for camera in (views[row] for row in evenly(len(views), MOST_PICTURES)):
+    for camera in (views[row] for row in spread(len(views), MOST_PICTURES)):
         name, picture = camera.names[0], None
         if name in source.project:
             with suppress(GvError):

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from gvtools.cameras import invert_rigid
 from gvtools.errors import DegenerateError, OptionError, ProjectError
-from gvtools.evaluation.conventions import EXPLAINED, FEW, NOTABLE
+from gvtools.evaluation import trajectories
 from gvtools.evaluation.trajectories import Rows, absolute_errors, by_index, by_name, by_time
 from gvtools.scenes.colmap_model import find_model, load_model
 from gvtools.scenes.layout import holds_views, is_address
@@ -156,16 +156,18 @@ def _other_rate(
     both = min(int(((low <= stamps) & (stamps <= high)).sum()) for stamps in (at, times))
     few, given = len(rows[0]) < PARTNERS * both, error(*rows)
     tried = []
-    if min(len(at), len(times)) >= FEW and (few or given > NOTABLE):
+    if min(len(at), len(times)) >= trajectories.FEW and (few or given > trajectories.NOTABLE):
         steps = [np.median(np.diff(stamps)) for stamps in (at, times)]
         rates = {np.ptp(at) / np.ptp(times), steps[0] / steps[1], *RATES}
         for rate, start in product(rates, (times[0], 0.0)):
             with suppress(DegenerateError):
                 pairs = match(at, start + rate * (times - start))
-                if len(pairs[0]) >= max(FEW, len(rows[0])):
+                if len(pairs[0]) >= max(trajectories.FEW, len(rows[0])):
                     tried.append((error(*pairs), len(pairs[0]), 1 / rate))
     best, count, fast = min(tried, default=(np.inf, 0, 1.0))
-    if best < EXPLAINED * given or (few and best < NOTABLE and count > 2 * PARTNERS * len(rows[0])):
+    if best < trajectories.EXPLAINED * given or (
+        few and best < trajectories.NOTABLE and count > 2 * PARTNERS * len(rows[0])
+    ):
         return (
             f"the estimate's clock seems to run {fast:.4g} times as fast as the reference's: with "
             f"its times divided by that, {count} poses find a partner instead of {len(rows[0])}, "

@@ -21,7 +21,8 @@ import numpy as np
 
 import gvtools
 from gvtools.errors import GvError, OptionError, ProjectError
-from gvtools.evaluation.published import Benchmark, load_benchmark
+from gvtools.evaluation.images import Lpips
+from gvtools.evaluation.published import Benchmark, SceneSplit, Setting, load_benchmark
 from gvtools.files import digest, make_folder, write_json
 from gvtools.untrusted import read_json
 from pipelines.console import Console, Silent
@@ -39,8 +40,6 @@ from pipelines.scoring.benchmark_scenes import (
 )
 
 if TYPE_CHECKING:
-    from gvtools.evaluation.lpips_distance import Lpips
-    from gvtools.evaluation.splits import SceneSplit
     from gvtools.scenes.scene import Scene
     from pipelines.reconstruction.settings import RunSettings
     from pipelines.scoring.measurement import MeasureOptions
@@ -94,34 +93,24 @@ def parse_methods(text: str) -> tuple[Method, ...]:
 
 def _parsed(text: str) -> Method:
     from gvtools.completers.base import available
+    from gvtools.settings import changes, with_file
     from gvtools.specs import unknown
     from pipelines.reconstruction.settings import RunSettings
 
-    name, equals, path = text.partition("=")
-    if equals:
-        return _of_path(name.strip(), Path(path.strip()).expanduser())
-    if text == DEFAULT:
-        return Method(name=text)
-    if text in PAPER:
-        return Method(name=text, settings=PAPER[text])
-    profiles = RunSettings.presets["profile"]
-    if text in profiles:
-        return Method(name=text, settings={"profile": text})
-    if text in available():
-        return Method(name=text, settings={"completer": text})
-    known = (DEFAULT, *PAPER, *profiles, *available())
-    raise OptionError(f"{unknown('method', text, known)}; NAME=DIR gives pictures")
-
-
-def _of_path(name: str, path: Path) -> Method:
-    from gvtools.settings import changes, with_file
-    from pipelines.reconstruction.settings import RunSettings
-
+    name, equals, place = (part.strip() for part in text.partition("="))
+    if not equals:
+        known: dict[str, Mapping[str, Any]] = {DEFAULT: {}, **PAPER}
+        known |= {profile: {"profile": profile} for profile in RunSettings.presets["profile"]}
+        known |= {completer: {"completer": completer} for completer in available()}
+        if name not in known:
+            raise OptionError(f"{unknown('method', name, known)}; NAME=DIR gives pictures")
+        return Method(name=name, settings=known[name])
     if not _NAME.fullmatch(name):
         raise OptionError(
             f"method {name!r}; expected letters, digits, blanks and + . - _, the first a letter or "
             "a digit"
         )
+    path = Path(place).expanduser()
     if path.is_dir():
         return Method(name=name, pictures=path.resolve())
     if path.suffix != ".json" or not path.is_file():
@@ -203,8 +192,6 @@ class _OpenCell:
 
 def measure_cell(cell: BenchmarkCell) -> dict[str, Any]:
     """Make the pictures of a cell, unless the method is a folder of pictures, and measure them."""
-    from gvtools.evaluation.lpips_distance import Lpips
-
     benchmark = load_benchmark(cell.benchmark).at(cell.views)
     recorded = open_benchmark_scene(benchmark, cell.scene, cell.root)
     split = split_of_scene(benchmark, recorded)
@@ -313,7 +300,6 @@ def _of_pictures(opened: _OpenCell) -> tuple[dict[str, Any], dict[str, np.ndarra
 
 def _summary(evaluation: Mapping[str, Any]) -> dict[str, Any]:
     """What tables show of an evaluation, as ``gvtools evaluate`` has it."""
-    from gvtools.evaluation.published import Setting
     from pipelines.report import nested
     from pipelines.scoring.tables import measured_row, scalars
 

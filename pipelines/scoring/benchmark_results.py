@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, astuple, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,10 +13,11 @@ from gvtools.evaluation.published import (
     Benchmark,
     MeasuredRow,
     Setting,
+    common,
     comparison_table,
     side_by_side,
 )
-from gvtools.evaluation.statistics import Interval, mean_interval
+from gvtools.evaluation.statistics import Interval, mean_interval, mean_known
 from gvtools.evaluation.tables import Column, Table, Value
 from gvtools.files import write_json, write_text
 from pipelines.scoring.benchmark import FAILED, BenchmarkCell, read_cell
@@ -79,13 +80,12 @@ def _result(
         figure: interval.mean if interval.n == len(scenes) else None
         for figure, interval in intervals.items()
     }
-    seconds = [r["seconds"] for r in scenes.values() if r.get("seconds") is not None]
     peaks = [r["peak_bytes"] for r in scenes.values() if r.get("peak_bytes") is not None]
     setting = _setting(benchmark, list(scenes.values()), failed=len(failures), lpips=lpips)
     return MethodResult(
         row=MeasuredRow(name, figures, setting),
         intervals=intervals,
-        seconds=sum(seconds) / len(seconds) if seconds else None,
+        seconds=mean_known([r.get("seconds") for r in scenes.values()]),
         peak_bytes=max(peaks, default=None),
         failures=failures,
         scenes=scenes,
@@ -95,10 +95,8 @@ def _result(
 def _setting(
     benchmark: Benchmark, results: Sequence[Mapping[str, Any]], *, failed: int, lpips: Any
 ) -> Setting:
-    sizes = {tuple(result["resolution"] or ()) for result in results}
-    size = sizes.pop() if len(sizes) == 1 else ()
+    size = common(tuple(result["resolution"] or ()) for result in results)
     rounds = [names for result in results for names in result["split"]["rounds"]]
-    per_round = {len(names) for names in rounds}
     poses = {result["poses_from"] for result in results}
     met3r = {result["met3r"] for result in results}
     masked = any(result.get("masked_share") for result in results)
@@ -106,7 +104,7 @@ def _setting(
         data_set=benchmark.name,
         resolution=(size[0], size[1]) if size else None,
         context=benchmark.context,
-        targets=per_round.pop() if len(per_round) == 1 else None,
+        targets=common(map(len, rounds)),
         rounds=benchmark.rounds,
         scenes=len(results),
         failed=failed,
@@ -162,13 +160,13 @@ def interval_table(benchmark: Benchmark, by_views: Mapping[int, Sequence[MethodR
     """For each number of views, method and figure one row: mean over scenes, its interval."""
     columns = (Column("views"), Column("method"), Column("figure"), Column("mean", digits=4),
                Column("low", digits=4), Column("high", digits=4), Column("scenes"))  # fmt: skip
-    rows: list[tuple[Value, ...]] = []
-    for views, results in by_views.items():
-        for result in results:
-            for name, interval in result.intervals.items():
-                if interval.n:
-                    ends = interval.mean, interval.low, interval.high, interval.n
-                    rows.append((views, result.row.system, name, *ends))
+    rows = (
+        (views, result.row.system, name, *astuple(interval))
+        for views, results in by_views.items()
+        for result in results
+        for name, interval in result.intervals.items()
+        if interval.n
+    )
     return Table(columns, tuple(rows), f"{benchmark.name}: means over scenes")
 
 

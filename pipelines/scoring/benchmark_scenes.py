@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gvtools.errors import ProjectError
+from gvtools.evaluation.images import Lpips, psnr, ssim
+from gvtools.evaluation.published import Benchmark, SceneSplit, split_scene
 from gvtools.files import make_folder, replaced_when_written
 
 if TYPE_CHECKING:
-    from gvtools.evaluation.lpips_distance import Lpips
-    from gvtools.evaluation.published import Benchmark
-    from gvtools.evaluation.splits import SceneSplit
     from gvtools.scenes.scene import Scene
 
 # Longer side of a thumbnail, pixels.
@@ -73,8 +72,6 @@ def _name_there(benchmark: Benchmark, name: str, root: Path) -> str:
 
 def split_of_scene(benchmark: Benchmark, scene: Scene) -> SceneSplit:
     """The views of a recorded scene that are given, and those that are completed."""
-    from gvtools.evaluation.splits import split_scene
-
     return split_scene(
         benchmark.split_of(benchmark.context),
         scene.names,
@@ -154,8 +151,6 @@ def masked_figures(
     lpips: Lpips | None,
 ) -> dict[str, float | None]:
     """PSNR of the object's pixels; SSIM and LPIPS of pictures that are white outside it."""
-    from gvtools.evaluation.images import psnr, ssim
-
     if not masks or any(mask is None for mask in masks.values()):
         return {}
     rows: list[dict[str, float | None]] = []

@@ -16,11 +16,12 @@ from gvtools.evaluation.published import (
     Benchmark,
     Setting,
     benchmark_names,
+    common,
     comparison_table,
     load_benchmark,
+    protocol_split,
     side_by_side,
 )
-from gvtools.evaluation.splits import protocol_split
 from gvtools.evaluation.statistics import LEVEL, RESAMPLES, mean_interval, mean_known
 from gvtools.files import write_json
 from gvtools.runs.digests import versions
@@ -249,28 +250,19 @@ def _setting(
 ) -> Setting:
     """How the figures were measured, as far as it decides what they may be ranked with."""
     reports = [report for run in runs for report in run.rounds[1:]]
-    sizes = {
-        (view["camera"]["width"], view["camera"]["height"])
-        for report in reports
-        for view in report["views"]
-    }
+    cameras = [view["camera"] for report in reports for view in report["views"]]
     met3r = [nested(e, "consistency.generated.met3r.status") for e in evaluations]
     poses = [e["poses"] for e in evaluations if nested(e, "poses.pictures")]
     located = sum(part["located"] for part in poses), sum(part["pictures"] for part in poses)
     masked = max(
         (e["images"]["settings"]["masked_share"] for e in evaluations if "images" in e), default=0
     )
-
-    def common(numbers: Sequence[int]) -> int | None:
-        return numbers[0] if len(set(numbers)) == 1 else None
-
     return Setting(
         data_set=data_set,
-        # Mixed sizes and numbers are none of the published ones.
-        resolution=sizes.pop() if len(sizes) == 1 else None,
-        context=common([len(run.record["context"]) for run in runs]),
-        targets=common([len(report["views"]) for report in reports]),
-        rounds=common([len(run.rounds) - 1 for run in runs]),
+        resolution=common((camera["width"], camera["height"]) for camera in cameras),
+        context=common(len(run.record["context"]) for run in runs),
+        targets=common(len(report["views"]) for report in reports),
+        rounds=common(len(run.rounds) - 1 for run in runs),
         scenes=len({run.record["project"] for run in runs}),
         pixels="inside masks" if masked > 0 else "all",
         lpips_net=options.lpips_net if options.lpips else None,

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.errors import OptionError, ProjectError
+from gvtools.evaluation.images import better_reading
 from gvtools.evaluation.picture_sets import (
     Matching,
     MethodPicture,
@@ -26,6 +27,7 @@ from gvtools.runs.layout import RECORD
 from gvtools.runs.poses import refined_poses_of
 from gvtools.runs.run import Run, RunTarget, load_memory, load_run
 from gvtools.runs.target_files import to_bytes
+from gvtools.scenes.inspection import spread
 from gvtools.scenes.scene import Frame
 from pipelines.console import Console
 from pipelines.scoring.evaluation import provenance
@@ -35,7 +37,6 @@ from pipelines.scoring.measurement import (
     Measurement,
     MeasureOptions,
     context_pictures,
-    evenly,
     load_measured,
     matcher_called,
     run_targets,
@@ -339,10 +340,8 @@ def _doubt(
 
 def _other_reading(matched: Sequence[MeasuredTarget]) -> str:
     """What is said where a few pictures would all fit their truths far better if read otherwise."""
-    from gvtools.evaluation.picture_readings import better_reading
-
     true = [(target.picture.rgb, target.truth) for target in matched if target.truth is not None]
-    some = [true[row] for row in evenly(len(true), READINGS)]
+    some = [true[row] for row in spread(len(true), READINGS)]
     found = better_reading([rgb for rgb, _ in some], [truth for _, truth in some])
     return found and f"its pictures seem to be {found}"
 
@@ -381,7 +380,7 @@ def judge(
         console=console,
         matcher=matcher_called(options.matcher),
     )
-    shown = {targets[row].key: targets[row] for row in evenly(len(targets), sheet_views)}
+    shown = {targets[row].key: targets[row] for row in spread(len(targets), sheet_views)}
     on_sheets: dict[str, dict[tuple[str, int], NDArray[np.uint8]]] = {}
 
     def measure(path: Path, name: str) -> dict[str, Any]:
@@ -422,7 +421,17 @@ def judge(
         },
     }
     tables = judge_tables(figures)
-    files = _write(figures, tables, _judged_views(shown, on_sheets), out=out)
+    views = [
+        JudgedView(
+            name=target.picture.name,
+            truth=None if target.truth is None else target.truth.rgb,
+            mask=None if target.truth is None else target.truth.mask,
+            never_observed=~target.observed,
+            pictures={name: own.get(key) for name, own in on_sheets.items()},
+        )
+        for key, target in shown.items()
+    ]
+    files = _write(figures, tables, views, out=out)
     print_judgement(tables, console)
     console.line(
         f"results in {out}: judge.json, judge.md, judge.csv, "
@@ -450,23 +459,6 @@ def _print_matching(method: MethodPictures, targets: int, console: Console) -> N
         console.warn(f"{name}: {doubt}")
     for (width, height), count in sorted(method.resized.items()):
         console.warn(f"{name}: {count} pictures of {width}x{height} pixels resized to their views'")
-
-
-def _judged_views(
-    shown: Mapping[tuple[str, int], MeasuredTarget],
-    pictures: Mapping[str, Mapping[tuple[str, int], NDArray[np.uint8]]],
-) -> list[JudgedView]:
-    """The views of the contact sheets, each with its picture of every method that has one."""
-    return [
-        JudgedView(
-            name=target.picture.name,
-            truth=None if target.truth is None else target.truth.rgb,
-            mask=None if target.truth is None else target.truth.mask,
-            never_observed=~target.observed,
-            pictures={name: own.get(key) for name, own in pictures.items()},
-        )
-        for key, target in shown.items()
-    ]
 
 
 def _write(

@@ -17,12 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gvtools.errors import DegenerateError, ProjectError
-from gvtools.evaluation.images import FIGURES, view_figures
+from gvtools.evaluation.images import FIGURES, Lpips, view_figures
 from gvtools.evaluation.posed_picture import PosedPicture
 from gvtools.evaluation.statistics import mean_interval, mean_known
+from gvtools.scenes.inspection import spread
 
 if TYPE_CHECKING:
-    from gvtools.evaluation.lpips_distance import Lpips
     from gvtools.evaluation.pose_probe import Located, PoseProbe
     from gvtools.evaluation.statistics import ErrorStatistics
     from gvtools.evaluation.trajectories import PoseAuc, PoseErrors
@@ -244,14 +244,14 @@ class Measurement:
 
         ``surfaces`` are the same with the depth by which features are carried.
         """
-        from gvtools.evaluation.depth_reprojection import depth_reprojection_of_views
         from gvtools.evaluation.feature_consistency import feature_consistency
         from gvtools.evaluation.geometric_verification import verify_geometry
+        from gvtools.evaluation.posed_picture import depth_reprojection_of_views
 
         depth = asdict(depth_reprojection_of_views(pictures))
         pairs = self.console.track(list(pairwise(surfaces)), f"{label}: pairs")
         features = [feature_consistency(first, second) for first, second in pairs]
-        matched = [pictures[row] for row in evenly(len(pictures), MOST_MATCHED)]
+        matched = [pictures[row] for row in spread(len(pictures), MOST_MATCHED)]
         self.console.line(f"{label}: matching {len(matched)} pictures")
         geometry = asdict(verify_geometry(matched, seed=self.options.seed))
         return {
@@ -311,12 +311,6 @@ class Measurement:
 def interval(values: Iterable[float | None], seed: int) -> dict[str, Any]:
     """Mean, ends of its bootstrap interval, and number of the values that are there, for JSON."""
     return asdict(mean_interval(values, seed=seed))
-
-
-def evenly(count: int, most: int) -> list[int]:
-    """At most so many of ``count`` rows, spread evenly over them."""
-    rows = np.linspace(0, count - 1, min(most, count)).round().astype(int)
-    return [int(row) for row in np.unique(rows)]
 
 
 def _met3r(pictures: Sequence[PosedPicture], seed: int) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from itertools import combinations
+from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -52,6 +53,7 @@ POSES = (
     ("pose AUC at 3 degrees, failures as wrong", "auc.3", "pictures"),
     ("pose AUC at 30 degrees, failures as wrong", "auc.30", "pictures"),
 )
+ENDS = itemgetter("mean", "low", "high", "n")  # of an interval
 FORMS = {".csv": csv_text, ".md": markdown, ".tex": latex}
 
 
@@ -89,15 +91,14 @@ def summary_table(
         images = evaluation.get("images", {"mean": {}, "rounds": [], "notes": {}})
         for figure, value in images["mean"].items():
             by_round = {part["round"]: part[figure]["mean"] for part in images["rounds"]}
-            ends = value["mean"], value["low"], value["high"], value["n"]
-            rows.append((name, figure, *ends, *(by_round.get(i + 1) for i in range(rounds)), None))
+            rounds_means = (by_round.get(i + 1) for i in range(rounds))
+            rows.append((name, figure, *ENDS(value), *rounds_means, None))
         for figure, mean, low, high, n, true in scalars(evaluation):
             rows.append((name, figure, mean, low, high, n, *[None] * rounds, true))
         notes += [f"{name}: {key}: {text}" for key, text in images["notes"].items()]
         notes += [f"{name}: {text}" for text in _without_figures(evaluation)]
     for figure, interval in over_scenes.items():
-        ends = interval["mean"], interval["low"], interval["high"], interval["n"]
-        rows.append(("all scenes", figure, *ends, *[None] * rounds, None))
+        rows.append(("all scenes", figure, *ENDS(interval), *[None] * rounds, None))
     if any(evaluation.get("poses", {}).get("located") for evaluation in evaluations):
         notes.append(
             "pose figures are over the located pictures; a completed picture repeats what the "
@@ -119,8 +120,7 @@ def scalars(evaluation: Mapping[str, Any]) -> list[Scalar]:
         out += [_scalar(*entry, part=ours, true=true) for entry in CONSISTENCY]
         features = ours["feature_consistency"]
         score, path = features["score"], "feature_consistency.score.mean"
-        ends = score["mean"], score["low"], score["high"], score["n"]
-        out.append(("feature consistency", *ends, nested(true, path)))
+        out.append(("feature consistency", *ENDS(score), nested(true, path)))
         label = "feature consistency of unrelated content"
         out.append((label, features["unrelated"], None, None, None, None))
     poses = evaluation.get("poses", {})

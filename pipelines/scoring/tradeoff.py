@@ -140,6 +140,7 @@ def changed(config: RunSettings, settings: Settings) -> RunSettings:
     return with_values(config, settings)
 
 
+@dataclass(eq=False)
 class Trials:
     """Runs with changed settings, each made once and stored in a JSON file.
 
@@ -147,11 +148,11 @@ class Trials:
     units, by ``run_identity`` of the start, are other trials.
     """
 
-    def __init__(
-        self, scene: Scene, config: RunSettings, *, folder: Path, identity: Mapping[str, Any]
-    ) -> None:
-        self.scene, self.config, self.folder, self.identity = scene, config, folder, identity
-        self._warm = False
+    scene: Scene
+    config: RunSettings  # of the start
+    folder: Path
+    identity: Mapping[str, Any]
+    _warm: bool = False
 
     def make(self, label: str, settings: Settings) -> Trial:
         """Run with these settings."""

@@ -19,22 +19,19 @@ from consistency_scene import (
 )
 
 from gvtools.errors import ShapeError
-from gvtools.evaluation.depth_reprojection import (
-    depth_reprojection,
-    depth_reprojection_of_views,
-)
 from gvtools.evaluation.geometric_verification import (
     epipolar_distances,
     verify_geometry,
 )
-from gvtools.evaluation.posed_picture import PosedPicture, Seen, correspond
-
-FIGURES = (
-    "mean_pixels",
-    "median_pixels",
-    "mean_relative_depth",
-    "median_relative_depth",
+from gvtools.evaluation.posed_picture import (
+    PosedPicture,
+    Seen,
+    correspond,
+    depth_reprojection,
+    depth_reprojection_of_views,
 )
+
+FIGURES = ("mean_pixels", "median_pixels", "mean_relative_depth", "median_relative_depth")
 SHARES = ("covisible_share", "occluded_share", "contradicting_share", "unknown_share")
 
 
@@ -76,18 +73,15 @@ def test_a_wrong_depth_scale_gives_its_closed_form(scale):
     focal = first.camera.K[0, 0, 0]
     # q's ray at depth s Z comes back to f X' / (s Z), X' = b + s (X - b): off by f b (1 - s) / s Z.
     pixels = focal * baseline * abs(1 - scale) / (scale * distance)
-    assert result.mean_pixels == pytest.approx(pixels, rel=1e-5)
-    assert result.median_pixels == pytest.approx(pixels, rel=1e-5)
-    assert result.mean_relative_depth == pytest.approx(abs(1 / scale - 1), rel=1e-5)
-    assert result.median_relative_depth == pytest.approx(abs(1 / scale - 1), rel=1e-5)
+    relative = abs(1 / scale - 1)
+    expected = pytest.approx([pixels, pixels, relative, relative], rel=1e-5)
+    assert [getattr(result, name) for name in FIGURES] == expected
 
 
 def test_a_scale_beyond_the_occlusion_limit_shows_in_the_shares():
     near = depth_reprojection(_flat(2.0), _flat(2.0, x=0.1, measured=1.8))
     far = depth_reprojection(_flat(2.0), _flat(2.0, x=0.1, measured=2.2))
     assert near.occluded_share == 1 and far.contradicting_share == 1
-    assert all(getattr(result, name) is None for result in (near, far) for name in FIGURES)
-    assert near.status == "empty: flat and flat see no common surface"
 
 
 def test_pixels_are_classified_as_the_scenes_geometry_says(pair):
@@ -150,17 +144,16 @@ def test_masked_and_missing_depth_is_not_known(pair):
 def test_views_without_common_surface_give_no_figure(pair):
     first, second = pair
     away = moved(second, turn=(0, 180, 0))
-    blind = replace(second, depth=None)
-    for result, reason in (
-        (depth_reprojection(first, away), "nothing of left falls inside right"),
-        (depth_reprojection(replace(first, depth=None), second), "left has no pixel with depth"),
-        (depth_reprojection(first, blind), "right has no pixel with depth"),
+    for views, reason, unknown in (
+        ((first, away), "nothing of left falls inside right", None),
+        ((replace(first, depth=None), second), "left has no pixel with depth", None),
+        ((first, replace(second, depth=None)), "right has no pixel with depth", 1),
+        ((_flat(2.0), _flat(2.0, x=0.1, measured=1.8)), "flat and flat see no common surface", 0),
     ):
+        result = depth_reprojection(*views)
         assert result.status == f"empty: {reason}" and not result.ok
-        assert result.covisible == 0
+        assert result.covisible == 0 and result.unknown_share == unknown
         assert all(getattr(result, name) is None for name in FIGURES)
-    assert depth_reprojection(first, away).covisible_share is None
-    assert depth_reprojection(first, blind).unknown_share == 1
 
 
 def test_many_views_weigh_by_pixels_and_name_the_pairs_without_overlap(pair):
@@ -173,7 +166,7 @@ def test_many_views_weigh_by_pixels_and_name_the_pairs_without_overlap(pair):
     assert views.status == "measured" and views.without_overlap == (("right", "away"),)
     found = [p for p in views.pairs if p.ok]
     assert views.covisible == sum(p.covisible for p in found)
-    for name in ("mean_pixels", "mean_relative_depth"):
+    for name in FIGURES[::2]:
         total = sum(getattr(p, name) * p.covisible for p in found)
         assert getattr(views, name) == pytest.approx(total / views.covisible)
     pixels, relative = [], []
@@ -212,6 +205,8 @@ def test_a_real_recording_agrees_until_a_pose_is_wrong(shared):
 
 
 WIDTH, HEIGHT = 180, 135
+# One of the views by a wrong pose.
+WRONG = [((0, 3, 0), (0, 0, 0)), ((3, 0, 0), (0, 0, 0)), ((0, 0, 0), (0.15, 0.08, 0))]
 
 
 @pytest.fixture(scope="module")
@@ -263,10 +258,7 @@ def test_points_lie_on_the_scenes_surfaces_and_poses_stay(right, views, workspac
     assert np.mean(np.minimum(wall, square) < 0.03) > 0.95
 
 
-@pytest.mark.parametrize(
-    ("turn", "shift"),
-    [((0, 3, 0), (0, 0, 0)), ((3, 0, 0), (0, 0, 0)), ((0, 0, 0), (0.15, 0.08, 0))],
-)
+@pytest.mark.parametrize(("turn", "shift"), WRONG)
 def test_a_wrong_pose_shows(right, views, turn, shift):
     wrong = verify_geometry([views[0], moved(views[1], turn=turn, shift=shift), *views[2:]])
     # What does not use the poses stays.
@@ -318,22 +310,17 @@ def test_a_camera_that_only_turns_has_no_epipolar_figure(views):
     assert result.mean_reprojection is None and result.mean_track_length is None
 
 
-def test_pictures_without_texture_give_a_status(views):
+def test_too_few_pictures_or_none_with_texture_give_a_status(views):
     blank = [replace(view, rgb=np.full_like(view.rgb, 120)) for view in views[:3]]
-    result = verify_geometry(blank)
-    assert result.status == (
-        "empty: no pair of the 3 pictures (0 features) has 15 verified matches"
-    )
-    assert result.mean_verified == result.verified_share == result.registered_share == 0
-    assert result.epipolar is None and result.mean_reprojection is None
-    assert result.unregistered == ("view 0", "view 1", "view 2")
-
-
-def test_too_few_pictures_give_a_status(views):
-    for few in (views[:0], views[:1]):
-        result = verify_geometry(few)
-        assert result.status == f"empty: {len(few)} picture(s); at least 2 are needed"
-        assert result.registered_share is None and result.mean_verified is None
+    nothing = "no pair of the 3 pictures (0 features) has 15 verified matches"
+    few = "picture(s); at least 2 are needed"
+    for given, reason, share in ((blank, nothing, 0), ([], f"0 {few}", None),
+                                 (views[:1], f"1 {few}", None)):  # fmt: skip
+        result = verify_geometry(given)
+        assert result.status == f"empty: {reason}"
+        assert result.mean_verified == result.verified_share == result.registered_share == share
+        assert result.epipolar is None and result.mean_reprojection is None
+        assert result.unregistered == tuple(view.name for view in given)
 
 
 def test_a_camera_with_skew_is_refused(views):

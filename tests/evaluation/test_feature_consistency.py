@@ -217,11 +217,8 @@ def test_met3r_is_given_square_pairs_from_minus_one_to_one(monkeypatch, pair):
     images = call.pop("images")
     assert images.shape == (1, 2, 3, 64, 64) and images.dtype == torch.float32
     assert (images[:, 0] == -1).all() and (images[:, 1] == 1).all()
-    assert call == {
-        "return_overlap_mask": True,
-        "return_score_map": False,
-        "return_projections": False,
-    }
+    off = dict.fromkeys(("return_score_map", "return_projections"), False)
+    assert call == {"return_overlap_mask": True, **off}
     apart = met3r_score(pair[0], pair[1], FakeMet3r(256, mask=0.0))
     assert (apart.status, apart.score) == ("empty: MEt3R finds no overlap", None)
 

@@ -15,18 +15,17 @@ import pytest
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from gvtools.errors import CheckpointError, OptionError, ShapeError
-from gvtools.evaluation.images import image_figures, psnr, relative_depth_error, ssim, ssim_map
-from gvtools.evaluation.lpips_distance import BACKBONES, Lpips
-from gvtools.evaluation.picture_readings import better_reading
+from gvtools.evaluation.images import (
+    BACKBONES,
+    Lpips,
+    better_reading,
+    image_figures,
+    psnr,
+    relative_depth_error,
+    ssim,
+    ssim_map,
+)
 from gvtools.scenes.scene import Frame
-
-SSIM = {
-    "gaussian_weights": True,
-    "sigma": 1.5,
-    "use_sample_covariance": False,
-    "data_range": 1.0,
-    "channel_axis": -1,
-}
 
 
 @pytest.fixture
@@ -36,8 +35,21 @@ def pair():
     return np.clip(truth + rng.normal(0, 0.1, truth.shape), 0, 1), truth
 
 
-def test_psnr_is_skimages(pair):
-    assert psnr(*pair) == pytest.approx(peak_signal_noise_ratio(pair[1], pair[0], data_range=1))
+@pytest.mark.parametrize("sample", [False, True])
+def test_figures_are_scikit_images_and_a_full_mask_changes_nothing(pair, sample):
+    image, truth = pair
+    expected, similarity = structural_similarity(
+        image, truth, gaussian_weights=True, sigma=1.5, use_sample_covariance=sample,
+        data_range=1.0, channel_axis=-1, full=True,
+    )  # fmt: skip
+    ours = ssim_map(image, truth, sample_covariance=sample)
+    np.testing.assert_allclose(ours, similarity[5:-5, 5:-5].mean(axis=-1), atol=1e-12)
+    for mask in (None, np.ones(truth.shape[:2], bool)):
+        assert psnr(image, truth, mask=mask) == pytest.approx(
+            peak_signal_noise_ratio(truth, image, data_range=1)
+        )
+        found = ssim(image, truth, mask=mask, sample_covariance=sample)
+        assert found == pytest.approx(expected, abs=1e-12)
 
 
 def test_psnr_of_a_constant_error_is_its_closed_form():
@@ -53,15 +65,6 @@ def test_bytes_stand_for_255ths(pair):
     # float32 is compared in float64.
     single = (truth / 255).astype(np.float32)
     assert psnr(image, single) == pytest.approx(psnr(image / 255, single.astype(np.float64)))
-
-
-def test_ssim_is_skimages_and_a_full_mask_changes_nothing(pair):
-    image, truth = pair
-    expected = structural_similarity(image, truth, **SSIM)
-    assert ssim(image, truth) == pytest.approx(expected, abs=1e-12)
-    full = np.ones(truth.shape[:2], bool)
-    assert ssim(image, truth, mask=full) == pytest.approx(expected, abs=1e-12)
-    assert ssim(truth, truth) == pytest.approx(1.0)
 
 
 def test_depth_error_is_the_median_over_pixels_with_both():
@@ -85,19 +88,6 @@ def test_what_does_not_fit_is_refused():
         psnr(image.astype(np.int64), image)
     with pytest.raises(ShapeError, match="at least 11x11"):
         ssim(image[:10], image[:10])
-
-
-@pytest.mark.parametrize("sample", [False, True])
-def test_the_compiled_map_is_scikit_images(sample):
-    rng = np.random.default_rng(5)
-    first = rng.random((37, 53, 3))
-    second = np.clip(first + 0.2 * rng.standard_normal(first.shape), 0, 1)
-    _, expected = structural_similarity(
-        first, second, gaussian_weights=True, sigma=1.5, use_sample_covariance=sample,
-        data_range=1.0, channel_axis=-1, full=True,
-    )  # fmt: skip
-    ours = ssim_map(first, second, sample_covariance=sample)
-    np.testing.assert_allclose(ours, expected[5:-5, 5:-5].mean(axis=-1), atol=1e-12)
 
 
 def test_regions_have_the_figures_of_their_masks():
@@ -240,21 +230,15 @@ def test_it_is_the_packages_own_forward(alex, take, monkeypatch):
 
 
 @needs_package
-def test_equal_pictures_have_no_distance_noise_adds_to_it_and_shapes_are_checked(alex, take):
+def test_equal_pictures_have_no_distance_and_noise_adds_to_it(alex, take):
     distance = take("alex", alex.read_bytes()).distance
-    image, truth = pictures()
+    image, _ = pictures()
     rng = np.random.default_rng(1)
     values = [
         distance(np.clip(image + rng.normal(0, s, image.shape), 0, 255).astype("u1"), image)[0]
         for s in (0, 5, 40)
     ]
     assert 0 == values[0] < values[1] < values[2]
-    wrongs: list[Any] = [truth[:-1], truth.astype(np.float32), truth[..., 0]]
-    for wrong in wrongs:
-        with pytest.raises(ShapeError):
-            distance(image, wrong)
-    with pytest.raises(ShapeError, match="at least 32"):
-        distance(image[:20], truth[:20])
 
 
 @pytest.mark.parametrize(("net", "count"), [("vgg", 14_714_688), ("alex", 2_469_696)])
@@ -275,9 +259,3 @@ def test_absent_weights_name_the_file_and_its_place(tmp_path, monkeypatch, alex)
     (tmp_path / "hub/checkpoints" / alex.name).write_bytes(alex.read_bytes())
     with pytest.raises(CheckpointError, match="SHA-256"):
         Lpips("alex")
-
-
-def test_another_network_is_never_called_lpips(alex, take):
-    for net, content in (("alex", b"nothing"), ("vgg", alex.read_bytes())):
-        with pytest.raises(CheckpointError, match="does not hold the weights"):
-            take(net, content)

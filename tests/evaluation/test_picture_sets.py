@@ -1,3 +1,4 @@
+# mypy: no-check-untyped-defs
 """Pictures in the layouts of nerfstudio, gsplat and NerfBaselines, matched with views."""
 
 from __future__ import annotations
@@ -30,14 +31,6 @@ def png(rgb) -> bytes:
     return out.getvalue()
 
 
-def truth_of(one):
-    return one.load_truth()
-
-
-def depth_of(one):
-    return one.load().depth
-
-
 def loaded(found):
     return {one.name: one.load().rgb for one in found.pictures}
 
@@ -52,7 +45,7 @@ def test_plain_folders_are_read_with_their_folders_and_depth(tmp_path):
     assert (found.layout, found.names) == ("plain folder", ("a/1.png", "a/2.png"))
     assert np.array_equal(loaded(found)["a/1.png"], picture(0))
     assert found.pictures[0].load().depth is None
-    assert np.array_equal(depth_of(found.pictures[1]), depth)
+    assert np.array_equal(found.pictures[1].load().depth, depth)
 
 
 def test_the_pictures_of_gvtools_render_are_read_without_their_other_files(tmp_path):
@@ -61,7 +54,7 @@ def test_the_pictures_of_gvtools_render_are_read_without_their_other_files(tmp_p
     np.savez(tmp_path / "frame-1.color.depth.npz", depth=np.ones((12, 16), np.float32))
     found = open_pictures(tmp_path)
     assert (found.layout, found.names) == ("gvtools render", ("frame-1.color.png",))
-    assert depth_of(found.pictures[0]).sum() == 12 * 16
+    assert found.pictures[0].load().depth.sum() == 12 * 16
 
 
 def test_transparent_pixels_lie_before_black(tmp_path):
@@ -87,7 +80,7 @@ def test_ns_render_dataset(tmp_path, folder):
     assert found.layout == "nerfstudio, ns-render dataset"
     assert found.names == ("cam/2.png", "cam/10.png", "cam/30.png")
     assert np.array_equal(found.pictures[1].load().rgb, picture(1))
-    assert np.array_equal(truth_of(found.pictures[1]), picture(11))
+    assert np.array_equal(found.pictures[1].load_truth(), picture(11))
     assert found.notes == (() if folder else ("split test taken; also there: train",))
 
 
@@ -100,7 +93,7 @@ def test_ns_eval(tmp_path):
     assert (found.layout, len(found.pictures)) == ("nerfstudio, ns-eval", 2)
     assert found.alphabetical
     # JPEG at its best quality is some levels off.
-    render, truth = found.pictures[1].load().rgb, truth_of(found.pictures[1])
+    render, truth = found.pictures[1].load().rgb, found.pictures[1].load_truth()
     assert np.abs(render.astype(int) - picture(11)).mean() < 5
     assert np.abs(truth.astype(int) - picture(1)).mean() < 5
 
@@ -117,7 +110,7 @@ def test_gsplat(tmp_path, folder):
     assert (found.layout, found.alphabetical) == ("gsplat", True)
     assert found.names == tuple(f"val_step29999_{i:04d}.png" for i in range(3))
     assert np.array_equal(found.pictures[2].load().rgb, picture(29999 + 2))
-    assert np.array_equal(truth_of(found.pictures[2]), picture(2))
+    assert np.array_equal(found.pictures[2].load_truth(), picture(2))
     assert "also there: compress_step29999, val_step6999" in found.notes[1]
 
 
@@ -160,7 +153,7 @@ def test_nerfbaselines(tmp_path, form):
     assert found.layout == "NerfBaselines"
     assert found.names == ("cam/2.png", "cam/10.png", "cam/30.png")
     assert np.array_equal(found.pictures[1].load().rgb, picture(1))
-    assert np.array_equal(truth_of(found.pictures[1]), picture(11))
+    assert np.array_equal(found.pictures[1].load_truth(), picture(11))
     taken = ("predictions-30000.tar.gz taken, the last of 2",)
     assert found.notes == (taken if form == "training" else ())
 
@@ -175,7 +168,7 @@ def test_renders_of_3dgs_and_its_descendants(tmp_path, place):
     found = open_pictures(tmp_path / place)
     assert (found.layout, found.alphabetical, len(found.pictures)) == ("3DGS", True, 11)
     assert found.pictures[10].load().rgb[0, 0, 0] == 40
-    assert truth_of(found.pictures[10])[0, 0, 0] == 210
+    assert found.pictures[10].load_truth()[0, 0, 0] == 210
 
 
 def test_what_holds_no_pictures_is_refused(tmp_path, monkeypatch):
@@ -211,6 +204,7 @@ def test_a_canvas_that_is_no_pair_and_a_damaged_picture_are_named(tmp_path, name
         open_pictures(tmp_path).pictures[0].load()
 
 
+BY_VIEW, ZERO = {"alphabetical": True}, {"others": ["f_000.jpg"]}
 VIEWS = tuple(f"frame-{i:06d}.color.jpg" for i in (10, 30, 50))
 
 
@@ -238,19 +232,22 @@ def test_names_match_without_endings_and_what_all_have_around_them(pictures, vie
 
 
 @pytest.mark.parametrize(
-    ("pictures", "views", "alphabetical", "expected"),
+    ("pictures", "views", "how", "expected"),
     [
         # Numbers are whole names, not parts of longer ones.
-        (["r_11.png", "r_1.png"], ["1.jpg", "11.jpg"], False, ("name", ["r_1.png", "r_11.png"])),
+        (["r_11.png", "r_1.png"], ["1.jpg", "11.jpg"], {}, ("name", ["r_1.png", "r_11.png"])),
         # Folders of the pictures do not count where names are enough.
-        (["a/1.png", "b/2.png"], ["1.jpg", "2.jpg"], False, ("name", ["a/1.png", "b/2.png"])),
+        (["a/1.png", "b/2.png"], ["1.jpg", "2.jpg"], {}, ("name", ["a/1.png", "b/2.png"])),
         # The order is the natural one of both sides, or the alphabetical one of the views.
-        (["p10.png", "p9.png"], ["v2.jpg", "v10.jpg"], False, ("order", ["p9.png", "p10.png"])),
-        (["0.png", "1.png"], ["v2.jpg", "v10.jpg"], True, ("order", ["1.png", "0.png"])),
+        (["p10.png", "p9.png"], ["v2.jpg", "v10.jpg"], {}, ("order", ["p9.png", "p10.png"])),
+        (["0.png", "1.png"], ["v2.jpg", "v10.jpg"], BY_VIEW, ("order", ["1.png", "0.png"])),
+        # Zeros before numbers do not count, nor the sign that joins folders.
+        (["4.png", "12.png"], ["f_012.jpg", "f_004.jpg"], ZERO, ("name", ["12.png", "4.png"])),
+        (["b_1.png", "a_1.png"], ["a/1.jpg", "b/1.jpg"], {}, ("name", ["a_1.png", "b_1.png"])),
     ],
 )
-def test_partners(pictures, views, alphabetical, expected):
-    assert partners(pictures, views, alphabetical=alphabetical) == expected
+def test_partners(pictures, views, how, expected):
+    assert partners(pictures, views, **how) == expected
 
 
 def test_missing_and_left_over_pictures_are_told():
@@ -334,10 +331,3 @@ def test_pictures_of_other_views_and_times_stand_for_none(pictures, views, other
     with pytest.raises(OptionError, match="--match order"):
         match_pictures(names[0], names[1], others=names[2])
     assert match_pictures(names[0], names[1], rule="order").picture_of == (0, 1, 2)
-
-
-def test_numbers_without_zeros_and_folders_that_are_joined_find_their_views():
-    found = match_pictures(["4.png", "12.png"], ["f_0012.jpg", "f_0004.jpg"], others=["f_0000.jpg"])
-    assert (found.rule, found.picture_of) == ("name", (1, 0))
-    found = match_pictures(["b_1.png", "a_1.png"], ["a/1.jpg", "b/1.jpg"])
-    assert (found.rule, found.picture_of) == ("name", (1, 0))

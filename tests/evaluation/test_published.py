@@ -20,14 +20,16 @@ from gvtools.evaluation.published import (
     PUBLISHED,
     MeasuredRow,
     Setting,
+    SplitRule,
     benchmark_names,
     comparison_table,
     load_benchmark,
     parse_benchmark,
+    protocol_split,
     reasons_not_to_rank,
     side_by_side,
+    split_scene,
 )
-from gvtools.evaluation.splits import SplitRule, protocol_split, split_scene
 from gvtools.specs import spec_texts
 
 PAPERS = ("dl3dv", "mipnerf360", "realestate10k", "scannetv2")
@@ -211,45 +213,42 @@ def test_the_table_marks_where_rows_come_from_and_says_why_there_is_no_rank():
 FEW = Setting(
     data_set="LLFF", resolution=(504, 378), context=3, targets=None, scenes=8, split="LLFF"
 )
+DTU = {"data_set": "DTU", "resolution": (400, 300), "context": 9, "scenes": 15, "split": "DTU"}
+# Its sizes are a share of the recorded ones.
+NERF360 = {"data_set": "Mip-NeRF 360", "resolution": None, "context": 24, "scenes": 9}
+NERF360 |= {"split": "Mip-NeRF 360", "divided_by": 8}
+BY_FOUR = "resolution divided by: 4 here, 8 published"
+
+
+@pytest.mark.parametrize(
+    ("name", "views", "figure", "change", "reason"),
+    [
+        ("llff", 3, "psnr", {}, None),
+        ("llff", 6, "psnr", {}, "context views a round: 3 here, 6 published"),
+        ("llff", 3, "psnr", {"failed": 1}, "scenes: 1 without figures here"),
+        ("llff", 3, "psnr", {"split": None}, "views: another choice here than the benchmark's"),
+        ("llff", 3, "psnr", {"split": "dtu"}, "views: another choice here than the benchmark's"),
+        ("llff", 3, "psnr", {"resolution": (8, 6)}, "resolution: 8x6 here, 504x378 published"),
+        ("mipnerf360-few", 24, "psnr", NERF360, None),
+        ("mipnerf360-few", 24, "psnr", NERF360 | {"divided_by": 4}, BY_FOUR),
+        ("dtu", 9, "psnr", DTU, None),
+        ("dtu", 9, "psnr_masked", DTU, "object mask: not recorded here, object published"),
+        ("dtu", 9, "psnr_masked", DTU | {"mask": "object"}, None),
+    ],
+)
+def test_few_views_are_ranked_where_nothing_differs(name, views, figure, change, reason):
+    setting = dataclasses.replace(FEW, **change)
+    found = reasons_not_to_rank(setting, load_benchmark(name).at(views), figure)
+    assert found == (() if reason is None else (reason,))
 
 
 def test_few_views_are_ranked_among_the_rows_of_as_many_views():
     three, six = (load_benchmark("llff").at(views) for views in (3, 6))
     assert (len(three.rows), len(six.rows)) == (11, 9)
-    assert reasons_not_to_rank(FEW, three, "psnr") == ()
-    (reason,) = reasons_not_to_rank(FEW, six, "psnr")
-    assert reason == "context views a round: 3 here, 6 published"
     rows = side_by_side([MeasuredRow("mine", {"psnr": 20.5, "ssim": 0.7}, FEW)], three)
     # 20.5 is between DropGaussian's 20.76 and CoR-GS's 20.45.
     assert rows[-1].ranks["psnr"] == 2
     assert rows[-1].ranks["ssim"] is None and "SSIM" in rows[-1].reasons["ssim"][0]
-
-
-@pytest.mark.parametrize(
-    ("change", "reason"),
-    [
-        ({"failed": 1}, "scenes: 1 without figures here"),
-        ({"split": None}, "views: another choice here than the benchmark's"),
-        ({"split": "few-view"}, "views: another choice here than the benchmark's"),
-        ({"resolution": (1008, 756)}, "resolution: 1008x756 here, 504x378 published"),
-    ],
-)
-def test_other_scenes_views_sizes_or_masks_have_no_rank(change, reason):
-    found = reasons_not_to_rank(
-        dataclasses.replace(FEW, **change), load_benchmark("llff").at(3), "psnr"
-    )
-    assert found == (reason,)
-
-
-def test_sizes_that_are_a_share_of_the_recorded_are_compared_as_such():
-    benchmark = load_benchmark("mipnerf360-few").at(24)
-    setting = Setting(
-        data_set="Mip-NeRF 360", resolution=None, context=24, targets=None, scenes=9,
-        split="Mip-NeRF 360", divided_by=8,
-    )  # fmt: skip
-    assert reasons_not_to_rank(setting, benchmark, "psnr") == ()
-    (reason,) = reasons_not_to_rank(dataclasses.replace(setting, divided_by=4), benchmark, "psnr")
-    assert reason == "resolution divided by: 4 here, 8 published"
 
 
 @pytest.mark.parametrize(
@@ -270,18 +269,6 @@ def test_nothing_is_first_beside_rows_that_are_not_comparable(name, views, size)
     setting = dataclasses.replace(setting, data_set="few-view", split="few-view", resolution=None)
     rows = [MeasuredRow(name, {"psnr": psnr}, setting) for name, psnr in (("a", 9.0), ("b", 5.0))]
     assert [row.ranks["psnr"] for row in side_by_side(rows, own)] == [1, 2]
-
-
-def test_masked_figures_need_masks():
-    benchmark = load_benchmark("dtu").at(9)
-    setting = dataclasses.replace(
-        FEW, data_set="DTU", resolution=(400, 300), context=9, scenes=15, split="DTU"
-    )
-    assert reasons_not_to_rank(setting, benchmark, "psnr") == ()
-    (reason,) = reasons_not_to_rank(setting, benchmark, "psnr_masked")
-    assert reason == "object mask: not recorded here, object published"
-    masked = dataclasses.replace(setting, mask="object")
-    assert reasons_not_to_rank(masked, benchmark, "psnr_masked") == ()
 
 
 def test_published_rows_that_depart_from_the_protocol_have_no_rank():
@@ -455,6 +442,8 @@ def test_one_view_less_than_needed_is_refused(chosen):
     assume(needed > 1)
     with pytest.raises(OptionError, match=f"{needed - 1} views; expected at least {needed} "):
         protocol_split(names[:-1], **chosen)
+    with pytest.raises(OptionError, match="stride 0; expected at least 1"):
+        protocol_split(names, stride=0)
 
 
 def test_a_seed_means_the_same_window_in_every_version():
@@ -465,28 +454,3 @@ def test_a_seed_means_the_same_window_in_every_version():
         62,
         15,
     ]
-
-
-def test_the_two_layouts():
-    ends = protocol_split(NAMES[:8])
-    assert ends.context == (NAMES[0], NAMES[7]) and ends.rounds == (NAMES[1:7],)
-    long = protocol_split(NAMES[:20], rounds=3)
-    assert long.context == NAMES[:2]
-    assert long.rounds == (NAMES[2:8], NAMES[8:14], NAMES[14:20])
-    assert (ends.window["layout"], long.window["layout"]) == ("ends", "first")
-    widest = protocol_split(NAMES)
-    assert (widest.window["stride"], widest.window["start"]) == (14, 1)
-    three = protocol_split(NAMES[:9], context=3)
-    assert three.context == (NAMES[0], NAMES[4], NAMES[8])
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"stride": 0}, "stride 0; expected at least 1"),
-        ({"stride": 15}, "100 views; expected at least 106 for 2 context and 1 x 6 target views"),
-    ],
-)
-def test_what_cannot_be_is_refused(options, message):
-    with pytest.raises(OptionError, match=message):
-        protocol_split(NAMES, **options)

@@ -21,10 +21,9 @@ from scipy.spatial.transform import Rotation
 
 from gvtools.cameras import Cameras, check_usable, rigid_poses
 from gvtools.errors import OptionError, ShapeError
-from gvtools.evaluation.depth_reprojection import depth_reprojection
 from gvtools.evaluation.feature_consistency import feature_consistency
 from gvtools.evaluation.images import image_figures, psnr, ssim
-from gvtools.evaluation.posed_picture import PosedPicture
+from gvtools.evaluation.posed_picture import PosedPicture, depth_reprojection
 from gvtools.evaluation.statistics import mean_interval
 from gvtools.evaluation.trajectories import (
     AUC_BINS,

@@ -9,11 +9,13 @@ import signal
 import socket
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from time import monotonic, sleep
+from typing import Any
 
 import pytest
-from command_line import refused
+from command_line import is_running, refused
 
 from gvtools.errors import OptionError
 from gvtools.runs.folder import folder_lock
@@ -66,6 +68,16 @@ def task_of(tmp_path: Path, command: str, **needs: object) -> Task:
     spec = FleetSpec(stages={"stage": stage}, scenes=[{"project": "a"}])
     (task,) = tasks_of(spec, str(tmp_path / "o"), folder=tmp_path)
     return task
+
+
+def ends_with(monkeypatch, status: int, run: Callable[[Any], object] = str) -> None:
+    """Commands of tasks call ``run`` with their words, and end with a status."""
+
+    def ran(command, **_):
+        run(command)
+        return subprocess.CompletedProcess([], status)
+
+    monkeypatch.setattr("pipelines.fleet.task.subprocess.run", ran)
 
 
 class Script:
@@ -122,8 +134,8 @@ def test_a_wrong_list_is_refused_in_one_line(scenes, tmp_path, change, message):
 def test_lost_workers_are_replaced_and_a_failure_skips_what_follows(scenes, tmp_path):
     tasks = planned(scenes, tmp_path / "out")
     wrong = {"status": "failed", "reason": "no cameras", "again": False}
-    pool = Script({("a", "first"): [lost_worker("node lost")], ("b", "first"): [wrong],
-                     ("c", "second"): [lost_worker("killed")] * 9})  # fmt: skip
+    pool: Any = Script({("a", "first"): [lost_worker("node lost")], ("b", "first"): [wrong],
+                          ("c", "second"): [lost_worker("killed")] * 9})  # fmt: skip
     run_fleet(tasks, pool, console=Console(quiet=True))
     assert ("a", "first", 2) in pool.begun and ("a", "second", 1) in pool.begun
     assert ("b", "first", 2) not in pool.begun and ("b", "second", 1) not in pool.begun
@@ -161,13 +173,10 @@ def test_a_command_that_was_killed_may_be_tried_again_and_a_wrong_input_not(
 ):
     task = planned(scenes, tmp_path / "out")[0]
 
-    class Ended:
-        returncode = -signal.SIGKILL
-
-    monkeypatch.setattr("pipelines.fleet.task.subprocess.run", lambda *_, **__: Ended)
+    ends_with(monkeypatch, -signal.SIGKILL)
     record = run_task(task)
     assert (record["reason"], record["again"]) == ("ended by SIGKILL", True)
-    Ended.returncode = 2
+    ends_with(monkeypatch, 2)
     assert run_task(task)["again"] is False
 
 
@@ -177,12 +186,11 @@ def test_a_capture_that_ended_before_its_record_is_made_again(tmp_path, monkeypa
     out = tmp_path / "o" / "a" / "stage"
     seen = []
 
-    def ran(*_, **__):
+    def make(command):
         seen.append(out.exists())
         out.mkdir(parents=True)
-        return subprocess.CompletedProcess([], 0)
 
-    monkeypatch.setattr("pipelines.fleet.task.subprocess.run", ran)
+    ends_with(monkeypatch, 0, make)
     assert run_task(task)["status"] == "done"
     Path(task.record()).unlink()
     assert run_task(task)["status"] == "done"
@@ -199,11 +207,7 @@ def test_a_merge_goes_on_where_an_attempt_stopped(tmp_path, monkeypatch):
     task = task_of(tmp_path, "merge {project} --out {out}")
     words: list[list[str]] = []
 
-    def failing(command, **_):
-        words.append(command)
-        return subprocess.CompletedProcess([], 1)
-
-    monkeypatch.setattr("pipelines.fleet.task.subprocess.run", failing)
+    ends_with(monkeypatch, 1, words.append)
     run_task(task)
     (tmp_path / "o" / "a" / "stage").mkdir()
     run_task(task)
@@ -221,7 +225,7 @@ def test_a_command_ends_with_a_driver_that_is_killed(tmp_path):
     driver.kill()
     driver.wait()
     limit = monotonic() + 20
-    while _runs(command):
+    while is_running(command):
         assert monotonic() < limit, "it goes on without its driver"
         sleep(0.01)
     driver.stdout.close()
@@ -237,14 +241,6 @@ command = [sys.executable, "-c", "import os, time; print(os.getpid(), flush=True
 pool = ThreadPoolExecutor(1)
 pool.submit(subprocess.run, command, preexec_fn=_ending_with(os.getpid())).result()
 """
-
-
-def _runs(process: int) -> bool:
-    try:
-        state = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0]
-    except OSError:
-        return False
-    return state != "Z"
 
 
 def test_a_second_driver_of_a_folder_is_refused(scenes, tmp_path, capsys):

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from command_line import refused
+from command_line import is_running, refused
 from PIL import Image
 from tiny_scan import write_colmap_scan, write_scan
 
@@ -28,12 +28,7 @@ from gvtools.scenes.colmap_writer import write_colmap
 from gvtools.scenes.project import open_project
 from pipelines.cli import main
 from pipelines.scoring import benchmark
-from pipelines.scoring.benchmark import (
-    BenchmarkCell,
-    measure_apart,
-    parse_methods,
-    read_cell,
-)
+from pipelines.scoring.benchmark import BenchmarkCell, measure_apart, parse_methods, read_cell
 from pipelines.scoring.benchmark_scenes import (
     at_benchmark_size,
     masked_figures,
@@ -139,42 +134,30 @@ def test_a_cell_in_a_process_of_its_own_leaves_its_reason(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_killed_benchmark_goes_on_with_the_same_command(tmp_path):
+def test_a_killed_benchmark_goes_on_with_the_same_command(projects, tmp_path):
     """Killed in its second cell; that one's process ends, too, and the first is kept."""
-    root, out = tmp_path / "projects", tmp_path / "out"
-    write_scan(root / "one", views=12)
-    write_scan(root / "two", views=12)
-    command = [sys.executable, "-m", "pipelines.cli", "benchmark", "few-view", "--root", root,
-               "--out", out, "--views", "3", "--methods", "fast"]  # fmt: skip
-    process = subprocess.Popen([str(word) for word in command], stdout=subprocess.DEVNULL)
+    out = tmp_path / "out"
+    command = [sys.executable, "-m", "pipelines.cli", *words(projects, out, "--methods", "fast")]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
     first = out / "cells/one/3_views/fast.json"
-    children = f"/proc/{process.pid}/task/{process.pid}/children"
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
     started: list[int] = []
     while process.poll() is None and not (first.is_file() and started):
         time.sleep(0.05)
         if first.is_file():
-            with open(children, encoding="ascii") as file:
-                started = [int(word) for word in file.read().split()]
+            started = [int(word) for word in children.read_text().split()]
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
     before = first.read_bytes()
     assert not (out / "results.json").is_file() or started
     end = time.monotonic() + 20
-    while any(_alive(pid) for pid in started) and time.monotonic() < end:
+    while any(is_running(pid) for pid in started) and time.monotonic() < end:
         time.sleep(0.1)
-    assert not any(_alive(pid) for pid in started)
-    subprocess.run([str(word) for word in command], check=True, stdout=subprocess.DEVNULL)
+    assert not any(is_running(pid) for pid in started)
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     assert first.read_bytes() == before
     results = json.loads((out / "results.json").read_text())["3_views"]["fast"]
     assert list(results["scenes"]) == ["one", "two"] and not results["failures"]
-
-
-def _alive(pid: int) -> bool:
-    try:
-        with open(f"/proc/{pid}/stat", encoding="ascii") as file:
-            return file.read().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
 
 
 # Scenes of data sets.
@@ -182,11 +165,14 @@ def _alive(pid: int) -> bool:
 VIEWS, FULL = 16, (160, 120)
 
 
-def write_pictures(folder: Path, divided_by: int) -> None:
-    folder.mkdir(parents=True)
-    for i in range(VIEWS):
-        size = FULL[0] // divided_by, FULL[1] // divided_by
-        Image.new("RGB", size, (i, divided_by, 0)).save(folder / f"view_{i:02d}.png")
+def write_copies(scene: Path, *copies: int) -> None:
+    """The scene's pictures, and those whose sides are divided."""
+    for divided_by in copies:
+        folder = scene / ("images" if divided_by == 1 else f"images_{divided_by}")
+        folder.mkdir(parents=True)
+        for i in range(VIEWS):
+            size = FULL[0] // divided_by, FULL[1] // divided_by
+            Image.new("RGB", size, (i, divided_by, 0)).save(folder / f"view_{i:02d}.png")
 
 
 def cameras() -> Cameras:
@@ -199,23 +185,19 @@ def cameras() -> Cameras:
 
 
 def write_mipnerf360(root: Path, *copies: int) -> Path:
-    scene = root / "garden"
-    for copy in copies:
-        write_pictures(scene / ("images" if copy == 1 else f"images_{copy}"), copy)
-    write_colmap(scene / "sparse" / "0", cameras())
+    write_copies(root / "garden", *copies)
+    write_colmap(root / "garden/sparse/0", cameras())
     return root
 
 
 def write_llff(root: Path, *copies: int) -> Path:
-    scene = root / "fern"
-    for copy in copies:
-        write_pictures(scene / ("images" if copy == 1 else f"images_{copy}"), copy)
+    write_copies(root / "fern", *copies)
     rows = []
     for pose in cameras().world_from_cam:
         right, down, forward = pose[:3, :3].T
         axes = np.stack([down, right, -forward, pose[:3, 3], [FULL[1], FULL[0], 150.0]])
         rows.append(np.concatenate([axes.T.ravel(), [0.5, 9.0]]))
-    np.save(scene / "poses_bounds.npy", np.array(rows))
+    np.save(root / "fern/poses_bounds.npy", np.array(rows))
     return root
 
 
@@ -275,7 +257,6 @@ def test_scenes_that_a_benchmark_lists_are_its_scenes_also_where_they_are_absent
     assert scene_names(load_benchmark("mipnerf360"), write_mipnerf360(tmp_path, 1)) == ("garden",)
 
 
-PHOTOGRAPHS = 12
 # Of 12 views, 0 and 8 are targets; of the 10 others, places 0, 4.5 (to even) and 9.
 CONTEXT = [f"frame-{i:06d}" for i in (1, 5, 11)]
 
@@ -296,8 +277,8 @@ def in_process(monkeypatch):
 @pytest.fixture(scope="module")
 def projects(tmp_path_factory):
     root = tmp_path_factory.mktemp("projects")
-    write_scan(root / "one", views=PHOTOGRAPHS)
-    write_scan(root / "two", views=PHOTOGRAPHS)
+    for name in ("one", "two"):
+        write_scan(root / name, views=12)
     (root / "notes").mkdir()
     return root
 
