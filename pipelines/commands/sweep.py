@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from gvtools.evaluation.published import Benchmark
     from gvtools.scenes.scene import Scene
     from pipelines.console import Console
-    from pipelines.fleet.run import Pool
+    from pipelines.fleet.run import Threads
     from pipelines.reconstruction.plan import Plan
     from pipelines.reconstruction.settings import RunSettings
     from pipelines.scoring.benchmark import BenchmarkCell
@@ -339,7 +339,7 @@ class FleetCommand(Arguments):
             for task in () if self.collect else tasks:
                 (left if finished_record(task) is None else finished).append(task)
             if left:
-                pool: Pool = this_machine(left)
+                pool: Threads | Ray = this_machine(left)
                 if self.engine == "ray":
                     pool = Ray(left, address=self.address or "local", console=console)
                 run_fleet(left, pool, finished=finished, console=console)

@@ -14,7 +14,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from gvtools.errors import OptionError, ProjectError
 from gvtools.evaluation.tables import Column, Table, csv_text, markdown
@@ -37,23 +37,8 @@ WAIT_S = 1.0
 CONNECT_S = 10.0
 NOT_RUN = "not run"
 TASKS, SUBMIT = "tasks.json", "submit.sh"
+HEADS = ("scene", "stage", "status", "attempts", "seconds", "node")
 _STATES = ("done", "running", "waiting", "failed", "again")
-
-
-class Pool(Protocol):
-    """Where tasks run."""
-
-    slots: float
-    """Tasks at a time."""
-
-    def submit(self, task: Task, attempt: int) -> Any:
-        """Begin a task; returns a handle."""
-
-    def finished(self, handles: Sequence[Any]) -> list[tuple[Any, Record]]:
-        """Handles of tasks that ended, with their records; waits for one at most ``WAIT_S``."""
-
-    def close(self) -> None:
-        """Release the workers."""
 
 
 class Threads:
@@ -64,11 +49,11 @@ class Threads:
         self._pool = ThreadPoolExecutor(slots)
 
     def submit(self, task: Task, attempt: int) -> Future[Record]:
-        """Begin a task."""
+        """Begin a task; returns a handle."""
         return self._pool.submit(run_task, task, attempt)
 
     def finished(self, handles: Sequence[Future[Record]]) -> list[tuple[Future[Record], Record]]:
-        """See Pool."""
+        """Handles of tasks that ended, with their records; waits for one at most ``WAIT_S``."""
         ended, _ = wait(handles, timeout=WAIT_S, return_when=FIRST_COMPLETED)
         return [(handle, self._record(handle)) for handle in ended]
 
@@ -89,7 +74,7 @@ def lost_worker(reason: str) -> Record:
 
 
 def run_fleet(
-    tasks: Sequence[Task], pool: Pool, *, finished: Sequence[Task] = (), console: Console
+    tasks: Sequence[Task], pool: Threads | Ray, *, finished: Sequence[Task] = (), console: Console
 ) -> None:
     """Run tasks, the stages of a scene in turn, beside those finished before; each leaves a record.
 
@@ -314,16 +299,16 @@ def collect(tasks: Sequence[Task]) -> list[Record]:
 def result_table(records: Sequence[Record]) -> Table:
     """A row for each stage of each scene; a column for each figure that any has."""
     figures = sorted({name for record in records for name in record.get("figures", {})})
-    heads = ("scene", "stage", "status", "attempts", "seconds", "node", *figures, "reason")
     rows = [
         (
-            *(record.get(name) for name in heads[:6]),
+            *(record.get(name) for name in HEADS),
             *(record.get("figures", {}).get(name) for name in figures),
             record.get("reason") or None,
         )
         for record in records
     ]
-    return Table(tuple(Column(head) for head in heads), tuple(rows), caption="Fleet")
+    columns = tuple(map(Column, (*HEADS, *figures, "reason")))
+    return Table(columns, tuple(rows), caption="Fleet")
 
 
 def report(tasks: Sequence[Task], root: str, console: Console) -> list[Record]:
@@ -336,7 +321,7 @@ def report(tasks: Sequence[Task], root: str, console: Console) -> list[Record]:
         write_json(Path(root) / "results.json", {"tasks": records})
         write_text(Path(root) / "results.csv", csv_text(table))
         write_text(Path(root) / "results.md", markdown(table))
-    heads = ("scene", "stage", "status", "attempts", "seconds", "node", "reason")
+    heads = (*HEADS, "reason")
     console.table(heads, [[record.get(name) or None for name in heads] for record in records])
     failed = [record for record in records if record["status"] != DONE]
     console.line(f"{len(records) - len(failed)} of {len(records)} tasks done; results in {root}")

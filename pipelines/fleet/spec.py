@@ -82,11 +82,6 @@ class Task:
     retries: int
     labels: dict[str, str]  # of preferred nodes
 
-    @staticmethod
-    def from_json(data: dict[str, Any]) -> Task:
-        """A task from its fields as JSON has them."""
-        return Task(**data | {"command": tuple(data["command"]), "before": tuple(data["before"])})
-
     @property
     def identity(self) -> dict[str, Any]:
         """What decides its result."""

@@ -231,7 +231,7 @@ def _reached(place: str, done: str) -> Iterator[tuple[Any, str]]:
 
 def main(argv: list[str]) -> int:
     """Run the task of a list (path, number) that a Slurm array names, with its retries."""
-    task = Task.from_json(json.loads(Path(argv[0]).read_text(encoding="utf-8"))[int(argv[1])])
+    task = Task(**json.loads(Path(argv[0]).read_text(encoding="utf-8"))[int(argv[1])])
     if finished_record(task):
         return 0
     for attempt in range(1, task.retries + 2):
