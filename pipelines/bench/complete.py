@@ -37,9 +37,7 @@ BLOCKS = 8
 TOKEN = 16  # px of a video token's edge
 
 
-def random_model(
-    config: GeoVerseConfig, device: torch.device | str = "cpu", *, seed: int = 0
-) -> GeoVerse:
+def random_model(config: GeoVerseConfig, device: torch.device | str = "cpu") -> GeoVerse:
     """A model in evaluation mode, without its video prior.
 
     Nothing is left at zero, as a fresh denoiser's gates are: zeros take a GPU less power, and so
@@ -47,7 +45,7 @@ def random_model(
     """
     device = torch.device(device)
     with torch.random.fork_rng():
-        torch.manual_seed(seed)
+        torch.manual_seed(0)
         with device:
             model = GeoVerse(config)
         for parameter in model.parameters():
@@ -94,9 +92,9 @@ def _filled(network: nn.Module, device: torch.device | str, dtype: torch.dtype) 
     return network
 
 
-def random_views(size: tuple[int, int], *, context: int, targets: int, seed: int = 0) -> ViewBatch:
+def random_views(size: tuple[int, int], *, context: int, targets: int) -> ViewBatch:
     """One sample of views on an arc about a point in front of them."""
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     views, (height, width) = context + targets, size
 
     def uniform(*shape: int) -> Tensor:
@@ -218,7 +216,7 @@ class TimedPass:
         A multiplication and an addition count as two. Products, convolutions and attention are
         counted; what is done to single numbers (norms, activations, gates) is not.
         """
-        attention = {CPU_ATTENTION: _attention_flops}
+        attention = {CPU_ATTENTION: lambda q, k, v, *_, **__: sdpa_flop_count(q, k, v)}
         with FlopCounterMode(display=False, custom_mapping=attention) as counter:
             clock = StageClock(counter.get_total_flops)
             self.run(clock)
@@ -240,10 +238,6 @@ class TimedPass:
             for name, spent in rows.items():
                 found.setdefault(name, []).append(spent)
         return found
-
-
-def _attention_flops(q: torch.Size, k: torch.Size, v: torch.Size, *_: Any, **options: Any) -> int:
-    return int(sdpa_flop_count(q, k, v))
 
 
 def complete_figures(options: CompleteOptions) -> dict[str, Any]:

@@ -94,13 +94,6 @@ def cloud(
     return points
 
 
-def concatenate(
-    memory: o3d.t.geometry.PointCloud, frame: o3d.t.geometry.PointCloud, voxel: float
-) -> o3d.t.geometry.PointCloud:
-    """The memory with a frame's points, one point a voxel again."""
-    return memory.append(frame).voxel_down_sample(voxel)
-
-
 def one_pixel(
     points: o3d.t.geometry.PointCloud, camera: Cameras
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

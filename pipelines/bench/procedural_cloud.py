@@ -85,18 +85,16 @@ def photograph(size: Float64, camera: Cameras) -> tuple[NDArray[np.uint8], NDArr
     return paint(center + depth[..., None] * directions), depth.astype(np.float32)
 
 
-def layers_in_view(
-    count: int, camera: Cameras, *, seed: int = 0, layers: int = 4, block: float = 0.08
-) -> NDArray[np.float32]:
-    """(N, 3) float32 points of wavy surfaces behind each other, all in view, in block order."""
-    rng = np.random.default_rng(seed)
+def layers_in_view(count: int, camera: Cameras) -> NDArray[np.float32]:
+    """(N, 3) float32 points of 4 wavy surfaces behind each other, all in view, in block order."""
+    rng = np.random.default_rng(0)
     width, height = int(camera.width[0]), int(camera.height[0])
     uv = rng.uniform(0.01, 0.99, (count, 2)) * (width, height)
-    layer = rng.integers(0, layers, count)
+    layer = rng.integers(0, 4, count)
     waves = np.sin(uv[:, 0] / 37) * np.cos(uv[:, 1] / 53)
     z = 2.0 + layer + 0.2 * waves
     rays = np.column_stack([uv, np.ones(count)]) @ np.linalg.inv(camera.K[0]).T
     pose = camera.world_from_cam[0]
     points = (rays * z[:, None]) @ pose[:3, :3].T + pose[:3, 3]
-    cell = np.floor(points / block).astype(np.int64)
+    cell = np.floor(points / 0.08).astype(np.int64)
     return points[np.lexsort(cell.T)].astype(np.float32)

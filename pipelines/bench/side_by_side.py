@@ -54,12 +54,14 @@ def alternate(
     calls: Sequence[Callable[[int], object]],
     repeat: int,
     *,
-    warm_up: int = 1,  # turns before them (compilation, caches)
     steady: bool = False,
 ) -> list[list[float]]:
-    """Seconds of each call, the calls taking turns so that disturbances hit all alike."""
+    """Seconds of each call, the calls taking turns so that disturbances hit all alike.
+
+    A turn before them compiles and fills caches.
+    """
     seconds: list[list[float]] = [[] for _ in calls]
-    for turn in range(warm_up + repeat):
+    for turn in range(1 + repeat):
         for call, kept in zip(calls, seconds, strict=True):
             gc.collect()
             time.sleep(SETTLE_SECONDS)
@@ -68,7 +70,7 @@ def alternate(
             start = time.perf_counter()
             call(turn)
             elapsed = time.perf_counter() - start
-            if turn >= warm_up:
+            if turn:
                 kept.append(elapsed)
     return seconds
 
@@ -119,7 +121,7 @@ def compare_fusing(memory: SpatialMemory, frames: list[Frame], *, repeat: int) -
 
     calls: list[Callable[[int], object]] = [
         lambda turn: memory.observe(*frames[turn], round=number),
-        lambda turn: open3d_peers.concatenate(old, clouds[turn], voxel),
+        lambda turn: old.append(clouds[turn]).voxel_down_sample(voxel),
         lambda turn: volume.integrate(*pictures[turn], frames[turn][2]),
     ]
     seconds = alternate(calls, repeat)
