@@ -45,7 +45,7 @@ from gvtools.scenes.project import open_recorded
 from gvtools.settings import dotted, with_values
 from gvtools.splats import HARMONICS, LOG_SCALE, SH, turn_gaussians
 from gvtools.view_selection import evenly_spread
-from pipelines.blocks.split import FILE, SceneBlock, by_name, read_blocks
+from pipelines.blocks.split import FILE, SceneBlock, read_blocks
 from pipelines.reconstruction.fitting import Fitted, fit_appearance
 from pipelines.reconstruction.plan import Plan, Targets, describe, run_identity
 from pipelines.reconstruction.prepare import make_plan, placed_scan
@@ -337,13 +337,23 @@ def read_runs(paths: Sequence[Path], *, blocks: Path | None = None) -> list[Bloc
                 f"{block.name}; expected --context @{place}/context.txt"
             )
         found[block.name] = BlockRun(run, block)
-    order = by_name({name: item.block for name, item in found.items()}, what="the given runs")
-    runs = [found[block.name] for block in order]
-    _check_alike(runs)
-    return runs
+    return _of_one_split(found)
 
 
-def _check_alike(runs: Sequence[BlockRun]) -> None:
+def _of_one_split(found: Mapping[str, BlockRun]) -> list[BlockRun]:
+    """All runs of one split, in order of the blocks' names, with the same settings."""
+    blocks = [item.block for item in found.values()]
+    split = {(block.names, block.refined) for block in blocks}
+    owned = [name for block in blocks for name in block.owners]
+    missing = [name for name in blocks[0].names if name not in found]
+    if missing:
+        raise ProjectError(
+            f"the given runs: {len(found)} of {len(blocks[0].names)} blocks; expected all; "
+            f"missing: {', '.join(missing)}"
+        )
+    if len(split) > 1 or len(set(owned)) != len(owned):
+        raise ProjectError("the given runs: blocks of different splits; expected those of one")
+    runs = [found[name] for name in blocks[0].names]
     first = runs[0].run.record["settings"]
     for item in runs[1:]:
         other = item.run.record["settings"]
@@ -359,6 +369,7 @@ def _check_alike(runs: Sequence[BlockRun]) -> None:
             f"{runs[0].run.path}: its generated points count as observed ones (protocol paper); "
             "expected them apart, since a merge observes again; reconstruct without"
         )
+    return runs
 
 
 # Confidence of what a block generated, where its run did not keep it.

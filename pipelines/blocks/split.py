@@ -378,24 +378,6 @@ def read_blocks(folder: Path) -> Iterator[tuple[Path, SceneBlock]]:
             yield path.parent, SceneBlock.load(path.parent)
 
 
-def by_name(found: Mapping[str, SceneBlock], *, what: str) -> tuple[SceneBlock, ...]:
-    """All blocks of one split, in order of their names."""
-    first = next(iter(found.values()))
-    missing = [name for name in first.names if name not in found]
-    if missing:
-        raise ProjectError(
-            f"{what}: {len(found)} of {len(first.names)} blocks; expected all; missing: "
-            f"{', '.join(missing)}"
-        )
-    alike = all(
-        (block.names, block.refined) == (first.names, first.refined) for block in found.values()
-    )
-    owned = [name for block in found.values() for name in block.owners]
-    if not alike or len(set(owned)) != len(owned):
-        raise ProjectError(f"{what}: blocks of different splits; expected those of one")
-    return tuple(found[name] for name in first.names)
-
-
 def split(
     scene: Scene,
     out: Path,  # a folder that is not there yet, or empty

@@ -230,7 +230,9 @@ def split_context(scene: Scene, config: GeoVerseConfig, *, seed: int = 0) -> Spl
             f"at least {FEWEST_VIEWS} to tune a model by, of which one judges; give more "
             "--context, or leave tuning out"
         )
-    views = _of_one_size(views)
+    if len({view.observed.depth.shape for view in views}) > 1:
+        # Small pictures are observed at less than ``DETAIL`` times the size; all then are.
+        views = tuple(SampleView(view.truth, view.truth) for view in views)
     numbers = range(len(views))
     count = min(MOST_JUDGES, max(1, len(views) // JUDGE_SHARE))
     # Not the ends of a path, which hardly anything else shows.
@@ -253,14 +255,6 @@ def split_context(scene: Scene, config: GeoVerseConfig, *, seed: int = 0) -> Spl
             "depth; expected views that see the same; give more --context, or leave tuning out"
         )
     return SplitContext(views, learnt, judged, len(scene) - len(views))
-
-
-def _of_one_size(views: tuple[SampleView, ...]) -> tuple[SampleView, ...]:
-    """Small pictures are observed at less than ``DETAIL`` times the size; all then are."""
-    sizes = {view.observed.depth.shape for view in views}
-    if len(sizes) == 1:
-        return views
-    return tuple(SampleView(view.truth, view.truth) for view in views)
 
 
 def _context_view(clip: Clip) -> ContextView:

@@ -41,11 +41,12 @@ from pipelines.reconstruction.settings import RunSettings
 QUIET = Console(quiet=True)
 # The last view sees what no other does.
 CONTEXT, TARGETS = "not:every:6+3", "every:6+3"
-SETTINGS = {"profile": "fast", "memory.observations_per_voxel": 3, "refine.poses": False}
+FAST = {"profile": "fast", "memory.observations_per_voxel": 3}
+FIT = {"refine.steps": 16, "refine.most_gaussians": 800, "rounds": 1}
 
 
 def reconstruct(project: Path, out: Path, **values: object) -> Path:
-    config = with_values(RunSettings(), {**SETTINGS, **values})
+    config = with_values(RunSettings(), {"refine.poses": False, **values})
     return run.reconstruct(open_project(project), config, out, console=QUIET)
 
 
@@ -59,16 +60,20 @@ def block_runs(folder: Path, out: Path, **values: object) -> list[Path]:
     return runs
 
 
+def split_run(folder: Path, *, blocks: int, overlap: float, **values: object) -> Path:
+    """A scan, its unsplit run, its blocks, their runs and the merged run."""
+    scan = write_scan(folder / "scan", views=10)
+    reconstruct(scan, folder / "whole", context=CONTEXT, targets=TARGETS, **values)
+    split(open_project(scan), folder / "blocks", blocks=blocks, overlap=overlap, context=CONTEXT,
+          refine_poses=False)  # fmt: skip
+    runs = block_runs(folder / "blocks", folder / "runs", **values)
+    merge(runs[::-1], folder / "merged", console=QUIET)
+    return folder
+
+
 @pytest.fixture(scope="module")
 def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A scan, its unsplit run, its blocks, their runs and the merged run."""
-    folder = tmp_path_factory.mktemp("walk")
-    scan = write_scan(folder / "scan", views=10)
-    reconstruct(scan, folder / "whole", context=CONTEXT, targets=TARGETS)
-    split(open_project(scan), folder / "blocks", blocks=3, context=CONTEXT, max_side=480,
-          refine_poses=False)  # fmt: skip
-    merge(block_runs(folder / "blocks", folder / "runs")[::-1], folder / "merged", console=QUIET)
-    return folder
+    return split_run(tmp_path_factory.mktemp("walk"), blocks=3, overlap=0.8, **FAST)
 
 
 def observed(run: Path) -> SpatialMemory:
@@ -152,7 +157,7 @@ def test_a_block_is_read_like_the_project_and_survives_a_copy(walk: Path, tmp_pa
 def test_computed_depth_is_that_of_each_views_owner(tmp_path: Path) -> None:
     scan = write_colmap_scan(tmp_path / "scan", views=6)
     split(open_project(scan), tmp_path / "blocks", blocks=2, overlap=1.0)
-    options = {"depth": "plane-sweep", "rounds": 0, "voxel": 0.05, "stereo.max_side": 64}
+    options = {"depth": "plane-sweep", "rounds": 0, "voxel": 0.05, "stereo.max_side": 64, **FAST}
     runs = block_runs(tmp_path / "blocks", tmp_path / "runs", **options)
     # With all views in every block, a view's depth is the unsplit run's, up to rounding of poses.
     whole = reconstruct(scan, tmp_path / "whole", **options)
@@ -291,30 +296,12 @@ def test_only_the_gaussians_of_the_own_cell_stay() -> None:
     assert (with_one.gaussians.values[:, 0] < 0.1 + 1e-5).all()
 
 
-FIT = {"refine.steps": 16, "refine.most_gaussians": 800, "refine.poses": False, "rounds": 1}
 SAVED = "round_000/appearance.npz"
-
-
-def reconstruct_fitted(project: Path, out: Path, **values: object) -> Path:
-    config = with_values(RunSettings(), {**FIT, **values})
-    return run.reconstruct(open_project(project), config, out, console=QUIET)
 
 
 @pytest.fixture(scope="module")
 def fitted(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A scan, its unsplit run, its blocks, their runs and the merged run."""
-    folder = tmp_path_factory.mktemp("fitted")
-    scan = write_scan(folder / "scan", views=10)
-    reconstruct_fitted(scan, folder / "whole", context=CONTEXT, targets=TARGETS)
-    split(
-        open_project(scan), folder / "blocks", blocks=2, overlap=0.5, context=CONTEXT,
-        refine_poses=False,
-    )  # fmt: skip
-    for place, block in read_blocks(folder / "blocks"):
-        lists = {"context": f"@{place}/context.txt", "targets": f"@{place}/targets.txt"}
-        reconstruct_fitted(place, folder / "runs" / block.name, **lists)
-    merge(sorted((folder / "runs").iterdir()), folder / "merged", console=QUIET)
-    return folder
+    return split_run(tmp_path_factory.mktemp("fitted"), blocks=2, overlap=0.5, **FIT)
 
 
 def across(folder: Path) -> list[str]:
