@@ -17,6 +17,7 @@ token no longer meets its own view's tokens through the identity.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -164,16 +165,23 @@ class Projective:
         # False for keys and values as in GLD's recorded outputs; see the module.
         invert_K: bool = True,
     ) -> None:
-        dtype = torch.promote_types(cam_from_world.dtype, torch.float32)
+        dtype = _precise(cam_from_world)
         self.grid = grid
         self.views = cam_from_world.shape[1]
         self.head_dim = head_dim
         self.matrix, self.key_matrix = projection_matrices(
             cam_from_world.to(dtype), K, size=size, invert_K=invert_K
         )
-        self.cos, self.sin = _angles(
-            grid, head_dim // 8, scale=position_scale, like=self.matrix.new_empty(0)
+        # Of the tokens' positions, (h*w, 2, head_dim / 8): axis x, then axis y.
+        kind: dict[str, Any] = {"dtype": dtype, "device": self.matrix.device}
+        rows, columns = (
+            (torch.arange(count, **kind) + 0.5) * factor - 0.5
+            for count, factor in zip(grid, position_scale, strict=True)
         )
+        position = torch.stack((columns.repeat(grid[0]), rows.repeat_interleave(grid[1])), dim=-1)
+        exponent = torch.arange(head_dim // 8, **kind) / (head_dim // 8)
+        angle = position[..., None] * ROTARY_BASE**-exponent
+        self.cos, self.sin = angle.cos(), angle.sin()
         # As wide as half a head, so that whole rows are multiplied: rows of four are slow.
         self._query, self._key, self._output = (
             _blocks(right, head_dim // 2)
@@ -234,24 +242,6 @@ def projection_matrices(
     last = torch.cat((centre, torch.ones_like(centre[..., :1])), -1)
     columns = (fx * x, fy * y, cx * x + cy * y + z, last)
     return matrix, torch.stack(columns, dim=-1)
-
-
-def _angles(
-    grid: tuple[int, int],
-    frequencies: int,
-    *,
-    scale: tuple[float, float],
-    like: Tensor,
-) -> tuple[Tensor, Tensor]:
-    """Cosines and sines (h*w, 2, frequencies): axis x, then axis y, of the tokens' positions."""
-    rows, columns = (
-        (torch.arange(count, dtype=like.dtype, device=like.device) + 0.5) * factor - 0.5
-        for count, factor in zip(grid, scale, strict=True)
-    )
-    position = torch.stack((columns.repeat(grid[0]), rows.repeat_interleave(grid[1])), dim=-1)
-    exponent = torch.arange(frequencies, dtype=like.dtype, device=like.device) / frequencies
-    angle = position[..., None] * ROTARY_BASE**-exponent
-    return angle.cos(), angle.sin()
 
 
 def _blocks(right: Tensor, size: int) -> Tensor:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import shutil
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -277,7 +276,7 @@ class GeoVerseCompleter(Completer):
         # Depth of ``base`` is in scene units. Only its pixels without depth take decoded depth,
         # which has to be brought to the memory's scale first.
         base_is_complete = base is not None and bool((base.depth > 0).all())
-        with self._precision():
+        with autocast(self._device, self._compute_type):
             generated = self.model.generate(
                 batch.to(self._device),
                 seed=seed,
@@ -320,7 +319,3 @@ class GeoVerseCompleter(Completer):
     @property
     def _compute_type(self) -> torch.dtype:
         return inference_type(self.settings.precision, self._device)
-
-    def _precision(self) -> AbstractContextManager[Any]:
-        """Autocast to half precision if the settings ask for it, or by default on CUDA."""
-        return autocast(self._device, self._compute_type)

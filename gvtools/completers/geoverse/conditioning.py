@@ -195,10 +195,10 @@ def encode_hints(
         first = alone() if context == 1 else encode_views(network, batch, one, config=config)
         token = first[1][:, :, 0].expand_as(token)
 
-    features = level1.normalise(_maps(joint[1], grid)) * informative[:, :, None, None, None]
+    features = level1.normalise(maps(joint[1], grid)) * informative[:, :, None, None, None]
     source = alone()[0] if config.cascade_context == "alone" else joint[0][:, :context]
     shallow = torch.zeros_like(features)
-    shallow[:, :context] = level0.normalise(_maps(source, grid))
+    shallow[:, :context] = level0.normalise(maps(source, grid))
     return Hints(features * mask.to(features.dtype), features, shallow, token, mask)
 
 
@@ -225,21 +225,6 @@ def _encode_jointly(
         for level, features in zip(joint, part, strict=True):
             level[samples[:, None], views] = features
     return joint
-
-
-@torch.no_grad()
-def encode_latents(
-    network: DepthAnything3,
-    level0: LatentStatistics,
-    level1: LatentStatistics,
-    *,
-    batch: ViewBatch,  # true pictures on all views
-    config: HintConfig,
-) -> tuple[Tensor, Tensor]:  # Two (B, V, C, h, w) tensors, normalised
-    """Clean level-0 and level-1 latents of true pictures of all views, encoded jointly."""
-    grid = network.encoder.grid(*batch.size)
-    both = encode_views(network, batch, slice(None), config=config)
-    return level0.normalise(_maps(both[0], grid)), level1.normalise(_maps(both[1], grid))
 
 
 def encode_views(
@@ -271,6 +256,6 @@ def _relative_cameras(batch: ViewBatch, unit: str) -> Tensor:
     return torch.where(known_unit, in_depths, cameras.to(in_depths.dtype)).to(cameras.dtype)
 
 
-def _maps(level: Tensor, grid: tuple[int, int]) -> Tensor:
+def maps(level: Tensor, grid: tuple[int, int]) -> Tensor:
     """(B, V, 1 + N, C) tokens to (B, V, C, h, w) maps, without token 0."""
     return level[:, :, 1:].transpose(2, 3).unflatten(3, grid)

@@ -311,29 +311,18 @@ class Denoiser(Recomputing):
         if encoding is not None and encoding.tokens is not None:
             s = encoding.tokens
         else:
-            s = self._encoded(s, time, positions.encoder, residuals or {}, video or {})
+            c = nn.functional.silu(time)
+            for index in range(self.config.depth):
+                keys = None if video is None else video.get(index)
+                s = self.layer(self.blocks[index], s, c, positions.encoder, keys)
+                if residuals is not None and index in residuals:
+                    s = s + residuals[index]
         if encoding is not None:
             encoding.tokens = s
         s = self.s_projector(nn.functional.silu(time + s))
         for index in range(self.config.depth, len(self.blocks)):
             x = self.layer(self.blocks[index], x, s, positions.head)
         return self.final_layer(x, s).transpose(2, 3).unflatten(3, grid)
-
-    def _encoded(
-        self,
-        s: Tensor,
-        time: Tensor,
-        positions: Projective,
-        residuals: Mapping[int, Tensor],
-        video: Mapping[int, VideoKeys],
-    ) -> Tensor:
-        """The encoder's tokens behind its blocks."""
-        c = nn.functional.silu(time)
-        for index in range(self.config.depth):
-            s = self.layer(self.blocks[index], s, c, positions, video.get(index))
-            if index in residuals:
-                s = s + residuals[index]
-        return s
 
     def _split(self, stream: str, x: Tensor, context: int) -> Tensor:
         """Embeds (B, V, 2C, h, w), context views by their own layer where there is one."""

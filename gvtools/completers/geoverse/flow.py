@@ -54,16 +54,14 @@ def latent_shift(values: int, *, base: int = 4096) -> float:
     return math.sqrt(values / base)
 
 
-def time_grid(
-    steps: int, *, shift: float = 1.0, start: float = 1.0, end: float = 0.0
-) -> tuple[float, ...]:
-    """``steps`` + 1 falling times from ``start`` to ``end``, equally spaced before the shift."""
-    first, last = unshift_time(start, shift), unshift_time(end, shift)
+def time_grid(steps: int, *, shift: float = 1.0, end: float = 0.0) -> tuple[float, ...]:
+    """``steps`` + 1 falling times from 1 to ``end``, equally spaced before the shift."""
+    first, last = unshift_time(1.0, shift), unshift_time(end, shift)
     inner = (first + (last - first) * k / steps for k in range(1, steps))
-    times = (start, *(shift_time(u, shift) for u in inner), end)
+    times = (1.0, *(shift_time(u, shift) for u in inner), end)
     if not all(later < earlier for earlier, later in pairwise(times)):
         raise OptionError(
-            f"time grid: {steps} steps from {start} to {end} at shift {shift} lie nearer to each "
+            f"time grid: {steps} steps from 1.0 to {end} at shift {shift} lie nearer to each "
             "other than rounding; take fewer, or a shift nearer to 1"
         )
     return times

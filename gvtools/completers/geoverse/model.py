@@ -26,8 +26,9 @@ from gvtools.completers.geoverse.conditioning import (
     ViewBatch,
     depth_condition,
     encode_hints,
-    encode_latents,
+    encode_views,
     fill_holes,
+    maps,
 )
 from gvtools.completers.geoverse.config import GeoVerseConfig
 from gvtools.completers.geoverse.denoiser import (
@@ -48,7 +49,7 @@ from gvtools.completers.geoverse.flow import (
 )
 from gvtools.completers.geoverse.refiner import Refiner
 from gvtools.completers.geoverse.rgb_head import RGBHead
-from gvtools.completers.geoverse.video_injection import ControlBranch, SharedAttention, video_keys
+from gvtools.completers.geoverse.video_injection import ControlBranch, SharedAttention
 from gvtools.completers.geoverse.video_prior import VideoFeatures, VideoPrior
 from gvtools.errors import CheckpointError, GvError
 from gvtools.networks.compute import hold_in, on_device
@@ -144,10 +145,7 @@ class GeoVerse(nn.Module):
             )
         if config.video is not None and config.injection == "shared":
             self.shared = SharedAttention(
-                config.shared,
-                width=config.level1.width,
-                heads=config.level1.heads,
-                video_channels=config.video.channels,
+                config.shared, config.level1, video_channels=config.video.channels
             )
         # Used on completions, see ``composition.refine``; it stays float32.
         self.refiner = None if config.refiner is None else Refiner(config.refiner)
@@ -332,9 +330,10 @@ class GeoVerse(nn.Module):
     def _keys(
         self, video: VideoFeatures | None, camera: CameraCondition, grid: tuple[int, int]
     ) -> dict[int, VideoKeys] | None:
-        if video is None:
+        if video is None or self.shared is None:
             return None
-        return video_keys(self.shared, self.config.level1, camera, features=video, grid=grid)
+        keys: dict[int, VideoKeys] = self.shared(video, camera, grid)
+        return keys
 
     def velocity1(
         self,
@@ -491,8 +490,10 @@ class GeoVerse(nn.Module):
     @torch.no_grad()
     def clean_latents(self, batch: ViewBatch) -> tuple[Tensor, Tensor]:
         """Level-0 and level-1 latents, (B, V, C, h, w) each, of true pictures of all views."""
+        grid = self.geometry.encoder.grid(*batch.size)
+        both = encode_views(self.geometry, batch, slice(None), config=self.config.hints)
         level0, level1 = self.level_statistics
-        return encode_latents(self.geometry, level0, level1, batch=batch, config=self.config.hints)
+        return level0.normalise(maps(both[0], grid)), level1.normalise(maps(both[1], grid))
 
     @torch.no_grad()
     def reconstruct(self, picture: Tensor) -> Tensor:

@@ -119,56 +119,40 @@ class SharedAttention(nn.Module):
     """Projects video features to keys and values of the denoiser's coupled blocks."""
 
     def __init__(
-        self, config: SharedAttentionConfig, *, width: int, heads: int, video_channels: int
+        self, config: SharedAttentionConfig, denoiser: DenoiserConfig, *, video_channels: int
     ) -> None:
         super().__init__()
-        self.config = config
-        self.heads = heads
+        self.config, self.denoiser = config, denoiser
+        width = 2 * denoiser.width
         self.norms = nn.ModuleList(nn.RMSNorm(video_channels, eps=1e-6) for _ in config.layers)
-        self.kv = nn.ModuleList(nn.Linear(video_channels, 2 * width) for _ in config.layers)
+        self.kv = nn.ModuleList(nn.Linear(video_channels, width) for _ in config.layers)
         if config.gated:
             self.gates = nn.Parameter(torch.zeros(len(config.layers)))
 
     def forward(
-        self, features: Sequence[Tensor], positions: Sequence[Projective]
+        self, features: VideoFeatures, camera: CameraCondition, grid: tuple[int, int]
     ) -> dict[int, VideoKeys]:
         """Keys and values by block, of a (B, V, C, h', w') tensor for each coupled layer.
 
-        ``positions`` are those of each one's grid, in the units of the latents' grid.
+        Positioned by the views' cameras, in the units of the latents' ``grid`` (h, w).
         """
         found = {}
         dtype = next(self.parameters()).dtype
+        heads = self.denoiser.heads
         for index, (layer, feature) in enumerate(zip(self.config.layers, features, strict=True)):
+            own = (feature.shape[-2], feature.shape[-1])
+            positions = Projective(
+                camera.cam_from_world,
+                camera.K,
+                camera.size,
+                grid=own,
+                head_dim=self.denoiser.width // heads,
+                position_scale=(grid[0] / own[0], grid[1] / own[1]),
+                invert_K=self.denoiser.invert_K,
+            )
             tokens = feature.flatten(3).transpose(2, 3).flatten(1, 2)
             kv = self.kv[index](self.norms[index](tokens.to(dtype)))
-            key, value = kv.unflatten(-1, (2, self.heads, -1)).permute(2, 0, 3, 1, 4)
+            key, value = kv.unflatten(-1, (2, heads, -1)).permute(2, 0, 3, 1, 4)
             gate = self.gates[index] if self.config.gated else None
-            found[layer] = VideoKeys(positions[index].key(key), positions[index].value(value), gate)
+            found[layer] = VideoKeys(positions.key(key), positions.value(value), gate)
         return found
-
-
-def video_keys(
-    # Projects the features; None for a model without shared attention.
-    shared: SharedAttention | None,
-    denoiser: DenoiserConfig,  # whose blocks are coupled
-    camera: CameraCondition,  # of the views
-    *,
-    features: VideoFeatures,  # one (B, V, C, h', w') a coupled block
-    grid: tuple[int, int],  # (h, w) of the latents, in whose units the positions are
-) -> dict[int, VideoKeys] | None:
-    """Keys and values of the coupled blocks, positioned by the given cameras."""
-    if shared is None:
-        return None
-    positions = [
-        Projective(
-            camera.cam_from_world,
-            camera.K,
-            camera.size,
-            grid=(level.shape[-2], level.shape[-1]),
-            head_dim=denoiser.width // denoiser.heads,
-            position_scale=(grid[0] / level.shape[-2], grid[1] / level.shape[-1]),
-            invert_K=denoiser.invert_K,
-        )
-        for level in features
-    ]
-    return shared(features, positions)

@@ -149,13 +149,6 @@ def resize_views(images: Tensor, valid: Tensor, size: tuple[int, int]) -> tuple[
     return seen.unflatten(0, count), weight.unflatten(0, count)
 
 
-def seed_rows(seed: int | Sequence[Sequence[int]], batch: int, views: int) -> list[list[int]]:
-    """A seed for each view, B rows of V, of one number for all or the rows themselves."""
-    if isinstance(seed, int):
-        return [[view_seed(seed, item, view) for view in range(views)] for item in range(batch)]
-    return [list(row) for row in seed]
-
-
 # F^W, to be handed to every denoising step: a (B, V, C, h, w) for each tap.
 VideoFeatures = tuple[Tensor, ...]
 
@@ -248,16 +241,18 @@ class VideoPrior:
         seed: int | Sequence[Sequence[int]] = 0,
     ) -> VideoFeatures:
         """One forward of the video model."""
-        seeds = seed_rows(seed, *images.shape[:2])
-        layout = view_layout(self.config.layout, images.shape[1])
+        batch, views = images.shape[:2]
+        if isinstance(seed, int):
+            seed = [[view_seed(seed, item, view) for view in range(views)] for item in range(batch)]
+        layout = view_layout(self.config.layout, views)
         with self.networks.lent(self._guest):
             device = self.networks.device
             with torch.autocast(device.type, enabled=False):
-                views = (images.to(device), valid.to(device))
-                proxy, shown = self._proxy(*views, context, seeds=seeds)
+                here = (images.to(device), valid.to(device))
+                proxy, shown = self._proxy(*here, context, seeds=seed)
                 z_proxy = self._encoded(proxy, layout)
                 outputs = self.networks.block_outputs(
-                    self._noised(z_proxy, layout, seeds),
+                    self._noised(z_proxy, layout, seed),
                     self._condition(z_proxy, shown, layout),
                     timestep=self.config.timestep,
                     blocks=self.config.taps,
@@ -266,7 +261,7 @@ class VideoPrior:
             return tuple(x[:, where].movedim(-1, 2).contiguous() for x in outputs)
 
     def _proxy(
-        self, images: Tensor, valid: Tensor, context: int, *, seeds: list[list[int]]
+        self, images: Tensor, valid: Tensor, context: int, *, seeds: Sequence[Sequence[int]]
     ) -> tuple[Tensor, Tensor]:
         """Views (B, V, 3, H', W') in [-1, 1], 0 where not shown, and shown (B, V, 1, H', W')."""
         size = self.config.size(images.shape[-2], images.shape[-1])
@@ -283,7 +278,9 @@ class VideoPrior:
         latents = self.networks.encode(clips.flatten(0, 1).transpose(1, 2))
         return latents.unflatten(0, clips.shape[:2]).transpose(1, 2).flatten(2, 3)
 
-    def _noised(self, z_proxy: Tensor, layout: ViewLayout, seeds: list[list[int]]) -> Tensor:
+    def _noised(
+        self, z_proxy: Tensor, layout: ViewLayout, seeds: Sequence[Sequence[int]]
+    ) -> Tensor:
         """x_t; a latent of several views takes the first one's noise."""
         sigma = self.config.timestep / 1000 if self.config.sigma is None else self.config.sigma
         first = [[row[held[0]] for held in layout.views_of_latent] for row in seeds]
@@ -304,7 +301,7 @@ class VideoPrior:
         mask = packed_mask(1 - shown, layout, stride=STRIDE)
         return torch.cat([z_proxy, reactive.expand_as(z_proxy), mask], dim=1)
 
-    def _noise(self, draw: str, seeds: list[list[int]], shape: tuple[int, ...]) -> Tensor:
+    def _noise(self, draw: str, seeds: Sequence[Sequence[int]], shape: tuple[int, ...]) -> Tensor:
         """Standard normal (B, views, *shape), each view's of its own seed."""
         rows = [[view_seed(value, "video", draw) for value in row] for row in seeds]
         device = self.networks.device

@@ -226,23 +226,15 @@ def read_part(
         else:
             found[name] = tensor
     if part.name.startswith("statistics"):
-        _check_statistics(content, found, path, part=part)
+        expected, level = int(part.name.removeprefix("statistics")), content.get("level")
+        # Of the four levels the last may be called -1.
+        if isinstance(level, int) and -4 <= level < 4 and level % 4 != expected:
+            raise CheckpointError(f"{path}: statistics of level {level}; expected level {expected}")
+        if "var" in found and bool((found["var"] < 0).any()):
+            raise CheckpointError(f"{path}: var is negative in places; expected variances")
         found = {name: tensor.reshape(-1) for name, tensor in found.items()}
     share_tied(found, part.tied, where=path)
     return found, tuple(ignored)
-
-
-def _check_statistics(
-    content: Mapping[str, Any], found: Mapping[str, Tensor], path: Path, *, part: Part
-) -> None:
-    """Refuse a file that names another level, or whose ``var`` has negative values."""
-    expected = int(part.name.removeprefix("statistics"))
-    level = content.get("level")
-    # Of the four levels the last may be called -1.
-    if isinstance(level, int) and -4 <= level < 4 and level % 4 != expected:
-        raise CheckpointError(f"{path}: statistics of level {level}; expected level {expected}")
-    if "var" in found and bool((found["var"] < 0).any()):
-        raise CheckpointError(f"{path}: var is negative in places; expected variances")
 
 
 @dataclass(frozen=True)
@@ -562,18 +554,12 @@ def fresh_extension(model: GeoVerse, loaded: Mapping[str, Tensor]) -> dict[str, 
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(_SEED)
         if model.control is not None:
-            control = ControlBranch(
-                config.control,
-                _published_level1(model, loaded),
-                video_channels=config.video.channels,
-            )
+            level1 = _published_level1(model, loaded)
+            control = ControlBranch(config.control, level1, video_channels=config.video.channels)
             fresh |= {f"control.{name}": value for name, value in control.state_dict().items()}
         if model.shared is not None:
             shared = SharedAttention(
-                config.shared,
-                width=config.level1.width,
-                heads=config.level1.heads,
-                video_channels=config.video.channels,
+                config.shared, config.level1, video_channels=config.video.channels
             )
             fresh |= {f"shared.{name}": value for name, value in shared.state_dict().items()}
     return fresh

@@ -14,7 +14,7 @@ import torch
 from geoverse_folders import BARE, CONTROL, SHARED, equal, output, report
 from torch import Tensor
 
-from gvtools.completers.geoverse.conditioning import LatentStatistics, ViewBatch, encode_latents
+from gvtools.completers.geoverse.conditioning import ViewBatch
 from gvtools.completers.geoverse.config import FlowConfig, named
 from gvtools.completers.geoverse.denoiser import Denoiser, Positions
 from gvtools.completers.geoverse.flow import (
@@ -48,11 +48,6 @@ def built(injection: str = "none", **changes: Any) -> GeoVerse:
 
 def features(injection: str, batch: ViewBatch) -> VideoFeatures | None:
     return None if injection == "none" else micro.video_features(*batch.images.shape[:2])
-
-
-def levels(model: Any) -> tuple[LatentStatistics, LatentStatistics]:
-    level0, level1 = model.statistics
-    return level0, level1
 
 
 def counted(monkeypatch: pytest.MonkeyPatch, kind: type, name: str) -> list[Any]:
@@ -230,9 +225,7 @@ def test_decoded_clean_latents_are_what_the_frozen_model_sees():
     batch = replace(
         batch, images=torch.rand(batch.images.shape), valid=torch.ones_like(batch.valid)
     )
-    level0, level1 = encode_latents(
-        model.geometry, *levels(model), batch=batch, config=model.config.hints
-    )
+    level0, level1 = model.clean_latents(batch)
     prepared = model.prepare(batch)
     decoded = model.decode(prepared, level0, level1)
     whole = model.geometry(batch.images)

@@ -32,7 +32,6 @@ from gvtools.completers.geoverse.flow import (
     view_seed,
 )
 from gvtools.completers.geoverse.objective import (
-    DEFECTS,
     center_similarity,
     depth_loss,
     flow_matching_loss,
@@ -222,7 +221,7 @@ def test_samples_without_a_scale_are_dropped():
     predicted, reference, found_centers, centers = _depths(np.random.default_rng(1))
     found_centers[1] = 0.5
     similarity = center_similarity(found_centers, centers)
-    assert similarity.status == ("aligned", "coincident predicted centres")
+    assert similarity.ok.tolist() == [True, False]
     predicted.requires_grad_()
     dropped = depth_loss(predicted, reference, similarity=similarity)
     assert dropped[1].item() == 0 < dropped[0].item()
@@ -332,7 +331,7 @@ def test_centres_on_a_line_give_a_scale_where_the_numpy_fit_refuses():
     reference = 4 * line @ _rotation(np.random.default_rng(0)).T
     assert not fit_similarity(line, reference).ok
     fit = _fit(line, reference)
-    assert fit.status == ("aligned",) and float(fit.scale) == pytest.approx(4)
+    assert bool(fit.ok) and float(fit.scale) == pytest.approx(4)
 
 
 def test_samples_are_fitted_one_by_one_from_their_finite_centres():
@@ -346,24 +345,22 @@ def test_samples_are_fitted_one_by_one_from_their_finite_centres():
 
 
 @pytest.mark.parametrize(
-    ("predicted", "reference", "defect"),
+    ("predicted", "reference"),
     [
-        (np.eye(3), np.where(np.arange(3)[:, None] > 0, np.nan, np.eye(3)), 1),
-        (np.full((3, 3), 0.1), np.eye(3), 2),
-        (np.eye(3), np.full((3, 3), 1e6 / 3), 3),
+        (np.eye(3), np.where(np.arange(3)[:, None] > 0, np.nan, np.eye(3))),
+        (np.full((3, 3), 0.1), np.eye(3)),
+        (np.eye(3), np.full((3, 3), 1e6 / 3)),
         (
             np.array([[1.0, 0, 0], [-1, 0, 0], [0, 0, 0], [0, 0, 0]]),
             np.array([[0.0, 0, 0], [0, 0, 0], [0, 1, 0], [0, -1, 0]]),
-            4,
         ),
     ],
 )
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
-def test_what_leaves_the_scale_open_is_said(predicted, reference, defect, dtype):
+def test_what_leaves_the_scale_open_has_none(predicted, reference, dtype):
     fit = center_similarity(
         torch.tensor(predicted, dtype=dtype)[None], torch.tensor(reference, dtype=dtype)[None]
     )
-    assert fit.status == (DEFECTS[defect],)
     assert not bool(fit.ok) and bool(fit.scale.isnan())
 
 
@@ -401,20 +398,13 @@ def test_euler_steps_equal_those_of_diffusers(steps, shift):
     assert float((ours - expected).abs().max() / expected.abs().max()) <= 1e-6
 
 
-@given(st.integers(1, 60), SHIFTS)
-def test_default_bounds_are_bounds_and_equally_long_before_the_shift(count, shift):
-    bounds = time_grid(count, shift=shift)
+@given(st.integers(1, 60), SHIFTS, st.sampled_from([0.0, 0.001]))
+def test_time_grids_are_bounds_and_equally_long_before_the_shift(count, shift, end):
+    bounds = time_grid(count, shift=shift, end=end)
     assert check_bounds(bounds) == bounds
-    assert bounds[0] == 1 and bounds[-1] == 0
+    assert bounds[0] == 1 and bounds[-1] == end
     before = [unshift_time(tau, shift) for tau in bounds]
-    np.testing.assert_allclose(np.diff(before), -1 / count, atol=1e-9)
-
-
-def test_a_grid_may_cover_a_part_of_time():
-    grid = time_grid(4, shift=3.0, start=0.8, end=0.2)
-    assert (grid[0], grid[-1]) == (0.8, 0.2)
-    before = [unshift_time(t, 3.0) for t in grid]
-    np.testing.assert_allclose(np.diff(before, n=2), 0, atol=1e-12)
+    np.testing.assert_allclose(np.diff(before), (before[-1] - 1) / count, atol=1e-9)
 
 
 def test_training_times_follow_the_shifted_uniform_distribution():

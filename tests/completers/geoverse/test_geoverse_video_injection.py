@@ -125,8 +125,7 @@ class SharedCase:
             torch.manual_seed(2)
             self.shared: Any = SharedAttention(
                 SharedAttentionConfig(LAYERS, gated=gated),
-                width=micro.DENOISER.width,
-                heads=HEADS,
+                self.net.config,
                 video_channels=micro.VIDEO.channels,
             ).double()
         self.x, self.t, self.known = micro.conditions(dtype=torch.float64)
@@ -137,10 +136,11 @@ class SharedCase:
         self.video_positions = Projective(
             camera.cam_from_world, camera.K, camera.size, grid=grid, head_dim=HEAD_DIM,
             position_scale=(micro.GRID[0] / grid[0], micro.GRID[1] / grid[1]),
+            invert_K=self.net.config.invert_K,
         )  # fmt: skip
 
     def keys(self) -> dict[int, VideoKeys]:
-        return self.shared(self.features, [self.video_positions] * len(LAYERS))
+        return self.shared(self.features, self.known.camera, micro.GRID)
 
     def velocity(self, keys: dict[int, VideoKeys] | None) -> Tensor:
         return self.net(self.x, self.t, self.known, video=keys, positions=self.positions)
