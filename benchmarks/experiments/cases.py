@@ -65,7 +65,7 @@ def held_out_cases(
 
     data = ProceduralViews(seed=seed, split="held-out", views=views, size=(size, size))
     for index in range(count):
-        yield case_of(data.inputs(index), f"held-out {index}")
+        yield case_of(data.inputs(index)[0], f"held-out {index}")
 
 
 def case_of(given: SampleInputs, name: str) -> Case:

@@ -133,16 +133,11 @@ class ContextView:
     def __post_init__(self) -> None:
         if self.rgb.dtype == np.uint8:
             object.__setattr__(self, "rgb", self.rgb.astype(np.float32) / 255)
-        what, size = f"context view {self.name}", (self.camera.height[0], self.camera.width[0])
+        what = f"context view {self.name}"
         if len(self.camera) != 1:
             raise ShapeError(f"{what}: {len(self.camera)} cameras; expected one")
-        check_shapes(
-            what,
-            (int(size[0]), int(size[1])),
-            rgb=self.rgb,
-            depth=self.depth,
-            confidence=self.confidence,
-        )
+        size = int(self.camera.height[0]), int(self.camera.width[0])
+        check_shapes(what, size, rgb=self.rgb, depth=self.depth, confidence=self.confidence)
 
     @cached_property
     def nonfinite_pixels(self) -> int:

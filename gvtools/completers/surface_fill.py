@@ -80,7 +80,14 @@ def _share_fills(
             surer = ~view.valid & carried.valid
             surer &= carried.confidence > SURER * completion.confidence[index]
             if surer.any():
-                view = _with_carried(view, carried, surer)
+                # It knows what is carried there, too.
+                view = replace(
+                    view,
+                    rgb=np.where(surer[..., None], carried.rgb, view.rgb),
+                    depth=np.where(surer, carried.depth, view.depth),
+                    valid=view.valid | surer,
+                    confidence=np.where(surer, carried.confidence, view.confidence),
+                )
                 again, weight = InpaintCompleter().fill(context, view)
                 completion.rgb[index], completion.depth[index] = again.rgb[0], again.depth[0]
                 completion.confidence[index], looked_up[index] = again.confidence[0], weight[0]
@@ -88,17 +95,6 @@ def _share_fills(
         if index != order[-1]:
             memory = _lift(memory, view, completion, index=index)
     return known
-
-
-def _with_carried(view: Guidance, carried: Guidance, where: NDArray[np.bool_]) -> Guidance:
-    """A view that knows what is carried there, too."""
-    return replace(
-        view,
-        rgb=np.where(where[..., None], carried.rgb, view.rgb),
-        depth=np.where(where, carried.depth, view.depth),
-        valid=view.valid | where,
-        confidence=np.where(where, carried.confidence, view.confidence),
-    )
 
 
 def _lift(

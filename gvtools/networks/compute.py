@@ -12,8 +12,8 @@ float32. On a CPU it takes bfloat16 where the processor multiplies it faster, wh
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import cache
 from typing import Any
 
@@ -141,15 +141,22 @@ class RememberedTable:
         return table
 
 
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Torch on one thread of the CPU within the block."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
 @cache
 def bfloat16_is_faster() -> bool:
     """Whether this processor takes clearly less time for a layer in bfloat16, both ways."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
+    with one_thread():
         return _least_seconds(torch.bfloat16) <= WORTH * _least_seconds(torch.float32)
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _least_seconds(dtype: torch.dtype) -> float:
@@ -214,7 +221,11 @@ def attend(q: Tensor, k: Tensor, v: Tensor) -> Tensor:  # (B, heads, N, d)
     100 tokens on in float32; in bfloat16 the products may win, but round the scores.
     """
     if not _is_fused(q):
-        return _in_chunks(q, k, v)
+        # As many queries at a time as ``MOST_SCORES`` allows.
+        rows = max(1, MOST_SCORES // (q.shape[0] * q.shape[1] * k.shape[2]))
+        chunks = q.split(rows, dim=2)
+        parts = [recompute(F.scaled_dot_product_attention, part, k, v) for part in chunks]
+        return torch.cat(parts, dim=2)
     size = q.shape[-1]
     lacking = -size % FUSED_MULTIPLE
     if not lacking or q.device.type != "cuda":
@@ -235,10 +246,3 @@ def _is_fused(q: Tensor) -> bool:
     if torch.is_autocast_enabled(q.device.type):
         dtype = torch.get_autocast_dtype(q.device.type)
     return dtype != torch.bfloat16 or has_bfloat16(q.device)
-
-
-def _in_chunks(q: Tensor, k: Tensor, v: Tensor) -> Tensor:
-    """The same, for as many queries at a time as ``MOST_SCORES`` allows."""
-    rows = max(1, MOST_SCORES // (q.shape[0] * q.shape[1] * k.shape[2]))
-    parts = [recompute(F.scaled_dot_product_attention, part, k, v) for part in q.split(rows, dim=2)]
-    return torch.cat(parts, dim=2)

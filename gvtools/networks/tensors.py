@@ -213,24 +213,6 @@ def save_tensors(
     from safetensors import SafetensorError
     from safetensors.torch import save_file
 
-    stored = _to_store(tensors, dtype, exact)
-    # The library gives its files to their owner alone; these get what the folder's others have.
-    file.touch()
-    mode = file.stat().st_mode
-    try:
-        # The library writes several entries in random order, and the same model as other bytes.
-        save_file(stored, str(file), metadata={"about": about})
-    except SafetensorError as error:
-        raise OSError(str(error)) from error
-    file.chmod(mode)
-    with file.open("rb+") as written:
-        os.fsync(written.fileno())
-
-
-def _to_store(
-    tensors: Mapping[str, Tensor], dtype: str, exact: Collection[str]
-) -> dict[str, Tensor]:
-    """The tensors as they are to be written, on the CPU; what is so already is not copied."""
     if dtype not in DTYPES:
         raise CheckpointError(f"dtype {dtype!r}; expected one of {', '.join(DTYPES)}")
     bad = not_finite(tensors)
@@ -251,7 +233,17 @@ def _to_store(
             f"{bad} reaches {float(tensors[bad].abs().max()):.3g}, too large for {dtype}; use "
             "bfloat16 or float32; nothing is written"
         )
-    return stored
+    # The library gives its files to their owner alone; these get what the folder's others have.
+    file.touch()
+    mode = file.stat().st_mode
+    try:
+        # The library writes several entries in random order, and the same model as other bytes.
+        save_file(stored, str(file), metadata={"about": about})
+    except SafetensorError as error:
+        raise OSError(str(error)) from error
+    file.chmod(mode)
+    with file.open("rb+") as written:
+        os.fsync(written.fileno())
 
 
 class _Entry(NamedTuple):

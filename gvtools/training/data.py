@@ -54,15 +54,11 @@ ROOMS = "rooms"
 DRAWN, RESAMPLED, GEOMETRY_OF = "drawn", "resampled", "geometry"
 
 
-class Redrawable(Protocol):
+class Redrawable(Samples, Protocol):
     """Samples by index, of which another one can be drawn where one is invalid."""
 
     def sample(self, index: int, attempt: int = 0) -> TrainingSample:
         """The sample of an index; each attempt gives another one."""
-        ...
-
-    def describe(self) -> dict[str, Any]:
-        """Everything that decides the samples, as plain data."""
         ...
 
 

@@ -53,26 +53,23 @@ class PooledViews:
     def sample(self, index: int) -> TrainingSample:
         """The sample of a number; numbers ``count`` apart have the same."""
         number = index % self.count
-        if self.folder is None:
-            return _sample(_dequantise(_quantise(_arrays(self.data.sample(number)))))
-        path = self._place / f"{number:06d}.npz"
-        packed = _read(path) if path.exists() else None
+        path = None if self.folder is None else self._place(self.folder) / f"{number:06d}.npz"
+        packed = None if path is None or not path.exists() else _read(path)
         if packed is None:
             packed = _quantise(_arrays(self.data.sample(number)))
-            # Without compression: reading is to cost nothing.
-            with replaced_when_written(path) as temporary, temporary.open("wb") as file:
-                np.savez(file, **packed)  # type: ignore[arg-type]
+            if path is not None:
+                # Without compression: reading is to cost nothing.
+                with replaced_when_written(path) as temporary, temporary.open("wb") as file:
+                    np.savez(file, **packed)  # type: ignore[arg-type]
         return _sample(_dequantise(packed))
 
     def describe(self) -> dict[str, Any]:
         """Everything that decides the samples, as plain data."""
         return {"pool": self.count, **self.data.describe()}
 
-    @property
-    def _place(self) -> Path:
+    def _place(self, folder: Path) -> Path:
         text = json.dumps(self.data.describe(), sort_keys=True, default=str)
-        assert self.folder is not None
-        return self.folder / hashlib.sha256(text.encode() + _code()).hexdigest()[:16]
+        return folder / hashlib.sha256(text.encode() + _code()).hexdigest()[:16]
 
 
 @cache

@@ -285,17 +285,16 @@ class AveragedWeights:
         for name, parameter in self._parameters.items():
             parameter.copy_(values[name])
 
-    def state_dict(self) -> dict[str, object]:
+    def state_dict(self) -> dict[str, Any]:
         """For a checkpoint."""
         return {"updates": self.updates, "shadow": self.shadow}
 
-    def load_state_dict(self, state: Mapping[str, object]) -> None:
+    @torch.no_grad()
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """From a checkpoint."""
-        self.updates = int(state["updates"])  # type: ignore[call-overload]
-        shadow: Mapping[str, Tensor] = state["shadow"]  # type: ignore[assignment]
-        with torch.no_grad():
-            for name, value in self.shadow.items():
-                value.copy_(shadow[name])
+        self.updates = int(state["updates"])
+        for name, value in self.shadow.items():
+            value.copy_(state["shadow"][name])
 
 
 FILE = "state.pt"

@@ -212,9 +212,7 @@ class StageRun:
         ``_identity`` needs both.
         """
         before = STAGES[: STAGES.index(self.stage)]
-        source = self.init
-        if source is None:
-            source = self._weights_before(before)
+        source = self.init or self._weights_before(before)
         if source is None and before:
             made = [name for name in before if getattr(self.config, name) is not None]
             first = f"run --stage {made[-1]} first, or give" if made else "give"
@@ -381,9 +379,15 @@ def encoder_sheet(model: GeoVerse, batch: TrainingBatch) -> NDArray[np.uint8]:
 def _bands(pictures: Sequence[Tensor], depths: Sequence[Tensor]) -> NDArray[np.uint8]:
     """The bands of each sample under each other, of (B, V, 3, H, W) and (B, V, 1, H, W)."""
     bands: list[NDArray[np.uint8]] = []
+    gaps = ((0, 0), (0, GAP), (0, GAP), (0, 0))
     for index in range(len(pictures[0])):
-        bands += [_band(values[index]) for values in pictures]
-        bands += [_depth_band(values[index]) for values in depths]
+        shown = [255 * values[index].cpu().permute(0, 2, 3, 1).numpy() for values in pictures]
+        tiles = [values.round().clip(0, 255) for values in shown]
+        tiles += [_shade(values[index]) for values in depths]
+        for views in tiles:
+            padded = np.pad(views.astype(np.uint8), gaps, constant_values=255)
+            # (V, H, W, 3) side by side.
+            bands.append(np.concatenate(list(padded), axis=1))
     return np.concatenate(bands)
 
 
@@ -396,23 +400,11 @@ def write_png(path: Path, image: NDArray[np.uint8]) -> None:
         Image.fromarray(image).save(temporary, format="PNG")
 
 
-def _band(pictures: Tensor) -> NDArray[np.uint8]:
-    """(V, 3, H, W) in [0, 1] side by side."""
-    tiles = (pictures.cpu().permute(0, 2, 3, 1).numpy() * 255).round().clip(0, 255)
-    return _side_by_side(tiles.astype(np.uint8))
-
-
-def _depth_band(depth: Tensor) -> NDArray[np.uint8]:
-    """(V, 1, H, W) side by side; near is bright, unknown black."""
+def _shade(depth: Tensor) -> NDArray[np.floating[Any]]:
+    """(V, 1, H, W) to (V, H, W, 3) in [0, 255]; near is bright, unknown black."""
     values = depth[:, 0].cpu().numpy()
     known = values > 0
     inverse = np.where(known, 1 / np.where(known, values, 1), 0)
     top = np.percentile(inverse[known], 98) if known.any() else 1.0
     grey = np.clip(inverse / max(top, 1e-12), 0, 1) * 255
-    return _side_by_side(np.repeat(grey[..., None], 3, axis=-1).astype(np.uint8))
-
-
-def _side_by_side(tiles: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """(V, H, W, 3) to (H + gap, V (W + gap), 3)."""
-    padded = np.pad(tiles, ((0, 0), (0, GAP), (0, GAP), (0, 0)), constant_values=255)
-    return np.concatenate(list(padded), axis=1)
+    return np.repeat(grey[..., None], 3, axis=-1)

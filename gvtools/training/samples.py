@@ -8,8 +8,7 @@ views at 96 x 96 costs milliseconds, so nothing faster stands in.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
@@ -25,6 +24,7 @@ from gvtools.completers.geoverse.views import resample_nearest, view_batch
 from gvtools.completers.surface_fill import surface_fill
 from gvtools.guidance import Guidance
 from gvtools.memory.spatial_memory import SpatialMemory
+from gvtools.networks.compute import one_thread
 from gvtools.training.corruption import (
     NOTHING,
     CorruptionOptions,
@@ -141,7 +141,8 @@ def make_sample(
         known = Observation(known.views + further.views, known.lifted + further.lifted)
     guidance = project_observation(known, clip.cameras[targets])
     size = truth.depth.shape[1], truth.depth.shape[2]
-    with _one_thread():
+    # Torch's averages differ in the last digit by how many threads share them.
+    with one_thread():
         over = surface_fill(known.views, guidance) if fill == "surfaces" else None
         views, cameras = view_batch(observation.views, guidance, size, fill=over)
     order = [*context, *targets]
@@ -172,17 +173,6 @@ def make_sample(
         place=torch.tensor(order),
         context=len(context),
     )
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Torch's averages differ in the last digit by how many threads share them."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def _mean_known(depths: Sequence[Float32]) -> float:

@@ -222,8 +222,8 @@ class HeadsStage(Stage):
     def learning_parts(self) -> Iterable[nn.Module | None]:
         """The heads that have a weight."""
         model, options = self.model, self.options
-        rays = model.geometry.head.ray_chain() if options.ray else []
-        depth = model.geometry.head.depth_chain() if options.depth else []
+        rays = model.geometry.head.chain(rays=True) if options.ray else []
+        depth = model.geometry.head.chain(rays=False) if options.depth else []
         return [*rays, model.rgb_head if options.rgb else None, *depth]
 
     def forward(self, batch: TrainingBatch, draws: Draws) -> tuple[Tensor, dict[str, Tensor]]:

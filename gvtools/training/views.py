@@ -145,21 +145,14 @@ class ClipSamples(ABC):
 
     def sample(self, index: int, attempt: int = 0) -> TrainingSample:
         """The sample of a number, 0 or more."""
-        inputs, truth = self._inputs(index, attempt)
+        inputs, truth = self.inputs(index, attempt)
+        clip, context, draws = inputs.clip, inputs.context, inputs.rng
         return make_sample(
-            inputs.clip,
-            truth,
-            inputs.context,
-            rng=inputs.rng,
-            strength=inputs.strength,
-            fill=self.fill,
+            clip, truth, context, rng=draws, strength=inputs.strength, fill=self.fill
         )
 
-    def inputs(self, index: int) -> SampleInputs:
-        """What the sample of a number is made of."""
-        return self._inputs(index, 0)[0]
-
-    def _inputs(self, index: int, attempt: int) -> tuple[SampleInputs, Clip]:
+    def inputs(self, index: int, attempt: int = 0) -> tuple[SampleInputs, Clip]:
+        """What the sample of a number is made of, and its true views at the model's size."""
         clip, truth = self.clips(index, attempt)
         rng = self.rng(index, FAULTS, attempt)
         strength = draw_strengths(rng, self.faults or CorruptionOptions(clean=1.0))

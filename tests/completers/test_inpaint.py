@@ -165,43 +165,47 @@ def test_reach_leaves_what_is_farther_empty():
     assert np.array_equal(result.depth[0] > 0, distance <= 0.05 * np.hypot(HEIGHT, WIDTH))
 
 
-def test_photographs_give_the_texture_that_no_depth_covers():
+@pytest.fixture(scope="module")
+def holed() -> tuple[np.ndarray, np.ndarray, Guidance]:
+    """The wall's picture, a hole in its middle, and both as guidance; not to be changed."""
     rgb, depth = wall_view()
     valid = _hole(np.s_[40:80, 55:105])
-    given = guidance(rgb, depth, valid, camera())
+    return rgb, ~valid, guidance(rgb, depth, valid, camera())
+
+
+def test_photographs_give_the_texture_that_no_depth_covers(holed):
+    rgb, hole, given = holed
     side_rgb, side_depth = wall_view(0.1)
     # The photograph shows the place, its sensor does not.
     side_depth[25:95, 30:130] = 0
     context = [ContextView("side", camera(0.1), side_rgb, side_depth)]
-    with_it = psnr(create("inpaint").complete(context, given).rgb[0], rgb, ~valid)
-    without = psnr(create("inpaint", context_views=0).complete(context, given).rgb[0], rgb, ~valid)
+    with_it, without = (
+        psnr(create("inpaint", context_views=count).complete(context, given).rgb[0], rgb, hole)
+        for count in (4, 0)
+    )
     assert with_it > 25
     assert with_it > without + 10
 
 
-def test_a_photograph_of_another_surface_is_not_used():
-    rgb, depth = wall_view()
-    valid = _hole(np.s_[40:80, 55:105])
-    given = guidance(rgb, depth, valid, camera())
-    red = np.zeros_like(rgb)
-    red[..., 0] = 1
-    context = [ContextView("blocked", camera(0.1), red, np.full_like(depth, 1.0))]
+RED = np.zeros((HEIGHT, WIDTH, 3), np.float32)
+RED[..., 0] = 1
+
+
+def test_a_photograph_of_another_surface_is_not_used(holed):
+    given = holed[2]
+    context = [ContextView("blocked", camera(0.1), RED, np.ones((HEIGHT, WIDTH), np.float32))]
     without = create("inpaint").complete([], given)
     blocked = create("inpaint").complete(context, given)
     assert np.array_equal(blocked.rgb, without.rgb)
 
 
-def test_a_photograph_that_disagrees_with_two_others_is_outvoted():
-    rgb, depth = wall_view()
-    valid = _hole(np.s_[40:80, 55:105])
-    given = guidance(rgb, depth, valid, camera())
-    unknown = np.zeros_like(depth)
-    red = np.zeros_like(rgb)
-    red[..., 0] = 1
+def test_a_photograph_that_disagrees_with_two_others_is_outvoted(holed):
+    rgb, hole, given = holed
+    unknown = np.zeros((HEIGHT, WIDTH), np.float32)
     honest = [ContextView(f"{x}", camera(x), wall_view(x)[0], unknown) for x in (-0.1, 0.1)]
-    liar = ContextView("liar", camera(0.02), red, unknown)
+    liar = ContextView("liar", camera(0.02), RED, unknown)
     result = create("inpaint").complete([*honest, liar], given)
-    assert psnr(result.rgb[0], rgb, ~valid) > 20
+    assert psnr(result.rgb[0], rgb, hole) > 20
 
 
 @pytest.mark.data

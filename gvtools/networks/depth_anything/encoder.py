@@ -306,20 +306,15 @@ class DepthAnythingBackbone(Recomputing):
         taps = self.config.taps[:levels]
         return self._run(x, grid, 0, taps=taps, camera_token=camera_token)
 
-    def propagate(
-        self, level: Tensor, grid: tuple[int, int], *, boundary: int | None = None
-    ) -> list[Tensor]:  # A (B, V, 1 + N, 2 width) tensor for each level after the boundary
-        """(B, V, 1 + N, 2 width) of each level after ``boundary``, from that level's raw features.
+    def propagate(self, level: Tensor, grid: tuple[int, int]) -> list[Tensor]:
+        """(B, V, 1 + N, 2 width) of each level after the boundary, from that level's raw features.
 
         Only their second half (the current state) is used: a local block follows and replaces the
         first.
         """
-        boundary = self.config.boundary if boundary is None else boundary
+        taps = self.config.taps[self.config.boundary :]
         state = level[..., self.config.width :]
-        start = self.config.taps[boundary] + 1
-        return self._run(
-            state, grid, start, taps=self.config.taps[boundary + 1 :], camera_token=None
-        )
+        return self._run(state, grid, taps[0] + 1, taps=taps[1:], camera_token=None)
 
     def normed(self, level: Tensor) -> Tensor:
         """What the heads receive of a raw (..., 2 width) level: [local, LayerNorm(current)]."""

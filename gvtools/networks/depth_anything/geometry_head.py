@@ -158,16 +158,10 @@ class GeometryHead(Recomputing):
         (depth,) = self._outputs(levels, grid, (self._depth,), views_at_once=views_at_once)
         return depth[:, :, 0].exp(), depth[:, :, 1].exp() + 1
 
-    def ray_chain(self) -> Iterator[nn.Module]:
-        """The modules that rays alone come from."""
+    def chain(self, *, rays: bool) -> Iterator[nn.Module]:
+        """The modules that rays alone, or depth alone, come from."""
         for name, module in self.scratch.named_children():
-            if name.endswith("_aux"):
-                yield module
-
-    def depth_chain(self) -> Iterator[nn.Module]:
-        """The modules that depth alone comes from."""
-        for name, module in self.scratch.named_children():
-            if name.startswith(("refinenet", "output")) and not name.endswith("_aux"):
+            if name.startswith(("refinenet", "output")) and name.endswith("_aux") == rays:
                 yield module
 
     def _outputs(
