@@ -88,8 +88,8 @@ def boards(at: float) -> tuple[np.ndarray, np.ndarray]:
         fine = cv2.GaussianBlur(rng.standard_normal((400, 600)).astype(np.float32), (0, 0), 2)
         over, down = x * z + at, y * z
         hit = (z == 3) | ((np.abs(over - left) < 0.18) & (np.abs(down - top) < 0.14))
-        at = (over * 100 + 300).astype(np.float32), (down * 100 + 200).astype(np.float32)
-        shade = cv2.remap(fine, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+        where = (over * 100 + 300).astype(np.float32), (down * 100 + 200).astype(np.float32)
+        shade = cv2.remap(fine, *where, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
         texture = grey + 150 * shade
         rgb[hit] = np.clip(texture, 0, 255).astype(np.uint8)[hit, None]
         depth[hit] = z
