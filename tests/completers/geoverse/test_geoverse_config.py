@@ -29,6 +29,8 @@ def test_wrong_ranges_in_a_file_are_refused():
         changed = {**data, part: {**data[part], key: value}}
         with pytest.raises(OptionError, match=said):
             from_json(GeoVerseConfig, changed)
+    with pytest.raises(OptionError, match="needs filled hints"):
+        micro.config(composition="correction")
     with pytest.raises(OptionError, match="image_size 12000000; expected at least 12 and at most"):
         from_json(GeoVerseConfig, {**data, "image_size": 12_000_000})
     with pytest.raises(OptionError, match=r"^config = .{60}; expected an object"):
