@@ -230,10 +230,7 @@ def test_the_seed_decides_and_each_view_draws_for_itself(network: Any) -> None:
     first, again, other = (prior.features(images, valid, 1, seed=s) for s in (1, 1, 2))
     assert all(map(torch.equal, first, again))
     assert not torch.equal(first[0], other[0])
-    rows = [
-        [view_seed(7, "frame", v) for v in range(3)],
-        [view_seed(8, "frame", v) for v in range(3)],
-    ]
+    rows = [[view_seed(seed, "frame", v) for v in range(3)] for seed in (7, 8)]
     spy.calls.clear()
     both = prior.features(images, valid, 1, seed=rows)
     for item in range(2):
@@ -300,10 +297,9 @@ def test_the_empty_prompt_is_not_zeros(network: Any) -> None:
     assert torch.equal(without.features(images, valid, 1)[0], zeros[0])
     with pytest.raises(CheckpointError, match="no embedding of the empty prompt"):
         VideoPrior(network, tiny.vae(), config=tiny.CONFIG)
-    with pytest.raises(CheckpointError, match="prompt"):
-        VideoPrior(network, tiny.vae(), torch.zeros(1, 9), config=tiny.CONFIG)
-    with pytest.raises(CheckpointError, match="prompt"):
-        VideoPrior(network, tiny.vae(), torch.zeros(7, tiny.TEXT), config=tiny.CONFIG)
+    for shape in ((1, 9), (7, tiny.TEXT)):
+        with pytest.raises(CheckpointError, match="prompt"):
+            VideoPrior(network, tiny.vae(), torch.zeros(shape), config=tiny.CONFIG)
 
 
 def test_a_configuration_that_does_not_fit_the_weights_is_refused(network: Any) -> None:
@@ -318,9 +314,6 @@ def test_a_copied_model_shares_its_prior(network):
 
     prior = tiny.prior(network)
     assert copy.deepcopy([prior])[0] is prior
-
-
-pytest.importorskip("diffusers", reason="the extra wan is not installed")
 
 
 class Stream:
