@@ -339,7 +339,7 @@ def _estimated_poses(probe: Mapping[str, Any] | None) -> dict[str, Any]:
 
 def _inverted(poses: Sequence[Any]) -> NDArray[np.float64]:
     known = [np.full((4, 4), np.nan) if pose is None else pose for pose in poses]
-    return np.asarray(np.linalg.inv(np.reshape(known, (-1, 4, 4))), np.float64)
+    return np.linalg.inv(np.array(known, np.float64).reshape(-1, 4, 4))
 
 
 def _errors(probe: Mapping[str, Any] | None) -> list[tuple[str, float | None, float | None]]:

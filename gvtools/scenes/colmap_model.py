@@ -260,7 +260,7 @@ class ColmapModel:
 
 
 def load_model(folder: Path, *, faces: bool = False) -> ColmapModel:
-    """The model in ``folder``, binary or text; with ``undistort``, wide cameras become several."""
+    """The model in ``folder``, binary or text; with ``faces``, wide cameras become several."""
     suffix, findings = checked_suffix(folder), list[Finding]()
     if others := _siblings(folder):
         listed = ", ".join(f"{name} ({count} images)" for name, count in others)

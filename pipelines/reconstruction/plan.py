@@ -248,7 +248,7 @@ def _check_pictures(scene: Scene, context: tuple[str, ...], targets: Targets) ->
 def make_schedule(
     targets: int, views_per_round: int, rounds: int | None, *, faces: int = 1
 ) -> tuple[tuple[int, ...], ...]:
-    """Rows of the targets for each round, in order; always so many ``undistort`` together.
+    """Rows of the targets for each round, in order; always so many ``faces`` together.
 
     Without ``rounds``, as many as it takes. With more rounds than full rounds need, the targets
     are spread evenly over them; what does not fit into them stays out, and is reported.

@@ -86,8 +86,8 @@ class Oracle:
         return int(np.argmin(gaps))
 
     def _unit(self, cam_from_world, centres) -> float:
-        """The unit of the cameras that were handed in; 1 without them."""
-        if cam_from_world is None:
+        """The unit of the cameras that were handed in; 1 without them, or of one alone."""
+        if cam_from_world is None or len(centres) == 1:
             return 1.0
         given = torch.linalg.inv(cam_from_world[0].double())[:, :3, 3].numpy()
         longest = np.linalg.norm(centres, axis=1).argmax()
@@ -165,11 +165,13 @@ def test_passes_share_one_scale_and_are_as_equal_as_can_be(tmp_path, monkeypatch
 
 @pytest.mark.parametrize(
     ("wrong", "said"),
-    [("centres", "unsupported"), ("depth", "unsupported"), ("", "unsupported: .*at least 4")],
-)
+    [("centres", "unsupported"), ("depth", "unsupported"), ("", "unsupported: .*at least 4"),
+     ("alone", "unsupported: fewer than 2 valid centres; give a project with")],
+)  # fmt: skip
 def test_a_scale_without_support_is_refused(scene, with_points, monkeypatch, weights, wrong, said):
-    """Points that fit no scale refuse it, whatever the centres say; two centres are none."""
-    scene = {"centres": scene, "depth": with_points}.get(wrong, scene.subset(scene.names[:2]))
+    """Points that fit no scale refuse it, whatever the centres say; two centres or one are none."""
+    few = scene.subset(scene.names[: 1 if wrong == "alone" else 2])
+    scene = {"centres": scene, "depth": with_points}.get(wrong, few)
     stand_in(monkeypatch, scene, wrong=wrong)
     source = da3(scene, weights)
     view = scene.views[0]

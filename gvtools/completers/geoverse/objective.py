@@ -10,7 +10,8 @@ the graph. References never receive a gradient. Half-precision inputs are compar
 
 The scale: (s*, Q*, b*) minimises sum_j |s Q o^_j + b - o_j|^2 over s > 0, Q in SO(3), b (appendix
 "Scale-aligned depth supervision"). The scale, unlike the rotation, is determined by two centres or
-by centres on a line, so these are solved; where it stays open its numbers are NaN.
+by centres on a line, so these are solved; where it stays open the status says so, and its numbers
+are NaN.
 """
 
 from __future__ import annotations
@@ -76,6 +77,13 @@ def sobel_magnitude(gray: Tensor, valid: Tensor) -> Tensor:
     return torch.where(valid, torch.hypot(torch.as_tensor(x), torch.as_tensor(y)), 0.0)
 
 
+DEFECTS = (
+    "aligned",
+    "fewer than 2 valid centres",
+    "coincident predicted centres",
+    "coincident reference centres",
+    "unrelated centres",
+)
 # Spreads below this many roundings of the coordinates' magnitude are no geometry.
 ROUNDINGS = 4
 
@@ -85,12 +93,17 @@ class CenterSimilarity:
     """The scale of reference ≈ scale · rotation · predicted + translation, for each sample."""
 
     scale: Tensor  # (B,) reference units per predicted unit; NaN where not ``ok``
-    # (B,) bool, whether the scale holds: of two centres or more, neither coincident nor unrelated.
-    ok: Tensor
+    ok: Tensor  # (B,) bool, whether the scale holds
+    defect: Tensor  # (B,) int64, index into ``DEFECTS``
     used: Tensor  # (B,) int64, centres the fit stands on
     # (B,) in [0, 1], 1 where the similarity maps the centres exactly; NaN where not ``ok``. The
     # share of the reference's spread left over is 1 - correlation^2.
     correlation: Tensor
+
+    @property
+    def status(self) -> tuple[str, ...]:
+        """What ``DEFECTS`` says of each sample."""
+        return tuple(DEFECTS[index] for index in self.defect.tolist())
 
 
 @torch.no_grad()
@@ -117,13 +130,16 @@ def center_similarity(predicted: Tensor, reference: Tensor) -> CenterSimilarity:
     coarsest = max(torch.finfo(z.dtype).eps for z in (predicted, reference))
     unrelated = matched <= ROUNDINGS * coarsest * size
 
-    ok = (count >= 2) & ~(x_flat | y_flat | unrelated)
+    defect = torch.zeros_like(count)
+    for index, holds in ((4, unrelated), (3, y_flat), (2, x_flat), (1, count < 2)):
+        defect = torch.where(holds, index, defect)
+    ok = defect == 0
     wide = torch.promote_types(predicted.dtype, torch.float32)
     scale, correlation = (
         torch.where(ok, value, torch.nan).to(wide).to(predicted.device)
         for value in (matched / x_spread, (matched / size).clamp(max=1))
     )
-    return CenterSimilarity(scale, ok.to(predicted.device), count, correlation)
+    return CenterSimilarity(scale, ok.to(predicted.device), defect, count, correlation)
 
 
 def _centered(points: Tensor, use: Tensor, eps: float) -> tuple[Tensor, Tensor]:

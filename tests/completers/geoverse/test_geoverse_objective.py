@@ -32,6 +32,7 @@ from gvtools.completers.geoverse.flow import (
     view_seed,
 )
 from gvtools.completers.geoverse.objective import (
+    DEFECTS,
     center_similarity,
     depth_loss,
     flow_matching_loss,
@@ -221,7 +222,7 @@ def test_samples_without_a_scale_are_dropped():
     predicted, reference, found_centers, centers = _depths(np.random.default_rng(1))
     found_centers[1] = 0.5
     similarity = center_similarity(found_centers, centers)
-    assert similarity.ok.tolist() == [True, False]
+    assert similarity.status == ("aligned", "coincident predicted centres")
     predicted.requires_grad_()
     dropped = depth_loss(predicted, reference, similarity=similarity)
     assert dropped[1].item() == 0 < dropped[0].item()
@@ -345,22 +346,24 @@ def test_samples_are_fitted_one_by_one_from_their_finite_centres():
 
 
 @pytest.mark.parametrize(
-    ("predicted", "reference"),
+    ("predicted", "reference", "defect"),
     [
-        (np.eye(3), np.where(np.arange(3)[:, None] > 0, np.nan, np.eye(3))),
-        (np.full((3, 3), 0.1), np.eye(3)),
-        (np.eye(3), np.full((3, 3), 1e6 / 3)),
+        (np.eye(3), np.where(np.arange(3)[:, None] > 0, np.nan, np.eye(3)), 1),
+        (np.full((3, 3), 0.1), np.eye(3), 2),
+        (np.eye(3), np.full((3, 3), 1e6 / 3), 3),
         (
             np.array([[1.0, 0, 0], [-1, 0, 0], [0, 0, 0], [0, 0, 0]]),
             np.array([[0.0, 0, 0], [0, 0, 0], [0, 1, 0], [0, -1, 0]]),
+            4,
         ),
     ],
 )
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
-def test_what_leaves_the_scale_open_has_none(predicted, reference, dtype):
+def test_what_leaves_the_scale_open_is_said(predicted, reference, defect, dtype):
     fit = center_similarity(
         torch.tensor(predicted, dtype=dtype)[None], torch.tensor(reference, dtype=dtype)[None]
     )
+    assert fit.status == (DEFECTS[defect],)
     assert not bool(fit.ok) and bool(fit.scale.isnan())
 
 
