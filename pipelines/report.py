@@ -338,8 +338,8 @@ def _estimated_poses(probe: Mapping[str, Any] | None) -> dict[str, Any]:
 
 
 def _inverted(poses: Sequence[Any]) -> NDArray[np.float64]:
-    known = [np.full((4, 4), np.nan) if pose is None else pose for pose in poses]
-    return np.linalg.inv(np.array(known, np.float64).reshape(-1, 4, 4))
+    known = np.array([np.full((4, 4), np.nan) if pose is None else pose for pose in poses], float)
+    return np.asarray(np.linalg.inv(known.reshape(-1, 4, 4)), np.float64)
 
 
 def _errors(probe: Mapping[str, Any] | None) -> list[tuple[str, float | None, float | None]]:
