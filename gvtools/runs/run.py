@@ -311,7 +311,10 @@ class _View(BaseModel):
             check_usable(camera)
             rigid_transform(camera.cam_from_world[0], what=self.name)
             size = [self.camera[side] for side in ("width", "height")]
-            expect([*camera.width, *camera.height] == size, f"a picture of {size} pixels")
+            fits = [*camera.width, *camera.height] == size and max(size) < 2**31
+            expect(fits and all(np.ndim(side) == 0 for side in size), f"a picture of {size} pixels")
+            shapes = [np.shape(self.camera[name]) for name in ("K", "cam_from_world")]
+            expect(shapes == [(3, 3), (4, 4)], f"K and cam_from_world of shapes {shapes}")
         except (ShapeError, KeyError, TypeError, OverflowError) as error:
             raise ValueError(str(error)) from None
         return self

@@ -6,6 +6,7 @@ import shutil
 import numpy as np
 import pytest
 from PIL import Image
+from pydantic import ValidationError
 from tiny_scan import write_colmap_scan, write_scan
 
 import gvtools
@@ -13,7 +14,7 @@ from gvtools.errors import ProjectError
 from gvtools.files import write_json
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.runs.folder import RunDirectory
-from gvtools.runs.run import load_growing_run, load_run
+from gvtools.runs.run import _View, load_growing_run, load_run
 from pipelines.cli import main
 
 pytestmark = pytest.mark.usefixtures("unpainted")
@@ -269,3 +270,17 @@ def test_a_record_of_another_version_is_refused(small_run, tmp_path, change):
     (tmp_path / "run.json").write_text(json.dumps({**record, **change}))
     with pytest.raises(ProjectError, match="no record of a run of this version"):
         load_run(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"width": 2**31}, {"width": [4]}, {"width": 0}, {"K": [np.eye(3).tolist()]},
+     {"cam_from_world": [np.eye(4).tolist()]}, {"cam_from_world": (2 * np.eye(4)).tolist()}],
+)  # fmt: skip
+def test_a_view_of_a_report_has_one_usable_camera(change):
+    camera = {"K": np.eye(3).tolist(), "cam_from_world": np.eye(4).tolist()}
+    view = {"name": "a", "stem": "a", "coverage": 1, "coverage_after": 1, "scale": {}}
+    view["camera"] = {**camera, "width": 4, "height": 3}
+    _View.model_validate(view)
+    with pytest.raises(ValidationError):
+        _View.model_validate({**view, "camera": {**view["camera"], **change}})
