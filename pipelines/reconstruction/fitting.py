@@ -70,9 +70,6 @@ MEMORY_SHARE, MOST_MEGAPIXELS, MEGAPIXEL_SECONDS = 0.15, 20.0, 2.0
 SWEEP_SECONDS, SWEEP_SHARE, SMALL_SIDE = 0.8, 0.15, 160
 # So many views are swept however little time there is, where a fit has few points to begin with.
 FEWEST_SWEPT = 12
-# The memory's colours must be better by so much, divided by the number of photographs that judge:
-# pictures of one that is at the border of the others differ by 2 dB from fit to fit [dB].
-MARGIN = 3.0
 # Progress is printed at this interval [s].
 SAY_EVERY = 5.0
 # Least tolerance of the blend with recorded depth. In targets far from all views Gaussians are
@@ -185,16 +182,18 @@ class Sweep:
 
 @dataclass(frozen=True)
 class FitValidation:
-    """PSNR of a fit's validation photographs, at the size of its sweep."""
+    """PSNR of what a memory without the validation photographs knows of them, at its sweep's size.
 
-    gaussians: float  # PSNR of the Gaussians' pictures [dB]
-    memory: float  # of the memory's own colours, and the Gaussians' where it knows nothing [dB]
-    photographs: int  # how many they are
+    Elsewhere, mostly at their borders, both guess, and differ by 2 dB from fit to fit.
+    """
+
+    gaussians: float  # of the Gaussians' pictures [dB]
+    memory: float  # of the memory's own colours [dB]
 
     @property
     def fit_is_used(self) -> bool:
-        """Whether the Gaussians are not clearly worse."""
-        return self.memory <= self.gaussians + MARGIN / self.photographs
+        """Whether the Gaussians are not worse."""
+        return self.memory <= self.gaussians
 
     def __str__(self) -> str:
         fit, own = f"{self.gaussians:.2f} dB", f"{self.memory:.2f} dB"
@@ -226,7 +225,7 @@ def validate_fit(
             frame.rgb, found.depth, view.camera, round=0, mask=frame.mask,
             confidence=found.confidence, options=plan.config.back_projection,
         )  # fmt: skip
-    squares, pixels, known = np.zeros(2), 0, 0
+    squares, known = np.zeros(2), 0
     for name, picture in predicted.items():
         view = scene[name]
         frame = view.load()
@@ -235,17 +234,15 @@ def validate_fit(
         whole = torch.from_numpy(picture.rgb).permute(2, 0, 1)[None]
         small = torch.nn.functional.interpolate(whole, where.shape, mode="area")
         shown = small[0].permute(1, 2, 0).numpy()
-        own = np.where(where[..., None], guidance.rgb[0], shown)
-        used = np.ones(where.shape, np.bool_) if frame.mask is None else frame.mask
-        for row, rgb in enumerate((shown, own)):
-            off = rgb[used] - frame.rgb[used] / np.float32(255)
+        for row, rgb in enumerate((shown, guidance.rgb[0])):
+            off = rgb[where] - frame.rgb[where] / np.float32(255)
             squares[row] += float(np.square(off).mean(axis=1).sum())
-        pixels, known = pixels + int(used.sum()), known + int(where.sum())
+        known += int(where.sum())
     memory.close()
     if not known:
         return None
-    gaussians, own_colors = -10 * np.log10(np.maximum(squares / pixels, 1e-10))
-    return FitValidation(float(gaussians), float(own_colors), len(predicted))
+    gaussians, own = -10 * np.log10(np.maximum(squares / known, 1e-10))
+    return FitValidation(float(gaussians), float(own))
 
 
 @dataclass(frozen=True, eq=False)
@@ -534,13 +531,13 @@ def _stopped_by_ctrl_c(fit: Fit, console: Console) -> Iterator[None]:
 
 def _progress(console: Console) -> Callable[[Fit, float], None]:
     """Prints progress now and then."""
-    began, told = time.perf_counter(), 0.0
+    began, told, steps = time.perf_counter(), 0.0, -1
 
     def say(fit: Fit, share: float) -> None:
-        nonlocal told
+        nonlocal told, steps
         now = time.perf_counter() - began
-        if now - told >= SAY_EVERY or share >= 1:
-            told = now
+        if fit.steps != steps and (now - told >= SAY_EVERY or share >= 1):
+            told, steps = now, fit.steps
             psnr = fit.validation_psnr()
             left_out = "" if psnr is None else f", left-out photographs {psnr:.2f} dB"
             console.line(
