@@ -323,6 +323,12 @@ class Lpips:
         import torch
         from torch.nn.functional import conv2d, interpolate
 
+        alike = image.shape == truth.shape and image.dtype == truth.dtype == np.uint8
+        if not alike or image.shape[2:] != (3,) or min(image.shape[:2]) < SMALLEST:
+            raise ShapeError(
+                f"LPIPS of {image.dtype} {image.shape} and {truth.dtype} {truth.shape}; expected "
+                f"equal uint8 (H, W, 3), at least {SMALLEST}x{SMALLEST} pixels"
+            )
         with torch.inference_mode():
             features = zip(self._heads, self._features(image), self._features(truth), strict=True)
             maps = [conv2d((first - second) ** 2, head) for head, first, second in features]

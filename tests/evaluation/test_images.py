@@ -230,15 +230,21 @@ def test_it_is_the_packages_own_forward(alex, take, monkeypatch):
 
 
 @needs_package
-def test_equal_pictures_have_no_distance_and_noise_adds_to_it(alex, take):
+def test_equal_pictures_have_no_distance_noise_adds_to_it_and_shapes_are_checked(alex, take):
     distance = take("alex", alex.read_bytes()).distance
-    image, _ = pictures()
+    image, truth = pictures()
     rng = np.random.default_rng(1)
     values = [
         distance(np.clip(image + rng.normal(0, s, image.shape), 0, 255).astype("u1"), image)[0]
         for s in (0, 5, 40)
     ]
     assert 0 == values[0] < values[1] < values[2]
+    wrongs: list[Any] = [truth[:-1], truth.astype(np.float32), truth[..., 0]]
+    for wrong in wrongs:
+        with pytest.raises(ShapeError):
+            distance(image, wrong)
+    with pytest.raises(ShapeError, match="at least 32"):
+        distance(image[:20], truth[:20])
 
 
 @pytest.mark.parametrize(("net", "count"), [("vgg", 14_714_688), ("alex", 2_469_696)])
