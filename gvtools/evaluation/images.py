@@ -367,6 +367,7 @@ def better_reading(pictures: Sequence[NDArray[np.uint8]], truths: Sequence[Frame
     and offset of brightness, and one motion (shift, size, turn) in the picture.
 
     >>> truth = np.random.default_rng(0).integers(0, 255, (32, 32, 3), np.uint8)
+    >>> from gvtools.scenes.scene import Frame
     >>> better_reading([truth[::-1]], [Frame(truth)])[:48]
     'upside down: otherwise PSNR would be 98.1 dB ins'
     """
