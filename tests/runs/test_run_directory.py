@@ -278,7 +278,8 @@ def test_a_record_of_another_version_is_refused(small_run, tmp_path, change):
      {"cam_from_world": [np.eye(4).tolist()]}, {"cam_from_world": (2 * np.eye(4)).tolist()}],
 )  # fmt: skip
 def test_a_view_of_a_report_has_one_usable_camera(change):
-    camera = {"K": np.eye(3).tolist(), "cam_from_world": np.eye(4).tolist(), "width": 4, "height": 3}
+    pose = {"K": np.eye(3).tolist(), "cam_from_world": np.eye(4).tolist()}
+    camera = {**pose, "width": 4, "height": 3}
     view = {"name": "a", "stem": "a", "coverage": 1, "coverage_after": 1, "scale": {}}
     _View.model_validate({**view, "camera": camera})
     with pytest.raises(ValidationError):
