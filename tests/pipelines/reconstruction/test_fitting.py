@@ -39,6 +39,7 @@ from pipelines.reconstruction.fitting import (
     MOST_SHARE,
     MOST_TOLERANCE,
     Fitted,
+    FitValidation,
     Sweep,
     fit_appearance,
     fit_views,
@@ -417,10 +418,19 @@ def test_a_fit_worse_than_the_memory_is_not_used(bare, monkeypatch, capsys):
     view = plan.scene["view_3.png"]
     truth = (view.load().rgb / 255).astype(np.float32)
     alpha = np.ones(truth.shape[:2], np.float32)
-    good = validate_fit({view.name: Picture(truth, alpha)}, plan, sweep)
+
+    def validated(rgb: np.ndarray, steps: int) -> FitValidation | None:
+        fitted: Any = SimpleNamespace(
+            predicted={view.name: Picture(rgb, alpha)}, sweep=sweep, steps=steps
+        )
+        return validate_fit(fitted, plan)
+
+    good = validated(truth, 1)
     assert good is not None and good.fit_is_used
-    bad = validate_fit({view.name: Picture(0 * truth, alpha)}, plan, sweep)
+    bad = validated(0 * truth, 1000)
     assert bad is not None and not bad.fit_is_used
+    close = FitValidation(30, 31, 1000)
+    assert close.fit_is_used and not replace(close, steps=100).fit_is_used
     # What the Gaussians show where the memory knows nothing does not count.
     assert good.gaussians > good.memory == bad.memory > 15 > bad.gaussians
     monkeypatch.setattr(fitting, "validate_fit", lambda *args: bad)
