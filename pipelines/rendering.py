@@ -296,13 +296,13 @@ def _path_cameras(
         return named_path(name, captured, count=int(count or FRAMES), depth=depth)
     if path == CAPTURED:
         return captured
-    place, at, selection = path.partition("@")
-    if not Path(place).exists():
-        raise OptionError(f"--path {path!r}; expected {FORMS}")
     from gvtools.scenes.project import open_project
-    from gvtools.scenes.selection import select
+    from gvtools.scenes.selection import path_and_selection, path_exists, select
 
-    selection = selection if at else "all"
+    place, selection = path_and_selection(path)
+    if not path_exists(place):
+        raise OptionError(f"--path {path!r}; expected {FORMS}")
+
     cameras = read_camera_path(Path(place), captured, selection=selection)
     poses = "" if run is None else said_of_path(Path(place), run)
     if cameras is None:

@@ -43,7 +43,7 @@ from gvtools.poses.refinement import (
 # Numbers below that name a part of the fit are progress.
 
 # The progress from which photographs are taken at a quarter, half and all of their size; those with
-# fewer than SMALL pixels at twice that, those with more than LARGE at half of it until LAST.
+# fewer than SMALL pixels at twice that, others halved until they have at most LARGE, before LAST.
 SIZES = ((0.0, 4), (0.2, 2), (0.6, 1))
 SMALL, LARGE, LAST = 112_000, 900_000, 0.85
 # Each degree of the spherical harmonics joins after so much progress.
@@ -284,7 +284,8 @@ class Fit:
 
     def shown_psnr(self) -> float:
         """Mean PSNR of some of the photographs, as the Gaussians show them now [dB]."""
-        rows = range(0, len(self.views), -(-len(self.views) // JUDGES))
+        shown = [row for row, view in enumerate(self.views) if _shows(view)]
+        rows = shown[:: -(-len(shown) // JUDGES)]
         return self.psnr_of({row: self._picture(row, self.cameras.pose(row)) for row in rows})
 
     def step(self, share: float) -> None:
@@ -446,7 +447,8 @@ class Fit:
         gradient = np.zeros_like(picture.image)
         in_threads(loss.loss_gradient, 3, shown, target, view.weight, options.ssim, gradient)
         gradient *= pixels
-        self._errors.append(float(((shown - target) ** 2 * view.weight).mean()))
+        error = ((shown - target) ** 2 * view.weight).mean() / max(view.weight.mean(), 1e-6)
+        self._errors.append(float(error))
         self.cameras.step_gain(number, (gradient[:3] * lit).sum(axis=(1, 2)) / pixels)
         gradient[4] = -(gradient[:3] * behind).sum(axis=0)
         gradient[:3] *= gain[:, None, None]

@@ -50,9 +50,8 @@ def choose_source(
     "auto" takes recorded depth where there is some and computes the rest: by Depth Anything 3 where
     its weights are given, by COLMAP's PatchMatch where pycolmap has CUDA, otherwise by plane-sweep
     stereo. Of CHOICES, ``sensor`` wants RGB-D, ``colmap`` COLMAP's stereo maps, on disk or computed
-    now, ``plane-sweep`` photographs alone, ``da3`` a foundation model's weights, ``sensor-or-da3``
-    these for what has no recorded depth, and without weights what "auto" takes. Nothing but
-    ``views`` is looked at.
+    now, ``plane-sweep`` photographs alone, ``da3`` a foundation model's weights;
+    ``sensor-or-da3`` is "auto" whose depth no fit replaces. Nothing but ``views`` is looked at.
     """
     chosen = _chosen(
         scene, views, choice, stereo=stereo, foundation=foundation or FoundationOptions()
@@ -134,8 +133,6 @@ def _chosen(
         return ChosenSource(_stereo(scene, views, stereo), "asked for")
     if recorded == len(views):
         return ChosenSource(RecordedDepth(views), "every context view has recorded depth")
-    if recorded and len(views) < 2 and foundation.weights is None:
-        return ChosenSource(RecordedDepth(), "a single view leaves nothing to compute from")
     if foundation.weights is not None:
         source = _foundation(scene, views, foundation)
         how = f"Depth Anything 3, as weights are given: {foundation.weights}"

@@ -1,8 +1,9 @@
 """RGB-D folders: what their layouts share, from options and frames to a scene.
 
-Poses are camera-to-world, depth is 16-bit with 0 and 65535 for no reading. All layouts publish
-intrinsics whose first pixel centre is (0, 0), as Kinect drivers and Open3D count; they are moved by
-half a pixel to the project's (0.5, 0.5) here, once. The layouts are in ``rgbd_layouts``.
+Poses are camera-to-world with OpenCV's axes, but NeuralRGBD's; depth is 16-bit with 0 and 65535 for
+no reading, or float. Layouts publish intrinsics whose first pixel centre is (0, 0), as Kinect
+drivers and Open3D count; they are moved by half a pixel to the project's (0.5, 0.5) here, once.
+The layouts are in ``rgbd_layouts``.
 """
 
 from __future__ import annotations
@@ -51,13 +52,13 @@ class RgbdOptions(Settings):
     section = "rgbd"
 
     depth_unit: float | None = Field(None, gt=0)
-    """Metres per stored unit (TUM 1/5000, others 1/1000)."""
+    """Metres per stored unit (TUM 1/5000, Replica by its file, float maps 1, others 1/1000)."""
     color_K: Matrix | None = None
     """(3, 3) intrinsics of the colour camera, pixels."""
     depth_K: Matrix | None = None
     """(3, 3) intrinsics of the depth camera, pixels; None: depth is of the colour camera."""
     color_from_depth: Matrix | None = None
-    """(4, 4) rigid, metres; None with ``depth_K`` given: the same place."""
+    """(4, 4) rigid, metres; None with ``depth_K`` given: the layout's, or the same place."""
     distortion: list[float] | None = None
     """k1, k2, p1, p2, k3 of the colour camera, as OpenCV has them."""
     depth_max: float | None = Field(None, gt=0)
@@ -219,12 +220,15 @@ def rgbd_scene(recording: Recording, *, kind: str = "rgbd", strict: bool = True)
         what = "unreadable" if frames[0].image.exists() else "no such picture"
         raise ProjectError(f"{frames[0].image}: {what}, like all {len(frames)} pictures beside it")
     lens = _lens(K, recording, size=size or (2, 2))
+    own = lens if "color_K" in recording.given else None
     unit = options.depth_unit or MILLIMETRES
     reader = partial(read_depth, unit=unit, maximum=options.depth_max)
     scene = posed_scene(
         root,
         [
-            replace(frame, lens=frame.lens or lens, read_depth=reader, registration=registration)
+            replace(
+                frame, lens=own or frame.lens or lens, read_depth=reader, registration=registration
+            )
             for frame in frames
         ],
         poses="world_from_cam",

@@ -7,7 +7,7 @@
   camera of its own; frames that the tracker lost hold infinity.
 - Redwood and Open3D: ``color``, ``depth`` and a ``.log`` trajectory, each block of which is the
   number of a picture in natural order and a pose.
-- Replica and RTAB-Map: see their classes.
+- NeuralRGBD, Replica and RTAB-Map: see their classes.
 
 ``gvtools capture`` takes the same layouts less their poses: every frame then stands at the
 identity.
@@ -399,6 +399,8 @@ class _RtabMap(_ScanNet):
         if K is not None:
             K[:2, 2] -= 0.5
         recording = super().calibration(root, under(options, color_K=K))
+        if K is None or options.color_K is not None:
+            return recording
         return replace(recording, findings=[Finding("info", "intrinsics: each picture's own")])
 
     def posed(self, recording: Recording, *, strict: bool) -> Recording:

@@ -45,6 +45,30 @@ def select(names: Sequence[str], spec: str) -> tuple[str, ...]:
     return tuple(names[i] for i in sorted(chosen))
 
 
+def is_view_or_folder(names: Sequence[str], text: str) -> bool:
+    """Whether a text is the name of a view, or of a folder of views."""
+    return text in names or text in _folders(names)
+
+
+def path_and_selection(text: str) -> tuple[str, str]:
+    """The two parts of PATH[@SELECTION], "all" without one; paths that exist may hold an "@".
+
+    >>> path_and_selection("runs/a@every:2"), path_and_selection("runs/a")
+    (('runs/a', 'every:2'), ('runs/a', 'all'))
+    """
+    ends = [at for at, sign in enumerate(text + "@") if sign == "@"]
+    end = next((end for end in reversed(ends) if end and path_exists(text[:end])), ends[0])
+    return text[:end], text[end + 1 :] if end < len(text) else "all"
+
+
+def path_exists(text: str) -> bool:
+    """Whether there is such a file or folder; a text may be too long for a path."""
+    try:
+        return Path(text).exists()
+    except (OSError, ValueError):
+        return False
+
+
 def _chosen(
     names: Sequence[str], pictures: Mapping[str, list[int]], spec: str, *, whole: str
 ) -> set[int]:

@@ -13,7 +13,12 @@ from numpy.typing import NDArray
 
 from gvtools.appearance.appearance import Appearance
 from gvtools.appearance.gaussians import Gaussians
-from gvtools.appearance.population import from_depth, from_points, pixels_with_depth
+from gvtools.appearance.population import (
+    STARTING_GAUSSIANS,
+    from_depth,
+    from_points,
+    pixels_with_depth,
+)
 from gvtools.appearance.splat.project_kernels import VALUES
 from gvtools.errors import DegenerateError
 from gvtools.poses.refinement import FitView
@@ -25,11 +30,11 @@ from gvtools.scans.registration import (
     given_placement,
     register,
 )
+from gvtools.scenes.inspection import spread
 from gvtools.scenes.matching import paired
 from gvtools.splat_files import holds_splats, read_splats
 from gvtools.splats import LOG_SCALE, LOGIT, QUATERNION, Splats, place_gaussians
 from gvtools.untrusted import read_json
-from gvtools.view_selection import evenly_spread
 from pipelines.reconstruction.prepare import photographed
 
 if TYPE_CHECKING:
@@ -48,9 +53,8 @@ FEWEST_POINTS = 100
 GIVEN = 0.15
 # Gaussians of at least this opacity are surfaces, by which they are placed.
 OPAQUE = 0.5
-# Splats that are this much nearer [dB] to the median of so many photographs, with this longer side
-# [px], than the mean colour lie where they belong. What is nearer than this share of the median
-# distance is not drawn.
+# Splats lie where they belong if pictures of them beat the photographs' mean colour by LEAST_GAIN
+# [dB] (median of LOOKED_AT, SIDE px long). NEAR: the near plane, in median distances.
 LEAST_GAIN, LOOKED_AT, SIDE, NEAR = 2.0, 5, 160, 0.02
 # Where splats may lie: where converters leave the axes of SPZ (right, up, back) or glTF, too.
 AXES = (
@@ -96,7 +100,7 @@ def given_start(plan: Plan, frame: LocalFrame, console: Console) -> GivenStart |
     def shows(placed: Placement) -> bool:
         return _shows(_local(splats, placed, frame), plan, frame)
 
-    tried = AXES if plan.config.scan.placement == ESTIMATE else ()
+    tried = AXES if _asked(plan) == ESTIMATE else ()
     placement = next((placed for placed in tried if shows(placed)), None)
     if placement is not None:
         console.line(f"{path.name}: placement {placement.how}, since the photographs show it")
@@ -113,8 +117,8 @@ def _shows(values: NDArray[np.float32], plan: Plan, frame: LocalFrame) -> bool:
     """Whether Gaussians in a frame look like the photographs, more than their mean colour does."""
     gaussians = Gaussians(values, frame=frame)
     gains = []
-    for name in evenly_spread(plan.context, LOOKED_AT):
-        view = plan.scene[name]
+    for row in spread(len(plan.context), LOOKED_AT):
+        view = plan.scene[plan.context[row]]
         rgb = view.load().rgb
         factor = min(SIDE / max(rgb.shape[:2]), 1)
         size = [max(1, round(side * factor)) for side in rgb.shape[1::-1]]
@@ -125,6 +129,11 @@ def _shows(values: NDArray[np.float32], plan: Plan, frame: LocalFrame) -> bool:
         errors = [np.square(each - photograph).mean() for each in (shown, photograph.mean((0, 1)))]
         gains.append(10 * np.log10((errors[1] + 1e-9) / (errors[0] + 1e-9)))
     return bool(np.median(gains) > LEAST_GAIN)
+
+
+def _asked(plan: Plan) -> str:
+    """The placement that the user gives; that of a scan beside it is not the start's."""
+    return plan.config.scan.placement if plan.config.scan.file is None else ESTIMATE
 
 
 def _placed(
@@ -140,8 +149,8 @@ def _placed(
     With ``shows``, photographs decide where few points support a placement.
     """
     options = plan.config.scan
-    if options.file is None and options.placement != ESTIMATE:
-        return given_placement(options.placement)
+    if (asked := _asked(plan)) != ESTIMATE:
+        return given_placement(asked)
     if (placement := _by_cameras(path, plan)) is not None:
         console.line(f"{path.name}: placement {placement.summary()}")
         return placement
@@ -184,7 +193,8 @@ def _by_cameras(path: Path, plan: Plan) -> Placement | None:
         told = [np.column_stack([entry["rotation"], entry["position"]]) for entry in entries]
         rows = paired([str(entry["img_name"]) for entry in entries], plan.scene.names)
         theirs = np.array([told[row] for row, _ in rows], np.float64).reshape(-1, 3, 4)
-    except (KeyError, TypeError, ValueError):  # somebody else's file of that name
+    except (KeyError, TypeError, ValueError, DegenerateError):
+        # Somebody else's file of that name, or one whose names say too little.
         return None
     mine = plan.scene.cameras.world_from_cam[[row for _, row in rows]]
     if len(rows) < 2 or not np.isfinite(theirs).all():
@@ -228,20 +238,21 @@ def _strongest(values: NDArray[np.float32], most: int) -> NDArray[np.float32]:
 
 
 def first_gaussians(plan: Plan, views: Sequence[FitView], frame: LocalFrame) -> Gaussians:
-    """Gaussians at recorded depth, else at sparse points and, if these are few, estimated depth."""
+    """Gaussians at recorded depth; where views lack it, at sparse points, and estimates if few."""
     seed, most = plan.config.seed, plan.config.refine.most_gaussians
-    if any(view.depth is not None for view in views):
+    recorded = [view for view in views if view.depth is not None]
+    if len(recorded) == len(views):
         return from_depth(views, frame=frame, seed=seed, most=most)
     points = plan.scene.points
-    positions, colors = np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
+    share = 1.0 if points is None else len(recorded) / len(views)
+    parts = [pixels_with_depth(recorded, seed=seed, count=round(share * STARTING_GAUSSIANS))]
     if points is not None:
-        positions, colors = frame.from_world(points.positions), points.colors
-    if len(positions) < FEW_POINTS:
-        estimated = [replace(v, depth=v.estimate) for v in views if v.estimate is not None]
-        missing = ENOUGH_POINTS - len(positions)
-        more = pixels_with_depth(estimated, seed=seed, count=missing)
-        positions = np.concatenate([positions, more[0]])
-        colors = np.concatenate([colors, more[1]])
+        parts.append((frame.from_world(points.positions), points.colors))
+    known = sum(len(part[0]) for part in parts)
+    if known < FEW_POINTS:
+        count = ENOUGH_POINTS - known
+        parts.append(pixels_with_depth(_estimated(views), seed=seed, count=count))
+    positions, colors = (np.concatenate(each) for each in zip(*parts, strict=True))
     if len(positions) < FEWEST_POINTS:
         raise DegenerateError(
             f"{plan.scene.root}: {len(positions)} sparse points and pixels with depth in "
@@ -258,6 +269,10 @@ def known_surface(start: Gaussians, views: Sequence[FitView]) -> NDArray[np.floa
     """
     if any(view.depth is not None for view in views):
         return None
-    estimated = [replace(v, depth=v.estimate) for v in views if v.estimate is not None]
-    more = pixels_with_depth(estimated, seed=0, count=ENOUGH_POINTS)[0]
+    more = pixels_with_depth(_estimated(views), seed=0, count=ENOUGH_POINTS)[0]
     return np.concatenate([start.values[:, :LOG_SCALE], more.astype(np.float32)])
+
+
+def _estimated(views: Sequence[FitView]) -> list[FitView]:
+    """Those with an estimate, as their depth."""
+    return [replace(v, depth=v.estimate) for v in views if v.estimate is not None]

@@ -37,18 +37,18 @@ from gvtools.appearance.splat.gsplat_splatter import GsplatSplat, splatter_on
 from gvtools.depth.choice import is_estimated
 from gvtools.depth.shown import FittedDepth
 from gvtools.depth.source import DepthMap, MixedDepth, RecordedDepth, is_recorded
-from gvtools.errors import DegenerateError, GvError, MemoryFileError, OptionError, ShapeError
+from gvtools.errors import DegenerateError, GvError, MemoryFileError, OptionError
 from gvtools.memory.projection import project
 from gvtools.memory.spatial_memory import SpatialMemory
 from gvtools.poses.refinement import FitView
 from gvtools.prefetch import prefetch
 from gvtools.runs.poses import RunPoses
 from gvtools.scenes.images import resize_nearest
+from gvtools.scenes.inspection import spread
 from gvtools.scenes.resized import reduced
 from gvtools.scenes.scene import Frame, View
 from gvtools.splat_files import holds_splats
 from gvtools.untrusted import load_arrays
-from gvtools.view_selection import evenly_spread
 from pipelines.reconstruction import fit_start
 from pipelines.reconstruction.fit_start import GIVEN, first_gaussians, given_start, known_surface
 from pipelines.reconstruction.voxel import grid_frame
@@ -65,13 +65,14 @@ SWEPT_SIDE = 320
 # time allows, at most all of them together MOST_MEGAPIXELS; a megapixel takes MEGAPIXEL_SECONDS of
 # one core. After 40 s lego gains 0.9 dB by it, the fox 1.3, others 0.1 to 1.1.
 MEMORY_SHARE, MOST_MEGAPIXELS, MEGAPIXEL_SECONDS = 0.15, 20.0, 2.0
-# A view takes about so long to sweep at 0.1 megapixels, all cores together [s]; a fit for a given
+# A view of 0.1 megapixels takes one core about so long to sweep [s]; a fit for a given
 # time takes at most SWEEP_SHARE of it for the sweep, by smaller pictures or else without.
 SWEEP_SECONDS, SWEEP_SHARE, SMALL_SIDE = 0.8, 0.15, 160
 # So many views are swept however little time there is, where a fit has few points to begin with.
 FEWEST_SWEPT = 12
-# The memory's colours must be better by so much where a fit made LONG steps or more: a room has
-# 0.8 dB more by 300 steps whose validation is 1.2 below; another has 4.6 less by 107, at 1.4.
+# A fit of LONG steps or more is left out only where the memory is better by more than MARGIN [dB],
+# a shorter one as soon as it is: a room has 0.8 dB more by 300 steps whose validation is 1.2 below;
+# another has 4.6 less by 107, at 1.4.
 MARGIN, LONG = 1.5, 300
 # Progress is printed at this interval [s].
 SAY_EVERY = 5.0
@@ -83,10 +84,10 @@ WITH_DEPTH = 0.4
 MOST_SHARE, MOST_TOLERANCE = 0.5, 0.2
 # Where exposures differ by more [log, standard deviation], the memory's colours are patchy.
 EVEN = 0.05
-# A fit that its clock ends after fewer steps for each photograph, and fewer than ENOUGH in all, is
-# not used; of other short ones a warning tells. With 50, 100 and 600 steps, 44 photographs have
-# 18.8, 21.1 and 29.1 dB in held-out pictures, and 27.3 without a fit; 175 of a room have 32.1 dB
-# with 409 steps, and 29.8 without.
+# Where no validation tells, and depth is not all recorded, a fit that its clock ends after fewer
+# steps for each photograph, and fewer than ENOUGH in all, is not used. With 50, 100 and 600 steps,
+# 44 photographs have 18.8, 21.1 and 29.1 dB in held-out pictures, and 27.3 without a fit; 175 of a
+# room have 32.1 dB with 409 steps, and 29.8 without.
 SHORT, ENOUGH = 7.5, 400
 # A fit whose validation photographs stopped gaining makes this share of its steps or more.
 SKIPPED = 0.9
@@ -97,8 +98,6 @@ def fit_views(
 ) -> list[FitView]:
     """The context's photographs, with recorded or estimated depth; poses in ``frame``."""
     views = [plan.scene[name] for name in plan.context]
-    if any(view.camera.K[0, 0, 1] for view in views):
-        raise ShapeError("cameras with skew; expected none; undistort the photographs first")
     poses = frame.cam_from_local(plan.scene.subset(plan.context).cameras.cam_from_world)
     frames = prefetch(lambda view: view.load(), views)
     return [
@@ -162,7 +161,8 @@ class Sweep:
                 return cls(plan, side, plan.context)
         if not (few and begins):
             return None
-        return cls(plan, SMALL_SIDE, list(evenly_spread(plan.context, max(views, FEWEST_SWEPT))))
+        rows = spread(len(plan.context), max(views, FEWEST_SWEPT))
+        return cls(plan, SMALL_SIDE, [plan.context[row] for row in rows])
 
     def depth(self, view: View) -> NDArray[np.float32] | None:
         """(H, W) z-depth, scene units, of ``scene``'s view; None if no other shows what it does."""
@@ -185,8 +185,9 @@ class Sweep:
 
 @dataclass(frozen=True)
 class FitValidation:
-    """PSNR of what a memory without the validation photographs knows of them, at its sweep's size.
+    """PSNR of the validation photographs where a memory made without them covers them.
 
+    Both are of the sweep's size.
     Elsewhere, mostly at their borders, both guess, and differ by 2 dB from fit to fit.
     """
 
@@ -196,7 +197,7 @@ class FitValidation:
 
     @property
     def fit_is_used(self) -> bool:
-        """Whether the Gaussians are not clearly worse."""
+        """Whether the memory is not better, or not by more than MARGIN after a long fit."""
         return self.memory <= self.gaussians + MARGIN * (self.steps >= LONG)
 
     def __str__(self) -> str:
@@ -207,7 +208,10 @@ class FitValidation:
 
 
 def validate_fit(fitted: Fitted, plan: Plan) -> FitValidation | None:
-    """Predict the validation photographs both ways; None where the memory shows nothing of them."""
+    """Predict the validation photographs both ways.
+
+    None without such photographs or a sweep, or where that memory shows nothing of them.
+    """
     predicted, sweep = fitted.predicted, fitted.sweep
     if not predicted or sweep is None:
         return None
@@ -257,7 +261,8 @@ class Fitted:
     # Refined poses of context and targets; None where they are as given.
     poses: RunPoses | None = None
     spread: bool = False  # whether targets take the pose corrections of the context views near them
-    # Pictures of validation photographs as rendered before these joined, by view.
+    # Pictures of validation photographs as rendered before these joined, by view; not kept in
+    # files.
     predicted: Mapping[str, Picture] = field(default_factory=dict)
     steps: int = 0  # of the first fit, including those of an earlier fit that it continued
     sweep: Sweep | None = None  # depth that the fit was held to; not kept in files
@@ -385,6 +390,7 @@ def fit_appearance(plan: Plan, console: Console, *, earlier: Fitted | None = Non
             "after the fit; give more time by --refine"
         )
         fit.population.values, fit.cameras.log_gains[:] = fit.start.values, exposures
+        fit.cameras.give_back()
     if fit.cameras.with_poses:
         console.line(f"fitting: {fit.cameras.summary()}")
     if len(fits) > 1:
@@ -455,6 +461,9 @@ def _new_fit(
     plan: Plan, console: Console, earlier: Fitted | None, *, sweep: Sweep | None
 ) -> Fit | None:
     """A new fit; after an earlier one, at its poses and with another random seed."""
+    if plan.scene.subset(plan.context).cameras.K[:, 0, 1].any():
+        console.warn("no Gaussians are fitted: cameras with skew; undistort the photographs first")
+        return None
     frame = grid_frame(plan.scene, plan.context)
     options, seed = _options(plan), plan.config.seed
     if earlier is not None:
@@ -488,7 +497,7 @@ def _new_fit(
 
 
 def _options(plan: Plan) -> FitOptions:
-    """Options of a fit, which leaves poses that features told."""
+    """The fit's options; poses that features determined are not refined again."""
     by_features = plan.poses is not None and plan.poses.by_features
     options = plan.config.refine
     return options.replaced(poses=options.poses and not by_features)

@@ -25,7 +25,13 @@ from gvtools.scenes.pixel_contradictions import probed
 from gvtools.scenes.pose_forms import pose_findings
 from gvtools.scenes.resized import reduced
 from gvtools.scenes.scene import Scene, View
-from gvtools.scenes.selection import check_disjoint, select
+from gvtools.scenes.selection import (
+    check_disjoint,
+    is_view_or_folder,
+    path_and_selection,
+    path_exists,
+    select,
+)
 from gvtools.scenes.transforms import read_camera_path
 from gvtools.settings import changes
 from gvtools.trajectories import PATHS, named_path
@@ -117,7 +123,7 @@ class Plan:
     completer: Completer  # of the whole run, under its effort policy
     ignored: tuple[str, ...] = ()  # settings of stereo that this source does not look at
     weights: tuple[Path, ...] = ()  # files of networks that decide the result
-    # The scene as it enters the memory, where that is smaller; None for ``scene``.
+    # The scene as it enters the memory of a fit; None for ``scene``.
     evidence: Scene | None = None
     poses: RunPoses | None = None  # refined ones, which ``posed`` takes instead of the project's
     scan: PlacedScan | None = None  # that the memory starts from, placed
@@ -157,9 +163,9 @@ def resolve_targets(
         if not count.isdecimal() or int(count) < 1:
             raise OptionError(f"targets {spec!r}; expected {name}:N with N >= 1")
         return _path(scene, context, name, count=int(count))
-    path, at, selection = spec.partition("@")
-    if path and (is_address(path) or _exists(path)) and spec not in scene.names:
-        selection = selection if at else "all"
+    path, selection = path_and_selection(spec)
+    there = path and (is_address(path) or path_exists(path))
+    if there and not is_view_or_folder(scene.names, spec):
         captured = scene.subset(context).cameras
         cameras = read_camera_path(Path(path), captured, selection=selection)
         if cameras is not None:
@@ -177,13 +183,6 @@ def resolve_targets(
         check_disjoint(context, chosen)
     views = tuple(scene[name] for name in chosen)
     return Targets(scene.subset(chosen).cameras, views, "hold-out")
-
-
-def _exists(text: str) -> bool:
-    try:
-        return Path(text).exists()
-    except OSError:
-        return False  # A long list of names is longer than any file's.
 
 
 def _path(scene: Scene, context: tuple[str, ...], name: str, *, count: int) -> Targets:
@@ -308,16 +307,17 @@ def expected_seconds(plan: Plan) -> float:
     """About how long a run takes, to a factor of two, without a network's time."""
     from numba import get_num_threads
 
+    from gvtools.depth.source import is_recorded
+
     config = plan.config
     sizes = plan.scene.subset(plan.context).cameras
     megapixels = float((sizes.width * sizes.height).sum()) / 1e6
-    if plan.source.name == "plane-sweep":
-        fit = config.refine.wanted and config.depth == "auto"
-        # A fit that is not used was swept for at a small size before.
-        depth = SWEPT + SWEPT_SMALL if fit else SWEPT
-        work = depth * len(plan.context) + LIFTED * megapixels
-    else:
-        work = RECORDED * len(plan.context) + LIFTED * megapixels
+    recorded = sum(is_recorded(plan.source, plan.scene[name]) for name in plan.context)
+    swept = len(plan.context) - recorded if "plane-sweep" in plan.source.name else 0
+    # A fit that is not used was swept for at a small size before.
+    fit = config.refine.wanted and config.depth == "auto" and not recorded
+    each = SWEPT + SWEPT_SMALL if fit else SWEPT
+    work = each * swept + RECORDED * (len(plan.context) - swept) + LIFTED * megapixels
     work += COMPLETED * sum(len(rows) for rows in plan.schedule)
     limit = config.refine.limit if config.refine.wanted else 0.0
     return (

@@ -253,6 +253,7 @@ def fuse_context(
     dropped: Counter[str] = Counter()
     reports: list[dict[str, Any]] = []
     guesses: list[tuple[Cameras, NDArray[np.uint8], DepthMap, NDArray[np.bool_]]] = []
+    farthest = config.back_projection.depth_max or np.inf
 
     def observe(*images: Any, **how: Any) -> FuseReport:
         with clock.stage("fuse"):
@@ -279,10 +280,11 @@ def fuse_context(
         use, guessed = frame.mask, depth_map.guessed
         if guessed is not None:
             everywhere = np.ones_like(guessed) if use is None else use
-            guesses.append((view.camera, frame.rgb, depth_map, guessed & everywhere))
+            lifted = guessed & everywhere & (depth_map.depth > 0) & (depth_map.depth <= farthest)
+            guesses.append((view.camera, frame.rgb, depth_map, lifted))
             use = everywhere & ~guessed
             # These are fused below, not left out.
-            dropped["masked"] -= int((guessed & everywhere).sum())
+            dropped["masked"] -= int(lifted.sum())
         fused = observe(
             frame.rgb, depth_map.depth, view.camera, confidence=depth_map.confidence, mask=use
         )

@@ -491,6 +491,17 @@ def test_layouts_of_other_scanners(tmp_path, write):
         )
 
 
+def test_intrinsics_that_are_given_win_over_each_pictures_own(tmp_path):
+    rtabmap(tmp_path)
+    own = open_project(tmp_path)
+    assert "each picture's own" in messages(own)
+    K = [[80, 0, 47.5], [0, 80, 35.5], [0, 0, 1]]
+    (tmp_path / "rgbd.json").write_text(json.dumps({"color_K": K}))
+    given = open_project(tmp_path)
+    assert given.cameras.K[:, 0, 0].tolist() == [80, 80]
+    assert "each picture's own" not in messages(given)
+
+
 def test_rtabmap_pictures_named_by_time(tmp_path):
     rtabmap(tmp_path)
     for folder in ("flat_rgb", "flat_depth", "flat_calib"):

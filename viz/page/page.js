@@ -35,7 +35,7 @@ async function unpack(element) {
   return new Uint32Array(await new Response(stream).arrayBuffer());
 }
 
-// Arrays of four words a Gaussian, one after the other, see words.py.
+// Arrays of four words a Gaussian, one after the other, see pack_gaussians in page.py.
 function splatsOf(words, count) {
   const { maxSplats } = library.utils.getTextureSize(count);
   const [first, second, sh1, sh2, sh3a, sh3b] = Array.from(
@@ -224,7 +224,7 @@ function walk(canvas) {
   addEventListener("keydown", (event) => {
     if (event.ctrlKey || event.metaKey || event.altKey || event.target.matches("input")) return;
     if (event.code === "KeyH") document.body.classList.toggle("bare");
-    moved();
+    if (event.code === "KeyH" || event.code in MOVES) moved();
     if (!(event.code in MOVES)) return;
     event.preventDefault();
     flight = setWalking(true);

@@ -230,6 +230,12 @@ def test_pixels_with_swept_depth_make_up_for_few_sparse_points(tmp_path, monkeyp
     assert len(enough) == 150
     assert len(few) > 2000
     np.testing.assert_array_equal(few[:150], enough)
+    # One photograph with recorded depth adds its part, and the points stay.
+    views[0] = replace(views[0], depth=views[0].estimate)
+    first_gaussians(plan, views, frame)
+    share = fit_start.STARTING_GAUSSIANS // len(views)
+    assert 0.5 * share < len(begun[-1]) - 150 <= share + 1
+    np.testing.assert_array_equal(begun[-1][-150:], enough)
     # A wall and a square before it, both parallel to the pictures.
     known = np.unique(enough[:, 2].round(6))
     assert len(known) == 2

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from tiny_scan import write_colmap_scan, write_scan
 
 from gvtools.appearance import fit_options
+from gvtools.appearance.camera_corrections import CameraCorrections
 from gvtools.appearance.fit import Fit
 from gvtools.appearance.fit_options import FitOptions
 from gvtools.cameras import rigid_poses
@@ -33,7 +34,7 @@ from pipelines.export.formats import ExportOptions
 from pipelines.export.splats import write_file
 from pipelines.reconstruction import fitting
 from pipelines.reconstruction import run as module
-from pipelines.reconstruction.fit_start import first_gaussians, given_start
+from pipelines.reconstruction.fit_start import _by_cameras, first_gaussians, given_start
 from pipelines.reconstruction.fitting import Fitted, fit_appearance, fit_views
 from pipelines.reconstruction.prepare import make_plan
 from pipelines.reconstruction.run import refine
@@ -264,8 +265,11 @@ def test_splats_lie_where_the_project_is(walls, rows, tmp_path):
     inside = tmp_path / "point_cloud" / "iteration_30000"
     inside.mkdir(parents=True)
     (tmp_path / "cameras.json").write_text(json.dumps(told))
-    by_cameras = started(walls, file.rename(inside / "point_cloud.ply")).gaussians.values
+    file = file.rename(inside / "point_cloud.ply")
+    by_cameras = started(walls, file).gaussians.values
     np.testing.assert_allclose(by_cameras, b, atol=1e-4)
+    (tmp_path / "cameras.json").write_text(json.dumps([*told, told[0]]))  # two of one name
+    assert _by_cameras(file, planned(walls)) is None
     np.testing.assert_allclose(a[:, LOGIT:], b[:, LOGIT:], atol=1e-4)
     frame = same.gaussians.frame
     world = frame.to_world(a[:, :LOG_SCALE])
@@ -323,7 +327,10 @@ def test_given_splats_are_kept_where_the_fit_ends_below_them(
     told = iter([30.0, after])
     monkeypatch.setattr(Fit, "shown_psnr", lambda fit: next(told))
     plan = planned(walls, f"refine.init={saved(rows, tmp_path / 'given.ply')}")
+    given_back = []
+    monkeypatch.setattr(CameraCorrections, "give_back", lambda self: given_back.append(self))
     fitted = fit_appearance(plan, Console())
+    assert bool(given_back) == (after < 30)
     start = started(walls, tmp_path / "given.ply").gaussians
     same = np.array_equal(fitted.appearance.gaussians.values, start.values)
     assert same == (after < 30) == ("the given Gaussians are kept" in capsys.readouterr().out)

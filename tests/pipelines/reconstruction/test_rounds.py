@@ -26,6 +26,7 @@ from gvtools.kernels import parallel_kernels_may_overlap
 from gvtools.memory.spatial_memory import FuseReport, SpatialMemory
 from gvtools.runs.run import load_run
 from gvtools.scenes.project import open_project
+from gvtools.scenes.selection import is_view_or_folder
 from gvtools.scenes.transforms import read_camera_path, write_transforms
 from gvtools.settings import with_texts
 from pipelines.cli import main
@@ -240,6 +241,16 @@ def test_hold_outs_come_with_their_truth_and_are_no_context(scene):
     with pytest.raises(OptionError, match="allow-overlap"):
         resolve_targets(scene, scene.names, "first:2")
     assert len(resolve_targets(scene, scene.names, "first:2", allow_overlap=True).cameras) == 2
+
+
+def test_folders_of_views_win_over_paths_which_may_hold_an_at_sign(tmp_path, scene):
+    other = write_scan(tmp_path / "run@2026")
+    found = resolve_targets(scene, scene.names[:2], f"{other}@last:1", allow_overlap=True)
+    assert found.kind == "project" and found.cameras.names == scene.names[-1:]
+    whole = resolve_targets(scene, scene.names[:1], str(other), allow_overlap=True)
+    assert len(whole.cameras) == len(scene)
+    names = tuple(f"test/{name}" for name in scene.names)
+    assert is_view_or_folder(names, "test") and not is_view_or_folder(names, "tes")
 
 
 @pytest.mark.parametrize("name", ["interpolate", "orbit", "spiral"])
