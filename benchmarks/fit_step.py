@@ -99,7 +99,7 @@ def main() -> None:
             pose = frame.cam_from_local(view.camera.cam_from_world)[0]
             views.append(FitView(view.load().rgb, view.camera.K[0], pose, None, None))
         fit = Fit(Gaussians(values.copy(), frame=frame), views, begin=0.9)
-        fit._left_out, fit._fading = 0.0, False
+        fit._dropout, fit._fading = 0.0, False
         peer = Peer(args.shared, values, views, fit.near)
 
         def step(fit: Fit = fit) -> None:

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.appearance.appearance import Appearance, recolor
+from gvtools.appearance.appearance import Appearance
 from gvtools.cameras import Cameras, concatenate
 from gvtools.completers.base import create, run_completer
 from gvtools.errors import OptionError
@@ -67,7 +67,7 @@ def render_view(
     def view(face: Cameras) -> Guidance:
         guidance = memory.project(face, options=options)
         if appearance is not None:
-            guidance = recolor(guidance, appearance.picture(face), blend=appearance.blend)
+            guidance = appearance.recolor(guidance, appearance.picture(face))
         return guidance if fill is None else fill(guidance)
 
     start = time.perf_counter()

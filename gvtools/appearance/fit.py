@@ -71,9 +71,9 @@ VALIDATION_EVERY, VALIDATION_ENDS, MOST_VALIDATION = 8, 0.75, 5
 # of the steps to convergence it gains, whatever a few photographs say.
 GAIN_CHECKS, LEAST_STAGE_GAIN, GAINS_UNTIL = (0.6, 0.65, 0.7), 0.025, 0.25
 # Dropout: without recorded depth, each step ignores a random share of the Gaussians, progress times
-# LEFT_OUT / number of photographs, at most MOST_LEFT_OUT. Otherwise Gaussians behind others would
+# DROPOUT / number of photographs, at most MOST_DROPOUT. Otherwise Gaussians behind others would
 # get no gradient from few viewing directions. After "DropGaussian" (Park et al. 2025).
-LEFT_OUT, MOST_LEFT_OUT = 1.2, 0.5
+DROPOUT, MOST_DROPOUT = 1.2, 0.5
 # With fewer than FEW photographs, all opacities shrink by FADING at each step; gradients restore
 # those that photographs need. The others vanish, above all floaters close to the cameras. After
 # "Binocular-Guided 3D Gaussian Splatting" (Han et al. 2024).
@@ -126,13 +126,14 @@ class Fit:
                 only opaque surfaces match photographs then, while over black a photograph's dark
                 parts could be fitted by stopping less light.
         """
-        self.start, self.seed, self.splatter, self.backdrop = start, seed, splatter, backdrop
+        self.start, self.seed, self.splatter = start, seed, splatter
         self.views, self.options = list(views), options or FitOptions()
         self.frame = start.frame
         self.rng = np.random.default_rng(seed)
         width = pixel_width(start.values[:, :LOG_SCALE], self.views)
         self.population = Population(start.values.copy(), width)
         self.recorded = all(view.depth is not None for view in self.views)
+        self.backdrop = backdrop and not self.recorded
         self.converged_after = converged_steps(len(self.views), recorded=self.recorded)
         self.cameras = CameraCorrections(
             np.array([view.cam_from_local for view in self.views]),
@@ -156,7 +157,7 @@ class Fit:
         self._validation = tuple(row for row in rows if _shows(self.views[row]))
         self._checks = tuple(share for share in POSE_CHECKS if share > begin)
         # Recorded depth fixes Gaussians along the ray, as photographs from more directions would.
-        self._left_out = 0.0 if self.recorded else min(MOST_LEFT_OUT, LEFT_OUT / len(self.views))
+        self._dropout = 0.0 if self.recorded else min(MOST_DROPOUT, DROPOUT / len(self.views))
         self._fading = len(self.views) < FEW and not self.recorded
         # See ``free_depth``; None without points.
         self._free = [
@@ -303,7 +304,7 @@ class Fit:
         view = self._at_size(number, share)
         degree = min(2, int(share / DEGREE_EVERY))
         lens = Lens.of(self.cameras.pose(number), view.K, size=view.size, near=self.near)
-        some = Sample(self.population.values, self._left_out * share, rng=self.rng)
+        some = Sample(self.population.values, self._dropout * share, rng=self.rng)
         picture = self.splatter(some.values, lens, degree=degree, faint=FAINT)
         gradient = self._loss_gradient(number, picture, view)
         rows, d_camera = picture.backward(gradient)
@@ -388,7 +389,7 @@ class Fit:
         values, free = self.population.values, self._free[number]
         if free is not None:
             values = values[~floaters(values, lens, free)]
-        return Picture.of(self.splatter(values, lens), gain=gain)
+        return Picture.of(self.splatter(values, lens), gain=gain, backdrop=self.backdrop)
 
     def _exposures(self) -> Exposures:
         """Exposures of the photographs that are fitted, without the validation photographs."""

@@ -31,7 +31,7 @@ from gvtools.poses.motions import (
 from gvtools.similarity import align_poses
 
 # Odometry compares pictures at this length of the longer side [px], each with so many neighbours.
-SIDE, NEIGHBORS = 320, 3
+SIDE, ODOMETRY_NEIGHBOURS = 320, 3
 # Neighbours along the path keep their given relative pose by this share of a pair's weight, so that
 # views that overlap with none stay where they were.
 GIVEN_WEIGHT = 0.01
@@ -39,7 +39,7 @@ GIVEN_WEIGHT = 0.01
 LEAST_BETTER = 0.01
 # Photographs are predicted at one over this of their size, each from so many neighbours, by one of
 # so many pixels.
-SMALLER, NEIGHBOURS, PIXELS = 2, 2, 4
+SMALLER, PREDICTED_FROM, PIXELS = 2, 2, 4
 # With fewer of these inside, a pair does not count.
 FEWEST = 25
 # Odometry works on depth scaled to TYPICAL_DEPTH: Open3D's limits are metres for rooms. Points
@@ -234,7 +234,7 @@ def _optimise(
 ) -> Float64:
     """(V, 4, 4) poses that agree with the pairs of images; pairs that contradict are left out."""
     pairs = []
-    for i, j in nearest_pairs(given, count=NEIGHBORS, shift=TYPICAL_DEPTH, by_angle=True):
+    for i, j in nearest_pairs(given, count=ODOMETRY_NEIGHBOURS, shift=TYPICAL_DEPTH, by_angle=True):
         start = given[j] @ np.linalg.inv(given[i])
         measured = _register((images[i], images[j]), K, size=size, start=start)
         if measured is not None:
@@ -336,7 +336,7 @@ def prediction_error(
     errors = []
     for row, view in enumerate(small):
         assert view.depth is not None
-        for other in nearest(poses, row, count=NEIGHBOURS, shift=typical):
+        for other in nearest(poses, row, count=PREDICTED_FROM, shift=typical):
             y, x = (each[::PIXELS] for each in np.nonzero((view.depth > 0) & (view.weight > 0.5)))
             rays = np.stack([x + 0.5, y + 0.5, np.ones(len(x))]).T @ np.linalg.inv(view.K).T
             points = rays * view.depth[y, x, None]

@@ -77,19 +77,17 @@ def write_context_depth(
 
 def off_scale(reports: Sequence[Mapping[str, Any]]) -> str | None:
     """One line that names the views, reported by round 0, whose depth is off the sparse points."""
-    names = [report["view"] for report in disagreeing(reports)]
-    if not names:
+    odd = [report for report in reports if report["scale"] and report["scale"]["disagrees"]]
+    if not odd:
         return None
-    more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
+    names = ", ".join(report["view"] for report in odd[:MAX_NAMED])
+    more = f" and {len(odd) - MAX_NAMED} more" if len(odd) > MAX_NAMED else ""
+    first = odd[0]["scale"]
     return (
-        f"depth of {len(names)} of {len(reports)} views is off the sparse points' scale: "
-        f"{', '.join(names[:MAX_NAMED])}{more}"
+        f"depth of {len(odd)} of {len(reports)} views is off the sparse points' scale: "
+        f"{names}{more}; the first: {first['status']}, scale {first['scale']:.3g}; look at its "
+        "unit and at the poses"
     )
-
-
-def disagreeing(reports: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """The reports of views whose depth disagrees with the sparse points."""
-    return [report for report in reports if report["scale"] and report["scale"]["disagrees"]]
 
 
 class DepthCache:

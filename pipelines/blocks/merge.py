@@ -105,7 +105,7 @@ def join_appearances(parts: Sequence[BlockAppearance], frame: LocalFrame) -> App
     surface = np.concatenate(surfaces).astype(np.float32) if all_known else None
     return Appearance(
         fits[0], near, blend, first.splatter, tuple(fits[1:]), _exposures(parts, gains, frame),
-        surface,
+        surface, all(part.appearance.backdrop for part in parts),
     )  # fmt: skip
 
 

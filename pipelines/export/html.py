@@ -74,6 +74,7 @@ def page_of(
         origin=splats.origin,
         up=run.up(),
         mip=splats.mode == "mip",
+        backdrop=fit is not None and fit.backdrop,
         depth=depth,
         near=NEAR * depth if fit is None else fit.near,
         exposures=None if fit is None else fit.exposures,

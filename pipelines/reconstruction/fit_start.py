@@ -1,14 +1,19 @@
-"""Gaussians that a fit begins with: at points and pixels with depth, or from a file, placed."""
+"""Gaussians that a fit begins with: at points and pixels with depth, or from a file, placed.
+
+And the swept depth of a run's photographs, as far as there is time for it.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
+from numba import get_num_threads
 from numpy.typing import NDArray
 
 from gvtools.appearance.appearance import Appearance
@@ -20,6 +25,8 @@ from gvtools.appearance.population import (
     pixels_with_depth,
 )
 from gvtools.appearance.splat.project_kernels import VALUES
+from gvtools.depth.choice import is_estimated
+from gvtools.depth.source import DepthMap, is_recorded
 from gvtools.errors import DegenerateError
 from gvtools.poses.refinement import FitView
 from gvtools.scans.registration import (
@@ -32,6 +39,8 @@ from gvtools.scans.registration import (
 )
 from gvtools.scenes.inspection import spread
 from gvtools.scenes.matching import paired
+from gvtools.scenes.resized import reduced
+from gvtools.scenes.scene import View
 from gvtools.splat_files import holds_splats, read_splats
 from gvtools.splats import LOG_SCALE, LOGIT, QUATERNION, Splats, place_gaussians
 from gvtools.untrusted import read_json
@@ -67,6 +76,70 @@ LEAST_SUPPORT = 0.25
 # Folders above a file in which its cameras are sought; how far they may be from the project's on
 # average: centres as a share of the extent, and turns.
 ABOVE, ALIKE = 3, 0.02
+# Longer side at which photographs are swept [px].
+SWEPT_SIDE = 320
+# A view of 0.1 megapixels takes one core about so long to sweep [s]; a fit for a given
+# time takes at most SWEEP_SHARE of it for the sweep, by smaller pictures or else without.
+SWEEP_SECONDS, SWEEP_SHARE, SMALL_SIDE = 0.8, 0.15, 160
+# So many views are swept however little time there is, where a fit has few points to begin with.
+FEWEST_SWEPT = 12
+
+
+class Sweep:
+    """Plane-sweep depth of a run's photographs, at a size that its fit has time for.
+
+    Each view is swept once, when it is asked for; ``scene`` is the project at that size.
+    """
+
+    def __init__(self, plan: Plan, side: int, names: Sequence[str]) -> None:
+        from gvtools.depth.stereo.plane_sweep import PlaneSweepStereo
+
+        self.scene = reduced(plan.scene, side)
+        stereo = plan.config.stereo
+        options = stereo.replaced(max_side=min(stereo.max_side, side))
+        self._source = PlaneSweepStereo(self.scene, options=options, views=plan.context)
+        self._names, self._kept = frozenset(names), dict[str, DepthMap | None]()
+
+    @classmethod
+    def of(cls, plan: Plan, *, begins: bool = True) -> Sweep | None:
+        """The sweep of a run; None if it has other depth, one view, or too little time.
+
+        A fit that ``begins`` needs points: with few, some views are swept however little time.
+        """
+        recorded = any(is_recorded(plan.source, plan.scene[name]) for name in plan.context)
+        estimated = any(is_estimated(plan.source, plan.scene[name]) for name in plan.context)
+        if recorded or estimated or len(plan.context) < 2:
+            return None
+        few = plan.scene.points is None or len(plan.scene.points.positions) < FEW_POINTS
+        limit, views = plan.config.refine.limit, len(plan.context)
+        for side in (SWEPT_SIDE, SMALL_SIDE):
+            each = SWEEP_SECONDS * (side / SWEPT_SIDE) ** 2 / get_num_threads()
+            if limit is not None:
+                views = int(SWEEP_SHARE * limit / each)
+            if views >= len(plan.context):
+                return cls(plan, side, plan.context)
+        if not (few and begins):
+            return None
+        rows = spread(len(plan.context), max(views, FEWEST_SWEPT))
+        return cls(plan, SMALL_SIDE, [plan.context[row] for row in rows])
+
+    def depth(self, view: View) -> NDArray[np.float32] | None:
+        """(H, W) z-depth, scene units, of ``scene``'s view; None if no other shows what it does."""
+        depth_map = self.map_of(view)
+        return None if depth_map is None else depth_map.depth
+
+    def map_of(self, view: View) -> DepthMap | None:
+        """The depth with its confidence."""
+        if view.name not in self._kept:
+            view, found = self.scene[view.name], None
+            with suppress(DegenerateError):
+                found = self._source.depth(self.scene, view, view.load())
+            self._kept[view.name] = found
+        return self._kept[view.name]
+
+    def covers(self, view: View) -> bool:
+        """The context's views, or those of them that there is time for."""
+        return view.name in self._names
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,14 +10,13 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from numba import get_num_threads
 from numpy.typing import NDArray
 
@@ -36,7 +35,7 @@ from gvtools.appearance.fit_options import FitOptions, converged_steps
 from gvtools.appearance.splat.gsplat_splatter import GsplatSplat, splatter_on
 from gvtools.depth.choice import is_estimated
 from gvtools.depth.shown import FittedDepth
-from gvtools.depth.source import DepthMap, MixedDepth, RecordedDepth, is_recorded
+from gvtools.depth.source import MixedDepth, RecordedDepth, is_recorded
 from gvtools.errors import DegenerateError, GvError, MemoryFileError, OptionError
 from gvtools.memory.projection import project
 from gvtools.memory.spatial_memory import SpatialMemory
@@ -44,13 +43,18 @@ from gvtools.poses.refinement import FitView
 from gvtools.prefetch import prefetch
 from gvtools.runs.poses import RunPoses
 from gvtools.scenes.images import resize_nearest
-from gvtools.scenes.inspection import spread
 from gvtools.scenes.resized import reduced
 from gvtools.scenes.scene import Frame, View
 from gvtools.splat_files import holds_splats
 from gvtools.untrusted import load_arrays
-from pipelines.reconstruction import fit_start
-from pipelines.reconstruction.fit_start import GIVEN, first_gaussians, given_start, known_surface
+from pipelines.reconstruction.fit_start import (
+    GIVEN,
+    SWEPT_SIDE,
+    Sweep,
+    first_gaussians,
+    given_start,
+    known_surface,
+)
 from pipelines.reconstruction.voxel import grid_frame
 
 if TYPE_CHECKING:
@@ -58,30 +62,23 @@ if TYPE_CHECKING:
     from pipelines.console import Console
     from pipelines.reconstruction.plan import Plan
 
-# Longer side at which photographs are swept [px].
-SWEPT_SIDE = 320
 # After a fit photographs enter the memory at least so large. Where validation photographs can tell
 # how much of the memory's detail the pictures take, they are as large as MEMORY_SHARE of the fit's
 # time allows, at most all of them together MOST_MEGAPIXELS; a megapixel takes MEGAPIXEL_SECONDS of
 # one core. After 40 s lego gains 0.9 dB by it, the fox 1.3, others 0.1 to 1.1.
 MEMORY_SHARE, MOST_MEGAPIXELS, MEGAPIXEL_SECONDS = 0.15, 20.0, 2.0
-# A view of 0.1 megapixels takes one core about so long to sweep [s]; a fit for a given
-# time takes at most SWEEP_SHARE of it for the sweep, by smaller pictures or else without.
-SWEEP_SECONDS, SWEEP_SHARE, SMALL_SIDE = 0.8, 0.15, 160
-# So many views are swept however little time there is, where a fit has few points to begin with.
-FEWEST_SWEPT = 12
-# A fit of LONG steps or more is left out only where the memory is better by more than MARGIN [dB],
-# a shorter one as soon as it is: a room has 0.8 dB more by 300 steps whose validation is 1.2 below;
-# another has 4.6 less by 107, at 1.4.
-MARGIN, LONG = 1.5, 300
+# A fit is left out where the memory is better by more than MARGIN [dB], three times that from LONG
+# steps on: benchmarks/README.md, "Short fits".
+MARGIN, LONG = 0.75, 300
 # Progress is printed at this interval [s].
 SAY_EVERY = 5.0
 # Least tolerance of the blend with recorded depth. In targets far from all views Gaussians are
 # smeared and the memory is right; validation photographs are too near to other views to show it.
 WITH_DEPTH = 0.4
-# Without, validation photographs gain about twice as much by the memory's colours as held-out ones:
-# the Gaussians that give the memory its depth have seen them. The greatest share and tolerance.
-MOST_SHARE, MOST_TOLERANCE = 0.5, 0.2
+# Without, after SEEN steps a photograph, validation photographs gain about twice as much by the
+# memory's colours as held-out ones: the Gaussians that give the memory its depth have seen them by
+# then. The greatest share and tolerance. Before, held-out ones gain as they tell, up to 4 dB.
+SEEN, MOST_SHARE, MOST_TOLERANCE = 15, 0.5, 0.2
 # Where exposures differ by more [log, standard deviation], the memory's colours are patchy.
 EVEN = 0.05
 # Where no validation tells, and depth is not all recorded, a fit that its clock ends after fewer
@@ -126,69 +123,13 @@ def _estimate(
     return None if depth is None else resize_nearest(depth, *frame.rgb.shape[1::-1])
 
 
-class Sweep:
-    """Plane-sweep depth of a run's photographs, at a size that its fit has time for.
-
-    Each view is swept once, when it is asked for; ``scene`` is the project at that size.
-    """
-
-    def __init__(self, plan: Plan, side: int, names: Sequence[str]) -> None:
-        from gvtools.depth.stereo.plane_sweep import PlaneSweepStereo
-
-        self.scene = reduced(plan.scene, side)
-        stereo = plan.config.stereo
-        options = stereo.replaced(max_side=min(stereo.max_side, side))
-        self._source = PlaneSweepStereo(self.scene, options=options, views=plan.context)
-        self._names, self._kept = frozenset(names), dict[str, DepthMap | None]()
-
-    @classmethod
-    def of(cls, plan: Plan, *, begins: bool = True) -> Sweep | None:
-        """The sweep of a run; None if it has other depth, one view, or too little time.
-
-        A fit that ``begins`` needs points: with few, some views are swept however little time.
-        """
-        recorded = any(is_recorded(plan.source, plan.scene[name]) for name in plan.context)
-        estimated = any(is_estimated(plan.source, plan.scene[name]) for name in plan.context)
-        if recorded or estimated or len(plan.context) < 2:
-            return None
-        few = plan.scene.points is None or len(plan.scene.points.positions) < fit_start.FEW_POINTS
-        limit, views = plan.config.refine.limit, len(plan.context)
-        for side in (SWEPT_SIDE, SMALL_SIDE):
-            each = SWEEP_SECONDS * (side / SWEPT_SIDE) ** 2 / get_num_threads()
-            if limit is not None:
-                views = int(SWEEP_SHARE * limit / each)
-            if views >= len(plan.context):
-                return cls(plan, side, plan.context)
-        if not (few and begins):
-            return None
-        rows = spread(len(plan.context), max(views, FEWEST_SWEPT))
-        return cls(plan, SMALL_SIDE, [plan.context[row] for row in rows])
-
-    def depth(self, view: View) -> NDArray[np.float32] | None:
-        """(H, W) z-depth, scene units, of ``scene``'s view; None if no other shows what it does."""
-        depth_map = self.map_of(view)
-        return None if depth_map is None else depth_map.depth
-
-    def map_of(self, view: View) -> DepthMap | None:
-        """The depth with its confidence."""
-        if view.name not in self._kept:
-            view, found = self.scene[view.name], None
-            with suppress(DegenerateError):
-                found = self._source.depth(self.scene, view, view.load())
-            self._kept[view.name] = found
-        return self._kept[view.name]
-
-    def covers(self, view: View) -> bool:
-        """The context's views, or those of them that there is time for."""
-        return view.name in self._names
-
-
 @dataclass(frozen=True)
 class FitValidation:
     """PSNR of the validation photographs where a memory made without them covers them.
 
-    Both are of the sweep's size.
-    Elsewhere, mostly at their borders, both guess, and differ by 2 dB from fit to fit.
+    The Gaussians' pictures are compared at full size, so that blur counts; the memory at the size
+    of its sweep, since a run without a fit sweeps larger pictures, of which it shows as much.
+    Elsewhere, mostly at borders, both guess, and differ by 2 dB from fit to fit.
     """
 
     gaussians: float  # of the Gaussians' pictures [dB]
@@ -197,8 +138,8 @@ class FitValidation:
 
     @property
     def fit_is_used(self) -> bool:
-        """Whether the memory is not better, or not by more than MARGIN after a long fit."""
-        return self.memory <= self.gaussians + MARGIN * (self.steps >= LONG)
+        """Whether the memory is not clearly better."""
+        return self.memory <= self.gaussians + MARGIN * (3 if self.steps >= LONG else 1)
 
     def __str__(self) -> str:
         fit, own = f"{self.gaussians:.2f} dB", f"{self.memory:.2f} dB"
@@ -234,22 +175,22 @@ def validate_fit(fitted: Fitted, plan: Plan) -> FitValidation | None:
             frame.rgb, found.depth, view.camera, round=0, mask=frame.mask,
             confidence=found.confidence, options=plan.config.back_projection,
         )  # fmt: skip
-    squares, known = np.zeros(2), 0
+    squares, pixels = np.zeros(2), np.zeros(2)
     for name, picture in predicted.items():
-        view = scene[name]
-        frame = view.load()
+        view, photograph = scene[name], plan.scene[name].load()
         guidance = project(memory, view.camera, options=plan.config.splat)
-        where = guidance.valid[0] if frame.mask is None else guidance.valid[0] & frame.mask
-        whole = torch.from_numpy(picture.rgb).permute(2, 0, 1)[None]
-        small = torch.nn.functional.interpolate(whole, where.shape, mode="area")
-        for row, rgb in enumerate((small[0].permute(1, 2, 0).numpy(), guidance.rgb[0])):
+        known = guidance.valid[0]
+        whole = resize_nearest(known, *photograph.rgb.shape[1::-1])
+        both = (picture.rgb, photograph, whole), (guidance.rgb[0], view.load(), known)
+        for row, (rgb, frame, where) in enumerate(both):
+            where = where if frame.mask is None else where & frame.mask
             off = rgb[where] - frame.rgb[where] / np.float32(255)
-            squares[row] += float(np.square(off).mean(axis=1).sum())
-        known += int(where.sum())
+            squares[row] += float(np.square(off).sum()) / 3
+            pixels[row] += where.sum()
     memory.close()
-    if not known:
+    if not pixels.all():
         return None
-    gaussians, own = -10 * np.log10(np.maximum(squares / known, 1e-10))
+    gaussians, own = -10 * np.log10(np.maximum(squares / pixels, 1e-10))
     return FitValidation(float(gaussians), float(own), fitted.steps)
 
 
@@ -332,8 +273,10 @@ class Fitted:
             blend = best_blend(samples, tolerances=(WITH_DEPTH, np.inf))
         elif exposures is not None and exposures.log_gains.std() > EVEN:
             return self
-        else:
+        elif self.steps >= SEEN * len(plan.context):
             blend = best_blend(samples, most_share=MOST_SHARE, tolerances=(0.0, MOST_TOLERANCE))
+        else:
+            blend = best_blend(samples)
         if blend is None:
             return self
         return replace(self, appearance=replace(self.appearance, blend=blend))
@@ -369,20 +312,20 @@ def fit_appearance(plan: Plan, console: Console, *, earlier: Fitted | None = Non
         fit = _continued_fit(plan, earlier, console, sweep=sweep)
     if fit is None:
         return None
-    fit, why = with_chosen_backdrop(fit)
-    if why:
-        console.line(f"fitting: {why}")
-    limit = fit.options.limit
-    side, seconds = _memory_side(plan, fit, earlier)
-    if limit is not None:
-        left = max(limit - (time.perf_counter() - began) - seconds, limit / 2)
-        fit.options = fit.options.replaced(seconds=left + fit.seconds)
-    if fit.splatter is GsplatSplat:
-        console.line("fitting: on the CUDA device, by gsplat")
-    # Splats that are given may be better than what there is time for.
-    given = fit.shown_psnr() if fit.begin and earlier is None else -np.inf
-    exposures = fit.cameras.log_gains.copy()
     with _stopped_by_ctrl_c(fit, console):
+        fit, why = with_chosen_backdrop(fit)
+        if why:
+            console.line(f"fitting: {why}")
+        limit = fit.options.limit
+        side, seconds = _memory_side(plan, fit, earlier)
+        if limit is not None:
+            left = max(limit - (time.perf_counter() - began) - seconds, limit / 2)
+            fit.options = fit.options.replaced(seconds=left + fit.seconds)
+        if fit.splatter is GsplatSplat:
+            console.line("fitting: on the CUDA device, by gsplat")
+        # Splats that are given may be better than what there is time for.
+        given = fit.shown_psnr() if fit.begin and earlier is None else -np.inf
+        exposures = fit.cameras.log_gains.copy()
         fits: Sequence[Fit] = run_fits(fit, report=_progress(console))
     if np.isfinite(given) and (found := fit.shown_psnr()) < given:
         console.line(
@@ -398,15 +341,18 @@ def fit_appearance(plan: Plan, console: Console, *, earlier: Fitted | None = Non
     if earlier is not None and not fit.begin:
         fits = _worth_adding(fits, earlier)
     fitted = replace(_fitted(fits, plan, earlier), sweep=sweep, side=side)
-    if earlier is not None:
-        return fitted
+    return fitted if earlier is not None else _judged(fitted, plan, console)
+
+
+def _judged(fitted: Fitted, plan: Plan, console: Console) -> Fitted | None:
+    """A first fit, with what validation tells; None where it is not used, with a warning."""
     validation = validate_fit(fitted, plan)
     if validation is not None:
         console.line(f"colours: {validation}")
         if not validation.fit_is_used:
             console.warn("the fit is not used: give it more time by --refine")
             return None
-        return replace(fitted, validation=validation)
+        fitted = replace(fitted, validation=validation)
     enough = min(round(SHORT * len(plan.context)), ENOUGH)
     # Recorded depth keeps surfaces.
     if not _recorded(plan) and fitted.steps < enough:
@@ -416,7 +362,7 @@ def fit_appearance(plan: Plan, console: Console, *, earlier: Fitted | None = Non
         )
         asked = plan.config.refine
         begun = asked.init is not None and holds_splats(Path(asked.init))
-        if not begun and fitted.steps != asked.steps:
+        if validation is None and not begun and fitted.steps != asked.steps:
             console.warn(f"the fit is not used: {few}; give it more time by --refine")
             return None
         console.warn(
@@ -579,7 +525,14 @@ def _fitted(fits: Sequence[Fit], plan: Plan, earlier: Fitted | None) -> Fitted:
     exposures = Exposures(cameras.poses(), log_gains, cameras.depth)
     fitted = Fitted(
         Appearance(
-            sets[0], first.near, blend, first.splatter, tuple(sets[1:]), exposures, first.surface
+            sets[0],
+            first.near,
+            blend,
+            first.splatter,
+            tuple(sets[1:]),
+            exposures,
+            first.surface,
+            first.backdrop,
         ),
         predicted={
             plan.context[row]: mean_picture([fit.predicted[row] for fit in fits])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gvtools.appearance.appearance import Appearance, Picture, recolor
+from gvtools.appearance.appearance import Appearance, Picture
 from gvtools.cameras import Cameras
 from gvtools.completers.base import (
     Completer,
@@ -33,7 +33,7 @@ from gvtools.memory.projection import Observed, Projection
 from gvtools.memory.spatial_memory import FuseReport, SpatialMemory
 from gvtools.memory.splat.api import ONE_PIXEL, SplatOptions
 from gvtools.prefetch import prefetch
-from gvtools.runs.context_depth import DepthCache, depth_report, disagreeing
+from gvtools.runs.context_depth import DepthCache, depth_report
 from gvtools.runs.layout import PANORAMA, target_picture, target_stems
 from gvtools.runs.target_files import (
     camera_entry,
@@ -100,7 +100,7 @@ class CachedProjection:
             if self.appearance is not None:
                 if self._picture is None:
                     self._picture = self.appearance.picture(self.camera)
-                self._guidance = recolor(self._guidance, self._picture, blend=self.appearance.blend)
+                self._guidance = self.appearance.recolor(self._guidance, self._picture)
             self._at = at
         return self._guidance
 
@@ -114,24 +114,6 @@ class CachedProjection:
             return rgb
         where = ~guidance.valid[0] & self._picture.solid
         return np.where(where[..., None], self._picture.rgb, rgb[0])[None]
-
-
-def warn_of_depth(reports: Sequence[Mapping[str, Any]], console: Console) -> None:
-    """Say of how many views there is no depth, or depth of another scale."""
-    failed = [report for report in reports if report["failed"]]
-    if failed:
-        console.warn(
-            f"{len(failed)} of {len(reports)} views have no depth and give no points, first: "
-            f"{failed[0]['failed']}"
-        )
-    odd = disagreeing(reports)
-    if odd:
-        first = odd[0]["scale"]
-        console.warn(
-            f"the depth of {len(odd)} of {len(reports)} views disagrees with the sparse points, "
-            f"first {odd[0]['view']}: {first['status']}, scale {first['scale']:.3g}; look at its "
-            "unit and at the poses"
-        )
 
 
 class RoundTargets:
@@ -253,7 +235,6 @@ def fuse_context(
     dropped: Counter[str] = Counter()
     reports: list[dict[str, Any]] = []
     guesses: list[tuple[Cameras, NDArray[np.uint8], DepthMap, NDArray[np.bool_]]] = []
-    farthest = config.back_projection.depth_max or np.inf
 
     def observe(*images: Any, **how: Any) -> FuseReport:
         with clock.stage("fuse"):
@@ -280,11 +261,10 @@ def fuse_context(
         use, guessed = frame.mask, depth_map.guessed
         if guessed is not None:
             everywhere = np.ones_like(guessed) if use is None else use
-            lifted = guessed & everywhere & (depth_map.depth > 0) & (depth_map.depth <= farthest)
-            guesses.append((view.camera, frame.rgb, depth_map, lifted))
+            guesses.append((view.camera, frame.rgb, depth_map, guessed & everywhere))
             use = everywhere & ~guessed
             # These are fused below, not left out.
-            dropped["masked"] -= int(lifted.sum())
+            dropped["masked"] -= int((guessed & everywhere).sum())
         fused = observe(
             frame.rgb, depth_map.depth, view.camera, confidence=depth_map.confidence, mask=use
         )
@@ -300,7 +280,11 @@ def fuse_context(
         entry["failed"] = cache.failed.get(entry["view"])
     if not len(memory):
         raise ProjectError(_nothing_fused(plan, memory, cache, beyond=total.out_of_reach))
-    warn_of_depth(reports, console)
+    if failed := [report["failed"] for report in reports if report["failed"]]:
+        console.warn(
+            f"{len(failed)} of {len(reports)} views have no depth and give no points, first: "
+            f"{failed[0]}"
+        )
     projected = sum(report["source"] == MEMORY for report in reports)
     if projected:
         console.line(

@@ -18,7 +18,6 @@ from gvtools.appearance.appearance import (
     Blend,
     best_blend,
     blend_colors,
-    recolor,
 )
 from gvtools.appearance.camera_corrections import Exposures
 from gvtools.appearance.fit import Fit
@@ -66,7 +65,7 @@ def test_only_colours_of_surfaces_that_gaussians_show_change(solid, guidance):
     where = guidance.valid[0] & (picture.alpha > 0.5)
     assert 0 < where.sum() < guidance.valid[0].sum()
     assert guidance.generated[0][where].any()
-    result = recolor(guidance, picture, blend=Blend(0.3, 0.5))
+    result = Appearance(solid, 0.05, Blend(0.3, 0.5)).recolor(guidance, picture)
     for name in ("depth", "valid", "generated", "confidence"):
         np.testing.assert_array_equal(getattr(result, name), getattr(guidance, name))
     assert result.cameras is guidance.cameras
@@ -77,6 +76,10 @@ def test_only_colours_of_surfaces_that_gaussians_show_change(solid, guidance):
     made = where & guidance.generated[0]
     expected[made] = picture.rgb[made]
     np.testing.assert_array_equal(result.rgb[0], expected)
+    # Where random colours were behind the Gaussians it is mostly a photograph's.
+    fitted = Appearance(solid, 0.05, Blend(0.3, 0.5), backdrop=True)
+    half = blend_colors(picture.rgb, guidance.rgb[0], where, blend=Blend(0.15, 0.5))[made]
+    np.testing.assert_allclose(fitted.recolor(guidance, picture).rgb[0][made], half, atol=1e-6)
 
 
 def test_a_picture_does_not_depend_on_the_gaussians_frame(solid):
@@ -104,6 +107,17 @@ def test_colours_are_over_black():
     assert seen.mean() > 0.9
     expected = picture.alpha[..., None] * np.array([200, 100, 50]) / 255
     np.testing.assert_allclose(picture.rgb[seen], expected[seen], atol=1e-4)
+    # Not where random colours were behind them in the fit: what stops half of the light or more
+    # has its own colour then.
+    fitted = Appearance(veil, 0.05, backdrop=True).picture(CAMERA)
+    np.testing.assert_allclose(fitted.rgb[seen], 2 * expected[seen], atol=1e-4)
+    dense = Gaussians(veil.values.copy(), frame=veil.frame)
+    dense.values[:, LOGIT] = 1.5
+    thick = Appearance(dense, 0.05, backdrop=True).picture(CAMERA)
+    middle = thick.solid
+    assert middle.any() and thick.alpha[middle].max() < 0.9
+    colors = np.broadcast_to(np.array([200, 100, 50]) / 255, thick.rgb.shape)
+    np.testing.assert_allclose(thick.rgb[middle], colors[middle], atol=1e-4)
 
 
 def test_fitted_depth_is_what_opaque_gaussians_show_trusted_by_the_look(solid):

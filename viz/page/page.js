@@ -100,8 +100,13 @@ async function start() {
   target = new library.WebGLRenderTarget(
     1, 1, { depthBuffer: false, ...deep && { type: library.HalfFloatType } });
   const vertexShader = "void main() { gl_Position = vec4(position.xy, 0.0, 1.0); }";
+  renderer.setClearColor(0, 0);
+  const light = scene.backdrop ? "max(lit.a, 0.5)" : "1.0";
   const fragmentShader = `uniform sampler2D picture;
-    void main() { gl_FragColor = vec4(texelFetch(picture, ivec2(gl_FragCoord), 0).rgb, 1.0); }`;
+    void main() {
+      vec4 lit = texelFetch(picture, ivec2(gl_FragCoord), 0);
+      gl_FragColor = vec4(lit.rgb / ${light}, 1.0);
+    }`;
   quad = new library.FullScreenQuad(new library.ShaderMaterial(
     { vertexShader, fragmentShader, uniforms: { picture: { value: target.texture } } }));
   world = new library.Scene();

@@ -107,6 +107,7 @@ class SharedPage:
     depth: float  # typical, scene units
     near: float  # nothing nearer is drawn, scene units
     mip: bool = False  # whether the low-pass keeps a Gaussian's light, as files may ask for
+    backdrop: bool = False  # whether colours are of what stops the light, see Appearance
     # Of the photographs, in the frame ``exposed_in``; None takes all as equal.
     exposures: Exposures | None = None
     exposed_in: LocalFrame | None = None
@@ -129,6 +130,7 @@ class SharedPage:
             "depth": self.depth,
             "near": self.near,
             "mip": self.mip,
+            "backdrop": self.backdrop,
             "far": FARTHEST * self.depth,
             "rounds": self.rounds,
             "start": self.start.view(self.origin),

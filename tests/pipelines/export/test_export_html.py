@@ -176,7 +176,7 @@ def test_the_page_shows_what_the_run_does(scene, fitted_run, tmp_path, monkeypat
     whole = fitted_run.appearance
     fitted = Gaussians(splats.values[: splats.fitted], frame=LocalFrame.at(splats.origin))
     expected = Appearance(
-        fitted, near=whole.near,
+        fitted, near=whole.near, backdrop=whole.backdrop,
     ).picture(camera).rgb * whole.exposures.at(
         whole.gaussians.frame.cam_from_local(camera.cam_from_world)[0]
     )  # fmt: skip

@@ -15,7 +15,7 @@ from run_files import Killed, kill_after_round_0, reconstructed, report_of, resu
 from tiny_scan import write_colmap_scan, write_scan
 
 from benchmarks.made_scenes import PLACES, write_place
-from gvtools.appearance.appearance import Appearance, Blend, Picture, recolor
+from gvtools.appearance.appearance import Appearance, Blend, Picture
 from gvtools.appearance.camera_corrections import Exposures
 from gvtools.appearance.fit import Fit
 from gvtools.appearance.gaussians import Gaussians
@@ -121,7 +121,7 @@ def test_targets_show_the_gaussians_where_the_memory_observed(whole, scan):
     memory = memory_of_round_0(whole)
     camera = fitted.apply(plan).targets.cameras[[0]]
     guidance = project(memory, camera, options=plan.config.splat)
-    shown = recolor(guidance, fitted.appearance.picture(camera), blend=fitted.appearance.blend)
+    shown = fitted.appearance.recolor(guidance, fitted.appearance.picture(camera))
     off = np.abs(shown.rgb[0] * 255 - guidance_of(whole, 1))[guidance.valid[0]]
     assert off.max() <= 1
     assert np.abs(guidance.rgb[0] * 255 - guidance_of(whole, 1))[guidance.valid[0]].max() > 1
@@ -173,7 +173,7 @@ def test_photographs_alone_get_depth_by_the_gaussians(tmp_path, monkeypatch, poi
     """With sparse points, and without any: then a plane sweep tells where to begin."""
     # So short a fit is not as good as the memory.
     monkeypatch.setattr(fitting, "validate_fit", lambda *args: None)
-    monkeypatch.setattr(fitting, "SWEPT_SIDE", 64)
+    monkeypatch.setattr(fit_start, "SWEPT_SIDE", 64)
     scan = write_colmap_scan(tmp_path / "scan", views=6, points=points)
     settings = ("context=first:5", "targets=range:5-5")
     out = run(scan, tmp_path / "run", *settings)
@@ -196,7 +196,7 @@ def test_a_fit_too_short_for_its_photographs_is_told(
 ):
     # Where nothing judges it.
     monkeypatch.setattr(fitting, "validate_fit", lambda *args: None)
-    monkeypatch.setattr(fitting, "SWEPT_SIDE", 64)
+    monkeypatch.setattr(fit_start, "SWEPT_SIDE", 64)
     monkeypatch.setattr(fitting, "ENOUGH", 10 if enough == 10 else 400)
     plan = planned(bare, f"refine.steps={steps}", "context=first:3")
     fit_appearance(plan, Console())
@@ -205,7 +205,7 @@ def test_a_fit_too_short_for_its_photographs_is_told(
 
 def test_a_fit_that_its_clock_ends_too_early_is_not_used(bare, monkeypatch, capsys):
     monkeypatch.setattr(fitting, "validate_fit", lambda *args: None)
-    monkeypatch.setattr(fitting, "SWEPT_SIDE", 64)
+    monkeypatch.setattr(fit_start, "SWEPT_SIDE", 64)
     plan = planned(bare, "refine.seconds=0.001", "context=first:3")
     assert fit_appearance(plan, Console()) is None
     assert "the fit is not used" in capsys.readouterr().err
@@ -245,9 +245,9 @@ def test_pixels_with_swept_depth_make_up_for_few_sparse_points(tmp_path, monkeyp
 
 @pytest.mark.parametrize(("seconds", "side"), [("none", 96), ("40", 96), ("15", 64), ("5", None)])
 def test_a_sweep_is_as_large_as_there_is_time(bare, monkeypatch, seconds, side):
-    monkeypatch.setattr(fitting, "SWEPT_SIDE", 96)
-    monkeypatch.setattr(fitting, "SMALL_SIDE", 64)
-    monkeypatch.setattr(fitting, "get_num_threads", lambda: 2)
+    monkeypatch.setattr(fit_start, "SWEPT_SIDE", 96)
+    monkeypatch.setattr(fit_start, "SMALL_SIDE", 64)
+    monkeypatch.setattr(fit_start, "get_num_threads", lambda: 2)
     monkeypatch.setattr(fit_start, "FEW_POINTS", 15)
     plan = planned(bare, f"refine.seconds={seconds}")
     sweep = Sweep.of(plan)
@@ -303,14 +303,14 @@ def test_a_fit_comes_back_from_its_file_as_it_was(tmp_path):
     gaussians = Gaussians(values, frame=LocalFrame.at([1e6, 2, 3]))
     poses = np.tile(np.eye(4), (2, 3, 1, 1))
     poses[..., :3, 3] = rng.normal(size=(2, 3, 3))
-    fitted = Fitted(Appearance(gaussians, 0.125, Blend(0.35, 0.4)), RunPoses(*poses))
+    fitted = Fitted(Appearance(gaussians, 0.125, Blend(0.35, 0.4), backdrop=True), RunPoses(*poses))
     for saved in (fitted, replace(fitted, poses=None)):
         saved.save(tmp_path / "fit.npz")
         back = Fitted.load(tmp_path / "fit.npz")
         np.testing.assert_array_equal(back.appearance.gaussians.values, gaussians.values)
         assert back.appearance.gaussians.frame.same_as(gaussians.frame)
         assert back.appearance.near == 0.125
-        assert back.appearance.blend == Blend(0.35, 0.4)
+        assert back.appearance.blend == Blend(0.35, 0.4) and back.appearance.backdrop
         assert (back.poses is None) == (saved.poses is None)
         if back.poses is not None:
             np.testing.assert_array_equal([back.poses.context, back.poses.targets], poses)
@@ -338,7 +338,7 @@ def test_the_blend_is_chosen_by_the_left_out_photographs(scan):
     assert fitted.with_best_blend(plan, memory) is fitted
 
 
-def test_photographs_take_at_most_half_of_the_memory_s_detail_and_none_unevenly_exposed(bare):
+def test_a_long_fit_takes_at_most_half_of_the_memory_s_detail_and_an_uneven_one_none(bare):
     plan = planned(bare)
     memory, name = _empty_memory(plan, Path()), plan.context[1]
     for each in plan.context:
@@ -351,8 +351,11 @@ def test_photographs_take_at_most_half_of_the_memory_s_detail_and_none_unevenly_
     smooth = truth + 0.3 * (truth - np.clip(shown.rgb[0], 0, 1))
     predicted = {name: Picture(smooth.astype(np.float32), np.ones(truth.shape[:2], np.float32))}
     even = replace(ONE, blend=Blend(share=0.0))
-    blend = Fitted(even, predicted=predicted).with_best_blend(plan, memory).appearance.blend
+    long, short = (Fitted(even, predicted=predicted, steps=steps) for steps in (10**4, 50))
+    blend = long.with_best_blend(plan, memory).appearance.blend
     assert 0 < blend.share <= MOST_SHARE and blend.tolerance <= MOST_TOLERANCE
+    most = short.with_best_blend(plan, memory).appearance.blend
+    assert most.tolerance > blend.tolerance or most.share > blend.share
     poses = np.repeat(np.eye(4)[None], 2, axis=0)
     uneven = replace(even, exposures=Exposures(poses, np.array([[0.1] * 3, [-0.1] * 3]), 1.0))
     kept = Fitted(uneven, predicted=predicted).with_best_blend(plan, memory)
@@ -435,7 +438,7 @@ def test_a_fit_worse_than_the_memory_is_not_used(bare, monkeypatch, capsys):
     assert good is not None and good.fit_is_used
     bad = validated(0 * truth, 1000)
     assert bad is not None and not bad.fit_is_used
-    close = FitValidation(30, 31, 1000)
+    close = FitValidation(30, 32, 1000)
     assert close.fit_is_used and not replace(close, steps=100).fit_is_used
     # What the Gaussians show where the memory knows nothing does not count.
     assert good.gaussians > good.memory == bad.memory > 15 > bad.gaussians
