@@ -83,10 +83,10 @@ def off_scale(reports: Sequence[Mapping[str, Any]]) -> str | None:
     names = ", ".join(report["view"] for report in odd[:MAX_NAMED])
     more = f" and {len(odd) - MAX_NAMED} more" if len(odd) > MAX_NAMED else ""
     first = odd[0]["scale"]
+    scale = f", scale {first['scale']:.3g}" if first["scale"] else ""  # not a number: null
     return (
         f"depth of {len(odd)} of {len(reports)} views is off the sparse points' scale: "
-        f"{names}{more}; the first: {first['status']}, scale {first['scale']:.3g}; look at its "
-        "unit and at the poses"
+        f"{names}{more}; the first: {first['status']}{scale}; look at its unit and at the poses"
     )
 
 

@@ -16,6 +16,7 @@ from gvtools.depth import choice
 from gvtools.depth.source import DepthMap
 from gvtools.errors import DegenerateError
 from gvtools.prefetch import prefetch
+from gvtools.runs.context_depth import off_scale
 from gvtools.scenes.scene import Frame, Scene, View
 from pipelines.cli import main
 
@@ -193,3 +194,9 @@ def test_an_error_comes_where_its_item_would_have():
     assert next(items) == 0
     with pytest.raises(ValueError, match="broken"):
         next(items)
+
+
+@pytest.mark.parametrize(("scale", "told"), [(1.08, "aligned, scale 1.08;"), (None, "aligned; l")])
+def test_depth_off_the_points_is_told_with_its_scale_where_there_is_one(scale, told):
+    odd = {"view": "a.png", "scale": {"disagrees": True, "status": "aligned", "scale": scale}}
+    assert told in (off_scale([odd, {"view": "b.png", "scale": None}]) or "")
