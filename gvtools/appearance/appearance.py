@@ -187,7 +187,7 @@ class Appearance:
             data = load_arrays(path)
             # Earlier versions knew no surfaces, and drew all over black.
             surface = data.setdefault("surface", np.zeros((0, 3), np.float32))
-            data.setdefault("backdrop", np.False_)
+            data.setdefault("backdrop", np.zeros((), np.bool_))
             counts, count = data["counts"], len(data["poses"])
             shapes = {
                 "counts": (len(counts),), "near": (), "blend": (2,), "poses": (count, 4, 4),
