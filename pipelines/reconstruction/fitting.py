@@ -436,6 +436,7 @@ def _new_fit(
         start, views, options=options, seed=seed, surface=surface,
         begin=GIVEN if given is not None and given.fitted else 0.0,
         splatter=splatter_on(plan.config.device),
+        backdrop=earlier is None or earlier.appearance.backdrop,
     )  # fmt: skip
     if given is not None and given.fitted:
         fit.compare_exposures()
@@ -455,6 +456,7 @@ def _continued_fit(plan: Plan, earlier: Fitted, console: Console, *, sweep: Swee
     fit = Fit(
         start, views, options=_options(plan), seed=seed, begin=CONTINUED,
         surface=earlier.appearance.surface, splatter=splatter_on(plan.config.device),
+        backdrop=earlier.appearance.backdrop,
     )  # fmt: skip
     fit.cameras.spread = earlier.spread
     if earlier.appearance.exposures is not None:
