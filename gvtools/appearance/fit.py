@@ -134,6 +134,8 @@ class Fit:
         self.population = Population(start.values.copy(), width)
         self.recorded = all(view.depth is not None for view in self.views)
         self.backdrop = backdrop and not self.recorded
+        # Whether all of it was before random colours, see Picture.
+        self.undimmed = self.backdrop and not begin and all(v.depth is None for v in self.views)
         self.converged_after = converged_steps(len(self.views), recorded=self.recorded)
         self.cameras = CameraCorrections(
             np.array([view.cam_from_local for view in self.views]),
@@ -286,7 +288,7 @@ class Fit:
     def shown_psnr(self) -> float:
         """Mean PSNR of some of the photographs, as the Gaussians show them now [dB]."""
         shown = [row for row, view in enumerate(self.views) if _shows(view)]
-        rows = shown[:: -(-len(shown) // JUDGES)]
+        rows = shown[:: max(-(-len(shown) // JUDGES), 1)]
         return self.psnr_of({row: self._picture(row, self.cameras.pose(row)) for row in rows})
 
     def step(self, share: float) -> None:
@@ -389,7 +391,7 @@ class Fit:
         values, free = self.population.values, self._free[number]
         if free is not None:
             values = values[~floaters(values, lens, free)]
-        return Picture.of(self.splatter(values, lens), gain=gain, backdrop=self.backdrop)
+        return Picture.of(self.splatter(values, lens), gain=gain, backdrop=self.undimmed)
 
     def _exposures(self) -> Exposures:
         """Exposures of the photographs that are fitted, without the validation photographs."""
@@ -524,6 +526,8 @@ def with_chosen_backdrop(fit: Fit) -> tuple[Fit, str]:
     trials = [fit.again(0, options, backdrop=backdrop) for backdrop in (True, False)]
     for trial in trials:
         trial.run(until=TRIAL_ENDS)
+    if fit.stopped:
+        return trials[0], ""
     random, black = (trial.left_out_psnr() for trial in trials)
     over_black = black > random + CLEARLY_BETTER
     chosen, behind = trials[over_black], "black" if over_black else "random colours"

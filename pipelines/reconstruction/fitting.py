@@ -313,7 +313,7 @@ def fit_appearance(plan: Plan, console: Console, *, earlier: Fitted | None = Non
     if fit is None:
         return None
     with _stopped_by_ctrl_c(fit, console):
-        fit, why = with_chosen_backdrop(fit)
+        fit, why = (fit, "") if earlier is not None else with_chosen_backdrop(fit)
         if why:
             console.line(f"fitting: {why}")
         limit = fit.options.limit
@@ -355,7 +355,8 @@ def _judged(fitted: Fitted, plan: Plan, console: Console) -> Fitted | None:
         fitted = replace(fitted, validation=validation)
     enough = min(round(SHORT * len(plan.context)), ENOUGH)
     # Recorded depth keeps surfaces.
-    if not _recorded(plan) and fitted.steps < enough:
+    better = validation is not None and validation.gaussians > validation.memory
+    if not (_recorded(plan) or better) and fitted.steps < enough:
         few = (
             f"{fitted.steps} steps of a fit to {len(plan.context)} photographs; expected at least "
             f"{enough}"
@@ -436,7 +437,6 @@ def _new_fit(
         start, views, options=options, seed=seed, surface=surface,
         begin=GIVEN if given is not None and given.fitted else 0.0,
         splatter=splatter_on(plan.config.device),
-        backdrop=earlier is None or earlier.appearance.backdrop,
     )  # fmt: skip
     if given is not None and given.fitted:
         fit.compare_exposures()
@@ -456,7 +456,6 @@ def _continued_fit(plan: Plan, earlier: Fitted, console: Console, *, sweep: Swee
     fit = Fit(
         start, views, options=_options(plan), seed=seed, begin=CONTINUED,
         surface=earlier.appearance.surface, splatter=splatter_on(plan.config.device),
-        backdrop=earlier.appearance.backdrop,
     )  # fmt: skip
     fit.cameras.spread = earlier.spread
     if earlier.appearance.exposures is not None:
@@ -523,6 +522,8 @@ def _fitted(fits: Sequence[Fit], plan: Plan, earlier: Fitted | None) -> Fitted:
     blend = Blend() if _recorded(plan) else Blend(share=0.0)
     if earlier is not None:
         blend = earlier.appearance.blend
+        if first.begin and not _recorded(plan) and steps >= SEEN * len(plan.context):
+            blend = Blend(min(blend.share, MOST_SHARE), min(blend.tolerance, MOST_TOLERANCE))
     log_gains = cameras.log_gains - cameras.log_gains.mean(axis=0)
     exposures = Exposures(cameras.poses(), log_gains, cameras.depth)
     fitted = Fitted(
@@ -534,7 +535,7 @@ def _fitted(fits: Sequence[Fit], plan: Plan, earlier: Fitted | None) -> Fitted:
             tuple(sets[1:]),
             exposures,
             first.surface,
-            first.backdrop,
+            first.undimmed if earlier is None else earlier.appearance.backdrop,
         ),
         predicted={
             plan.context[row]: mean_picture([fit.predicted[row] for fit in fits])
