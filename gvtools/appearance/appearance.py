@@ -175,9 +175,7 @@ class Appearance:
     # (N, 3) points on surfaces, in the Gaussians' frame; what floats before them is not shown,
     # see free_space. None shows all.
     surface: NDArray[np.float32] | None = None
-    # Whether random colours were behind them in the fit, see Picture. Over black they cost borders
-    # of what photographs show 0.1 to 3.3 dB of whole pictures.
-    backdrop: bool = False
+    backdrop: bool = False  # whether random colours were behind them in the fit, see Picture
 
     @classmethod
     def load(cls, path: Path) -> Appearance:

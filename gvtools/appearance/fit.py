@@ -134,7 +134,6 @@ class Fit:
         self.population = Population(start.values.copy(), width)
         self.recorded = all(view.depth is not None for view in self.views)
         self.backdrop = backdrop and not self.recorded
-        # Whether all of it was before random colours, see Picture.
         self.undimmed = self.backdrop and not begin and all(v.depth is None for v in self.views)
         self.converged_after = converged_steps(len(self.views), recorded=self.recorded)
         self.cameras = CameraCorrections(
