@@ -128,8 +128,7 @@ class Fit:
         """
         self.start, self.seed, self.splatter = start, seed, splatter
         self.views, self.options = list(views), options or FitOptions()
-        self.frame = start.frame
-        self.rng = np.random.default_rng(seed)
+        self.frame, self.rng = start.frame, np.random.default_rng(seed)
         width = pixel_width(start.values[:, :LOG_SCALE], self.views)
         self.population = Population(start.values.copy(), width)
         self.recorded = all(view.depth is not None for view in self.views)
@@ -143,14 +142,12 @@ class Fit:
             exposure=self.options.exposure,
         )
         self.near = 0.02 * self.cameras.depth
-        self.surface = surface
+        self.surface, self.begin = surface, begin
         # Of all calls of ``run`` together.
         self.steps, self.seconds = 0, 0.0
-        self._stop = threading.Event()
-        self._last_psnr = -np.inf
+        self._stop, self._last_psnr = threading.Event(), -np.inf
         # Pictures of the validation photographs, by their numbers, before these joined the fit.
         self.predicted: dict[int, Picture] = {}
-        self.begin = begin
         # The limit of Gaussians does not count those of an earlier fit.
         self._begun_with = len(start.values) if begin else 0
         rows = () if begin else validation_rows(len(self.views))

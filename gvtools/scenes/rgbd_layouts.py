@@ -398,7 +398,8 @@ class _RtabMap(_ScanNet):
         K = pinhole(lens.values[:4]) if isinstance(lens, LensParameters) else None
         if K is not None:
             K[:2, 2] -= 0.5
-        recording = super().calibration(root, under(options, color_K=K))
+        bent = list(lens.values[4:9]) if isinstance(lens, LensParameters) else []
+        recording = super().calibration(root, under(options, color_K=K, distortion=bent or None))
         if K is None or options.color_K is not None:
             return recording
         return replace(recording, findings=[Finding("info", "intrinsics: each picture's own")])

@@ -500,6 +500,17 @@ def test_intrinsics_that_are_given_win_over_each_pictures_own(tmp_path):
     given = open_project(tmp_path)
     assert given.cameras.K[:, 0, 0].tolist() == [80, 80]
     assert "each picture's own" not in messages(given)
+    # Their distortion stays that of the files.
+    for path in tmp_path.glob("flat_calib/*.yaml"):
+        path.write_text(
+            path.read_text().replace("[ 0., 0., 0., 0., 0. ]", "[ 0.3, 0., 0., 0., 0. ]")
+        )
+    K = [[91, 0, 47.5], [0, 92, 35.5], [0, 0, 1]]  # of the first picture
+    (tmp_path / "rgbd.json").write_text(json.dumps({"color_K": K}))
+    bent = open_project(tmp_path).views[0].load().rgb
+    (tmp_path / "rgbd.json").unlink()
+    np.testing.assert_array_equal(bent, open_project(tmp_path).views[0].load().rgb)
+    assert not np.array_equal(bent, given.views[0].load().rgb)
 
 
 def test_rtabmap_pictures_named_by_time(tmp_path):
